@@ -1,0 +1,107 @@
+"""What is known of BITeno, what is chosen, and the parameters by which its simulation may be wrong.
+
+Public: 15.5 kg, 0.95 m tall, legs of 0.65 m, three joints a leg, a policy at 100 Hz over a joint PD at 1000 Hz, 40
+observations, 6 actions and Table I of the paper. Everything else (masses of single links, limits, gains, feet) is a
+choice of this project, scaled from the nearest public robot, the point-footed LimX TRON1 (18.6 kg, the same six joints).
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from envs.domain import Entry
+
+MODEL_PATH = Path(__file__).parent / "model.xml"
+
+SIDES = ("left", "right")
+JOINTS = tuple(f"{side}_{joint}" for side in SIDES for joint in ("abad", "hip", "knee"))
+FEET = tuple(f"{side}_foot" for side in SIDES)
+
+STAND_RAD = np.array([0.0, -0.35, 0.70] * 2)  # foot under the hip
+HIP_HEIGHT_M = 0.612
+HIP_Y_M = np.array([0.10, -0.10])
+LINK_M = 0.31  # thigh and shank alike
+STANCE_DEPTH_M = 0.582  # hip axis to the foot's centre: HIP_HEIGHT_M less the foot's radius
+POLICY_DT_S = 0.01
+
+CLOCK_HZ = 1.75
+DUTY = 0.5
+SWING_HEIGHT_M = 0.08
+
+TABLE_ONE = {
+    "linear_tracking": 2.0,
+    "angular_tracking": 1.5,
+    "linear_velocity_z": -1.25,
+    "angular_velocity_xy": -0.1,
+    "torque": -5.0e-6,
+    "orientation": -10.0,
+    "joint_acceleration": -2.0e-7,
+    "action_rate": -0.1,
+    "joint_default": -0.35,
+    "raibert": -1.25,
+}
+"""Weights of the paper's Table I."""
+
+WALKING = {**TABLE_ONE, "raibert": -5.0, "action_rate": -0.01}
+"""Weights that make it walk. Under Table I alone this robot earns as much by buzzing (13 touchdowns a second and foot)."""
+
+
+def _mass(name: str, *bodies: str) -> Entry:
+    # A heavier link of the same shape: inertia grows with mass.
+    return Entry(name=name, kind="body", targets=bodies, fields=("body_mass", "body_inertia"), bounds=(0.2, 5.0))
+
+
+def _joints(name: str, *fields: str, bounds: tuple[float, float]) -> Entry:
+    return Entry(name=name, kind="joint", targets=JOINTS, fields=fields, bounds=bounds)
+
+
+ENTRIES = {
+    entry.name: entry
+    for entry in (
+        Entry(
+            name="foot_friction", kind="geom", targets=FEET, fields=("geom_friction",), column=0, bounds=(0.15, 4.0)
+        ),
+        *(_mass(f"{side}_{link}_mass", f"{side}_{link}") for side in SIDES for link in ("abductor", "thigh", "shank")),
+        *(_mass(f"{link}_mass", f"left_{link}", f"right_{link}") for link in ("abductor", "thigh", "shank")),
+        _mass("trunk_mass", "trunk"),
+        *(
+            Entry(
+                name=f"trunk_com_{axis}_m",
+                kind="body",
+                targets=("trunk",),
+                fields=("body_ipos",),
+                column=column,
+                bounds=(-0.08, 0.08),
+                log=False,
+            )
+            for column, axis in enumerate("xyz")
+        ),
+        Entry(
+            name="torque_scale",
+            kind="actuator",
+            targets=JOINTS,
+            fields=("actuator_gainprm", "actuator_biasprm", "actuator_forcerange"),
+            bounds=(0.3, 2.0),
+        ),
+        _joints("joint_damping", "dof_damping", bounds=(0.1, 10.0)),
+        _joints("joint_armature", "dof_armature", bounds=(0.2, 5.0)),
+        Entry(
+            name="contact_time_constant",
+            kind="geom",
+            targets=FEET,
+            fields=("geom_solref",),
+            column=0,
+            bounds=(0.5, 4.0),
+        ),
+    )
+}
+"""Everything that can be tuned, by name; multipliers of the nominal model, but the centre of mass, which is an offset."""
+
+PARAMETER_SETS = {
+    # The paper's own seven, in its order.
+    "legs6": (
+        "foot_friction",
+        *(f"{side}_{link}_mass" for side in SIDES for link in ("abductor", "thigh", "shank")),
+    ),
+    "whole_body": ("foot_friction", "trunk_mass", "abductor_mass", "thigh_mass", "shank_mass"),
+}

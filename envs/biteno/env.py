@@ -1,0 +1,288 @@
+"""BITeno follows velocity commands: the task of the paper's section IV, its physical parameters an argument.
+
+`Biteno` is one robot, pure and unbatched; `vmap` it. `BraxBiteno` is the same robot many times behind Brax's interface,
+with automatic resets. A state holds positions and velocities, not a whole `mjx.Data`, so a reset is cheap and fresh.
+
+The sum of Table I can be negative, and then falling early pays. The remedy is an explicit cost of termination
+(`TaskConfig.termination_cost`); it is part of the trained reward, never of the scored one (`State.score`).
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+import chex
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from brax.envs.base import Env as BraxEnv
+from brax.envs.base import State as BraxState
+from mujoco import mjx
+
+from envs import domain, sensing
+from envs.biteno import constants, gait, rewards
+
+_ACTION_LIMIT = 10.0
+_MIN_HEIGHT_M = 0.35
+_MAX_TILT_COS = np.cos(np.pi / 4)
+
+# time step in s, steps in a policy step, solver iterations, line-search iterations
+_PHYSICS = {"exact": (0.001, 10, 3, 5), "fast": (0.002, 5, 2, 5)}
+
+
+@dataclass(frozen=True, kw_only=True)
+class TaskConfig:
+    """The task; defaults are the paper's where it has one."""
+
+    physics: Literal["exact", "fast"] = "exact"
+    """`exact`: 10 sub-steps of 1 ms. `fast`: 5 of 2 ms with fewer solver iterations; what is learnt there walks at 1 ms."""
+    base: Literal["stand", "raibert"] = "stand"
+    """What an action is added to: the standing pose, or Raibert's reference."""
+    action_scale: float = 0.25
+    """Joint target in rad per unit of action."""
+    noise: float = 0.0
+    """Width of the observation noise in units of `sensing.NOISE`."""
+    weights: Mapping[str, float] = field(default_factory=lambda: dict(constants.WALKING))
+    """Trained reward: weight of every term of Table I."""
+    termination_cost: float = 1.0
+    """Taken from the trained reward where an episode ends in a fall."""
+    episode_s: float = 20.0
+    """Time limit of an episode."""
+    command_s: float = 5.0
+    """Time between two commands."""
+    command_max: tuple[float, float, float] = (1.0, 0.3, 0.8)
+    """Largest command forward in m/s, sideways in m/s, turning in rad/s."""
+    zero_command_share: float = 0.1
+    """Share of commands that are zero."""
+
+
+@chex.dataclass(frozen=True)
+class State:
+    """One robot between two policy steps."""
+
+    qpos: jax.Array  # [13]
+    qvel: jax.Array  # [12]
+    qacc_warmstart: jax.Array  # [12]
+    command: jax.Array  # [3] m/s, m/s, rad/s
+    phase: jax.Array  # [2] cycles
+    action: jax.Array  # [6]
+    joint_error: jax.Array  # [6] rad
+    obs: jax.Array  # [40]
+    reward: jax.Array  # trained reward
+    score: jax.Array  # reward under the weights of Table I
+    done: jax.Array  # 1 where the robot fell or is not finite
+    not_finite: jax.Array  # 1 where the simulation broke
+    steps: jax.Array  # policy steps since the reset
+    terms: dict  # unweighted terms of Table I
+    key: jax.Array
+
+
+class Biteno:
+    """One robot.
+
+    Args:
+      config: the task.
+      entries: the parameter table.
+    """
+
+    observation_size = 40
+    action_size = 6
+
+    def __init__(self, config: TaskConfig, entries: Mapping[str, domain.Entry] = constants.ENTRIES):
+        if set(config.weights) != set(constants.TABLE_ONE):
+            raise ValueError(f"weights: got {sorted(config.weights)}, expected {sorted(constants.TABLE_ONE)}")
+        if config.physics not in _PHYSICS:
+            raise ValueError(f"physics: got '{config.physics}', expected one of {', '.join(_PHYSICS)}")
+        self.config = config
+        self.entries = entries
+        model = mujoco.MjModel.from_xml_path(str(constants.MODEL_PATH))
+        model.opt.timestep, self._substeps, model.opt.iterations, model.opt.ls_iterations = _PHYSICS[config.physics]
+        joints = [model.joint(name) for name in constants.JOINTS]
+        self._joint_qpos = np.array([joint.qposadr[0] for joint in joints])
+        self._joint_dof = np.array([joint.dofadr[0] for joint in joints])
+        self._home = jnp.array(model.keyframe("home").qpos, jnp.float32)
+        self.mj_model = model
+        self._model = mjx.put_model(model)
+        self._data = mjx.make_data(model)
+
+    def model(self, params: domain.Params) -> mjx.Model:
+        """The robot with these parameters."""
+        return domain.apply(self._model, params, self.entries)
+
+    def reset(self, params: domain.Params, key: jax.Array) -> State:
+        """Starts an episode near the standing pose, at a random phase, under a random command.
+
+        Args:
+          params: physical values by name (`envs.domain`); a reset does not depend on them, a step does.
+          key: random key.
+        """
+        del params
+        key, key_joint, key_velocity, key_phase, key_command, key_noise = jax.random.split(key, 6)
+        joint = self._home[self._joint_qpos] + jax.random.uniform(key_joint, (6,), minval=-0.1, maxval=0.1)
+        qvel = jax.random.uniform(key_velocity, (self.mj_model.nv,), minval=-0.2, maxval=0.2)
+        zeros = jnp.zeros(6)
+        state = State(
+            qpos=self._home.at[self._joint_qpos].set(joint),
+            qvel=qvel,
+            qacc_warmstart=jnp.zeros_like(qvel),
+            command=self._draw_command(key_command),
+            phase=jnp.mod(jax.random.uniform(key_phase) + jnp.array([0.0, 0.5]), 1.0),
+            action=zeros,
+            joint_error=zeros,
+            obs=jnp.zeros(self.observation_size),
+            reward=jnp.zeros(()),
+            score=jnp.zeros(()),
+            done=jnp.zeros(()),
+            not_finite=jnp.zeros(()),
+            steps=jnp.zeros((), jnp.int32),
+            terms={name: jnp.zeros(()) for name in constants.TABLE_ONE},
+            key=key,
+        )
+        return state.replace(obs=self._observe(state, key_noise))
+
+    def step(self, params: domain.Params, state: State, action: jax.Array) -> State:
+        """Moves the robot on by one policy step of 10 ms under an action [6]."""
+        action = jnp.clip(action, -_ACTION_LIMIT, _ACTION_LIMIT)
+        reference = gait.joint_reference(state.phase, state.command)
+        base = reference if self.config.base == "raibert" else jnp.asarray(constants.STAND_RAD)
+        target = base + self.config.action_scale * action
+
+        model = self.model(params)
+        data = self._data.replace(
+            qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.qacc_warmstart, ctrl=target
+        )
+        data, _ = jax.lax.scan(lambda data, _: (mjx.step(model, data), None), data, length=self._substeps)
+
+        finite = jnp.isfinite(data.qpos).all() & jnp.isfinite(data.qvel).all()
+        torque = data.qfrc_actuator[self._joint_dof]
+        qpos, qvel, warmstart, torque = jax.tree.map(
+            lambda new, old: jnp.where(finite, new, old),
+            (data.qpos, data.qvel, data.qacc_warmstart, torque),
+            (self._home, jnp.zeros_like(state.qvel), jnp.zeros_like(state.qvel), jnp.zeros_like(torque)),
+        )
+        key, key_command, key_noise = jax.random.split(state.key, 3)
+        moved = state.replace(qpos=qpos, qvel=qvel)
+        readings = self._readings(moved)
+        values = rewards.terms(
+            **readings,
+            command=state.command,
+            last_joint_velocity=state.qvel[self._joint_dof],
+            torque=torque,
+            action=action,
+            last_action=state.action,
+            joint_reference=reference,
+        )
+        values = {name: jnp.where(finite, value, 0.0) for name, value in values.items()}
+        fell = (readings["gravity"][2] > -_MAX_TILT_COS) | (qpos[2] < _MIN_HEIGHT_M)
+        done = (fell | ~finite).astype(jnp.float32)
+
+        steps = state.steps + 1
+        redraw = steps % round(self.config.command_s / constants.POLICY_DT_S) == 0
+        moved = moved.replace(
+            qacc_warmstart=warmstart,
+            command=jnp.where(redraw, self._draw_command(key_command), state.command),
+            phase=gait.advance(state.phase),
+            action=action,
+            joint_error=target - readings["joint"],
+            reward=rewards.weigh(values, self.config.weights) - self.config.termination_cost * done,
+            score=rewards.weigh(values, constants.TABLE_ONE),
+            done=done,
+            not_finite=1.0 - finite,
+            steps=steps,
+            terms=values,
+            key=key,
+        )
+        return moved.replace(obs=self._observe(moved, key_noise))
+
+    def _readings(self, state: State) -> dict[str, jax.Array]:
+        quat = state.qpos[3:7]
+        return {
+            "velocity": sensing.rotate_inverse(quat, state.qvel[:3]),
+            "gyro": state.qvel[3:6],  # MuJoCo keeps a free joint's angular velocity in the body frame
+            "gravity": sensing.projected_gravity(quat),
+            "joint": state.qpos[self._joint_qpos],
+            "joint_velocity": state.qvel[self._joint_dof],
+        }
+
+    def _observe(self, state: State, key: jax.Array) -> jax.Array:
+        readings = self._readings(state)
+        if self.config.noise > 0.0:
+            readings = sensing.disturb(key, readings, self.config.noise)
+        return sensing.observe(
+            **readings,
+            command=state.command,
+            last_action=state.action,
+            joint_error=state.joint_error,
+            phase=state.phase,
+        )
+
+    def _draw_command(self, key: jax.Array) -> jax.Array:
+        key_size, key_zero = jax.random.split(key)
+        command = jax.random.uniform(key_size, (3,), minval=-1.0) * jnp.array(self.config.command_max)
+        return jnp.where(jax.random.bernoulli(key_zero, self.config.zero_command_share), 0.0, command)
+
+
+class BraxBiteno(BraxEnv):
+    """A batch of robots behind Brax's interface, each with its own parameters, reset when its episode ends.
+
+    The parameters travel in `state.info["params"]`: set them with `with_params`, nothing is compiled anew.
+    """
+
+    def __init__(self, robot: Biteno):
+        self._robot = robot
+        self._limit = round(robot.config.episode_s / constants.POLICY_DT_S)
+
+    def reset(self, rng: jax.Array) -> BraxState:
+        """Resets a batch of nominal robots, one for each key in `rng` [batch, ...]."""
+        count = rng.shape[0]
+        params = {
+            name: jnp.full(count, value, jnp.float32) for name, value in domain.nominal(self._robot.entries).items()
+        }
+        return self.start(params, rng)
+
+    def start(self, params: domain.Params, keys: jax.Array) -> BraxState:
+        """Resets a batch of robots with the given parameters, each value [batch]."""
+        robots = jax.vmap(self._robot.reset)(params, keys)
+        return self._as_brax(params, robots, robots, jnp.zeros_like(robots.done))
+
+    @staticmethod
+    def with_params(state: BraxState, params: domain.Params) -> BraxState:
+        """The same robots, wherever they are, with other parameters [batch]."""
+        return state.replace(info={**state.info, "params": params})
+
+    def step(self, state: BraxState, action: jax.Array) -> BraxState:
+        """Steps every robot under its action [batch, 6]; those whose episode ended start a new one."""
+        params = state.info["params"]
+        robots = jax.vmap(self._robot.step)(params, state.pipeline_state, action)
+        truncation = (robots.steps >= self._limit) * (1.0 - robots.done)
+        ended = (robots.done + truncation) > 0
+        fresh = jax.vmap(self._robot.reset)(params, robots.key)
+        following = jax.tree.map(
+            lambda new, old: jnp.where(ended.reshape(-1, *[1] * (old.ndim - 1)), new, old), fresh, robots
+        )
+        return self._as_brax(params, robots, following, truncation)
+
+    @staticmethod
+    def _as_brax(params, robots: State, following: State, truncation: jax.Array) -> BraxState:
+        # Brax calls an episode cut by the clock done as well, and tells it apart by `truncation`.
+        return BraxState(
+            pipeline_state=following,
+            obs=following.obs,
+            reward=robots.reward,
+            done=jnp.maximum(robots.done, truncation),
+            metrics={**robots.terms, "score": robots.score, "not_finite": robots.not_finite},
+            info={"params": params, "truncation": truncation},
+        )
+
+    @property
+    def observation_size(self) -> int:
+        return self._robot.observation_size
+
+    @property
+    def action_size(self) -> int:
+        return self._robot.action_size
+
+    @property
+    def backend(self) -> str:
+        return "mjx"

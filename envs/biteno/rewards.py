@@ -1,0 +1,63 @@
+"""Table I of the paper, term by term, unweighted.
+
+Two slips in print are mended: orientation is the horizontal part of projected gravity (|g|^2 is always one, and a policy
+that pays for it learns to fall), and joint acceleration is squared (the square is missing). As in legged_gym, whose form
+this is, acceleration is a finite difference over a policy step and every term is multiplied by that step's length.
+"""
+
+from collections.abc import Mapping
+
+import jax
+import jax.numpy as jnp
+
+from envs.biteno import constants
+
+_SHARPNESS = 4.0
+
+
+def terms(
+    *,
+    velocity: jax.Array,
+    command: jax.Array,
+    gyro: jax.Array,
+    gravity: jax.Array,
+    joint: jax.Array,
+    joint_velocity: jax.Array,
+    last_joint_velocity: jax.Array,
+    torque: jax.Array,
+    action: jax.Array,
+    last_action: jax.Array,
+    joint_reference: jax.Array,
+) -> dict[str, jax.Array]:
+    """The ten terms of Table I, each a scalar without weight or time step.
+
+    Args:
+      velocity, gyro, gravity: [3] body frame, as in `sensing.observe` but without noise.
+      command: [3] m/s, m/s, rad/s.
+      joint, joint_velocity, last_joint_velocity: [6] rad, rad/s; the last one a policy step ago.
+      torque: [6] Nm.
+      action, last_action: [6].
+      joint_reference: [6] rad, Raibert's q*.
+    """
+    acceleration = (joint_velocity - last_joint_velocity) / constants.POLICY_DT_S
+    return {
+        "linear_tracking": jnp.exp(-_SHARPNESS * _square(command[:2] - velocity[:2])),
+        "angular_tracking": jnp.exp(-_SHARPNESS * (command[2] - gyro[2]) ** 2),
+        "linear_velocity_z": velocity[2] ** 2,
+        "angular_velocity_xy": _square(gyro[:2]),
+        "torque": _square(torque),
+        "orientation": _square(gravity[:2]),
+        "joint_acceleration": _square(acceleration),
+        "action_rate": _square(action - last_action),
+        "joint_default": _square(joint - constants.STAND_RAD),
+        "raibert": _square(joint - joint_reference),
+    }
+
+
+def weigh(values: Mapping[str, jax.Array], weights: Mapping[str, float]) -> jax.Array:
+    """Weighted sum of the terms, times the policy's time step."""
+    return constants.POLICY_DT_S * sum(weights[name] * value for name, value in values.items())
+
+
+def _square(vector: jax.Array) -> jax.Array:
+    return jnp.sum(vector**2)

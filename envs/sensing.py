@@ -1,0 +1,84 @@
+"""What the robot perceives: one observation function, whatever engine moves it."""
+
+import jax
+import jax.numpy as jnp
+
+from envs.biteno import constants
+
+_VELOCITY_SCALE = 2.0
+_COMMAND_SCALE = jnp.array([2.0, 2.0, 0.25])
+_GYRO_SCALE = 0.25
+_JOINT_VELOCITY_SCALE = 0.05
+
+NOISE = {"velocity": 0.1, "gyro": 0.2, "gravity": 0.05, "joint": 0.01, "joint_velocity": 1.5}
+"""Half width of the uniform noise, before scaling: m/s, rad/s, 1, rad, rad/s."""
+
+
+def rotate_inverse(quat: jax.Array, vector: jax.Array) -> jax.Array:
+    """Takes a world vector [3] into the frame of a body with orientation `quat` [4] (w, x, y, z)."""
+    w, axis = quat[0], -quat[1:]
+    cross = jnp.cross(axis, vector)
+    return vector + 2.0 * (w * cross + jnp.cross(axis, cross))
+
+
+def projected_gravity(quat: jax.Array) -> jax.Array:
+    """Direction of gravity in the body frame, [3], a unit vector."""
+    return rotate_inverse(quat, jnp.array([0.0, 0.0, -1.0]))
+
+
+def clock(phase: jax.Array) -> jax.Array:
+    """Sine and cosine of each foot's phase: [2] cycles to [4]."""
+    angle = 2.0 * jnp.pi * phase
+    return jnp.stack([jnp.sin(angle), jnp.cos(angle)], axis=-1).reshape(-1)
+
+
+def observe(
+    *,
+    velocity: jax.Array,
+    command: jax.Array,
+    gyro: jax.Array,
+    gravity: jax.Array,
+    joint: jax.Array,
+    joint_velocity: jax.Array,
+    last_action: jax.Array,
+    joint_error: jax.Array,
+    phase: jax.Array,
+) -> jax.Array:
+    """Builds the observation in the paper's order (section IV-A.2).
+
+    Args:
+      velocity: [3] m/s, of the trunk's origin, body frame.
+      command: [3] m/s, m/s, rad/s.
+      gyro: [3] rad/s, body frame.
+      gravity: [3] projected gravity.
+      joint, joint_velocity: [6] rad, rad/s.
+      last_action: [6].
+      joint_error: [6] rad, last target less position.
+      phase: [2] cycles, of each foot.
+
+    Returns:
+      [40]: velocity 0:3, command 3:6, gyro 6:9, gravity 9:12, joint 12:18, joint velocity 18:24, last action 24:30,
+      joint error 30:36, clock 36:40.
+    """
+    return jnp.concatenate(
+        [
+            velocity * _VELOCITY_SCALE,
+            command * _COMMAND_SCALE,
+            gyro * _GYRO_SCALE,
+            gravity,
+            joint - constants.STAND_RAD,
+            joint_velocity * _JOINT_VELOCITY_SCALE,
+            last_action,
+            joint_error,
+            clock(phase),
+        ]
+    )
+
+
+def disturb(key: jax.Array, readings: dict[str, jax.Array], scale: float) -> dict[str, jax.Array]:
+    """Adds uniform sensor noise to the readings named in `NOISE`, `scale` times as wide."""
+    noisy = dict(readings)
+    for (name, width), key_channel in zip(NOISE.items(), jax.random.split(key, len(NOISE)), strict=True):
+        reading = readings[name]
+        noisy[name] = reading + scale * width * jax.random.uniform(key_channel, reading.shape, minval=-1.0)
+    return noisy

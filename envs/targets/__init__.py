@@ -1,0 +1,1 @@
+"""Where measured episodes come from."""

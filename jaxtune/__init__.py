@@ -1,0 +1,1 @@
+"""jaxtune tunes simulators to measured robots, safely, and says what they are missing."""

@@ -1,0 +1,188 @@
+"""The verification model: does the simulated data cover a measured window at all? (Section III-B.2 and IV-A.3.)
+
+A variational autoencoder on windows of 50 consecutive (observation, action) tuples: four strided convolutions down to a
+latent, a symmetric decoder, a learned noise level for every channel. Eq. 2 is mended in sign: as printed, a badly
+reconstructed window lowers the statistic that the text calls high. Here
+
+    novelty(x) = mean over Q of ELBO(simulated neighbour) - ELBO(x),
+
+where Q holds the nearest simulated windows in latent space, so that high means not covered. A window without a neighbour
+within reach has no novelty of its own; its caller gives it a finite cap.
+"""
+
+import math
+from dataclasses import dataclass
+
+import chex
+import jax
+import jax.numpy as jnp
+import optax
+from flax import linen as nn
+from jaxtyping import Array, Bool, Float
+
+from jaxtune import windows
+from jaxtune.types import Trajectory
+
+_STRIDE = 2
+_LAYERS = 4
+_MIN_LOG_STD = -3.0  # noiseless channels (the clock) would otherwise be fitted without end
+
+
+@dataclass(frozen=True, kw_only=True)
+class DVMConfig:
+    """Sizes of the verification model and its training."""
+
+    window: int = 50
+    """Steps in a window."""
+    stride: int = 10
+    """Steps between the windows of a measured episode."""
+    latent: int = 16
+    """Dimensions of the latent space."""
+    channels: int = 64
+    """Channels of every convolution."""
+    train_steps: int = 800
+    """Gradient steps."""
+    batch: int = 128
+    """Windows in a gradient step."""
+    learning_rate: float = 2e-3
+    """Peak of a one-cycle cosine schedule."""
+    references: int = 2048
+    """Simulated windows among which neighbours are sought."""
+    neighbours: int = 10
+    """Size of Q."""
+    reach: float = 0.95
+    """Quantile of the distances among references (to their own last neighbour) beyond which nothing counts as near."""
+
+
+def _halve(x: Float[Array, "batch time channels"]) -> Float[Array, "batch half patch"]:
+    """Patches of four steps at every second step, the edges padded: a strided convolution's input as one matrix."""
+    batch, time, channels = x.shape
+    odd = time % _STRIDE
+    pairs = jnp.pad(x, ((0, 0), (1, 1 + odd), (0, 0))).reshape(batch, -1, _STRIDE * channels)
+    return jnp.concatenate([pairs[:, :-1], pairs[:, 1:]], axis=-1)
+
+
+def _double(x: Float[Array, "batch half patch"], time: int) -> Float[Array, "batch time channels"]:
+    """The transpose of `_halve`: overlapping patches are added up and the padding is cut off."""
+    batch, _, patch = x.shape
+    first, second = jnp.split(x, 2, axis=-1)
+    pairs = jnp.pad(first, ((0, 0), (0, 1), (0, 0))) + jnp.pad(second, ((0, 0), (1, 0), (0, 0)))
+    return pairs.reshape(batch, -1, patch // (2 * _STRIDE))[:, 1 : 1 + time]
+
+
+class _VAE(nn.Module):
+    config: DVMConfig
+    num_channels: int
+
+    def setup(self):
+        width = self.config.channels
+        self.down = [nn.Dense(width) for _ in range(_LAYERS)]
+        self.to_latent = nn.Dense(2 * self.config.latent)
+        self.lengths = [math.ceil(self.config.window / _STRIDE**layer) for layer in range(_LAYERS + 1)]
+        self.from_latent = nn.Dense(self.lengths[-1] * width)
+        outputs = [width] * (_LAYERS - 1) + [self.num_channels]
+        self.up = [nn.Dense(2 * _STRIDE * channels) for channels in outputs]
+        self.log_std = self.param("log_std", nn.initializers.zeros, (self.num_channels,))
+
+    def encode(self, x):
+        for layer in self.down:
+            x = nn.elu(layer(_halve(x)))
+        mean, log_std = jnp.split(self.to_latent(x.reshape(x.shape[0], -1)), 2, axis=-1)
+        return mean, jnp.clip(log_std, -6.0, 2.0)
+
+    def decode(self, z):
+        x = nn.elu(self.from_latent(z)).reshape(z.shape[0], self.lengths[-1], -1)
+        for layer, length in zip(self.up, reversed(self.lengths[:-1]), strict=True):
+            x = _double(layer(x), length)
+            x = x if layer is self.up[-1] else nn.elu(x)
+        return x
+
+    def __call__(self, x, noise):
+        """ELBO [batch] and latent mean [batch, latent] of scaled windows, with latent noise [batch, latent]."""
+        mean, log_std = self.encode(x)
+        error = x - self.decode(mean + jnp.exp(log_std) * noise)
+        channel = jnp.maximum(self.log_std, _MIN_LOG_STD)
+        likelihood = -0.5 * (error * jnp.exp(-channel)) ** 2 - channel - 0.5 * math.log(2 * math.pi)
+        divergence = 0.5 * (mean**2 + jnp.exp(2 * log_std) - 1.0) - log_std
+        return likelihood.sum(axis=(1, 2)) - divergence.sum(axis=1), mean
+
+
+@chex.dataclass(frozen=True)
+class DVM:
+    """A trained verification model and the simulated windows that measured ones are compared with."""
+
+    variables: dict
+    scaler: windows.Scaler
+    latent: jax.Array  # [references, latent]
+    elbo: jax.Array  # [references]
+    reach: jax.Array  # largest distance of a neighbour
+
+
+def train(key: jax.Array, config: DVMConfig, trajectory: Trajectory) -> tuple[DVM, jax.Array]:
+    """Trains on simulated episodes [episodes, time].
+
+    Returns:
+      The model, and its ELBO in nats per window, the mean over the last tenth of the steps.
+    """
+    key_init, key_train, key_reference = jax.random.split(key, 3)
+    scaler = windows.fit_scaler(trajectory)
+    network = _VAE(config, scaler.mean.size)
+    variables = network.init(
+        key_init, jnp.zeros((1, config.window, scaler.mean.size)), jnp.zeros((1, config.latent))
+    )
+    schedule = optax.cosine_onecycle_schedule(config.train_steps, config.learning_rate)
+    optimizer = optax.chain(optax.clip_by_global_norm(100.0), optax.adam(schedule))
+    scale = 1.0 / (config.window * scaler.mean.size)
+
+    def loss(variables, key):
+        key_window, key_noise = jax.random.split(key)
+        window, _ = windows.draw(key_window, trajectory, config.batch, config.window)
+        noise = jax.random.normal(key_noise, (config.batch, config.latent))
+        elbo, _ = network.apply(variables, scaler(window), noise)
+        return -scale * elbo.mean()
+
+    def descend(carry, key):
+        variables, opt_state = carry
+        value, grads = jax.value_and_grad(loss)(variables, key)
+        updates, opt_state = optimizer.update(grads, opt_state, variables)
+        return (optax.apply_updates(variables, updates), opt_state), value
+
+    (variables, _), losses = jax.lax.scan(
+        descend, (variables, optimizer.init(variables)), jax.random.split(key_train, config.train_steps)
+    )
+    window, _ = windows.draw(key_reference, trajectory, config.references, config.window)
+    elbo, latent = _evaluate(config, variables, scaler, window)
+    # The first neighbour of a reference is itself.
+    own, _ = jax.lax.top_k(-_distances(latent, latent), config.neighbours + 1)
+    reach = jnp.quantile(-own[:, -1], config.reach)
+    dvm = DVM(variables=variables, scaler=scaler, latent=latent, elbo=elbo, reach=reach)
+    return dvm, -losses[-max(config.train_steps // 10, 1) :].mean() / scale
+
+
+def novelty(
+    config: DVMConfig, dvm: DVM, trajectory: Trajectory
+) -> tuple[Float[Array, " windows"], Bool[Array, " windows"], Bool[Array, " windows"]]:
+    """Eq. 2, window by window, for one set of episodes [episodes, time].
+
+    Returns:
+      Novelty in nats per window; which windows are valid; which of them have a simulated neighbour within reach (the
+      novelty of the others is zero, and means nothing).
+    """
+    cut, valid = windows.grid(trajectory, config.window, config.stride)
+    elbo, latent = _evaluate(config, dvm.variables, dvm.scaler, cut.reshape(-1, *cut.shape[2:]))
+    closeness, index = jax.lax.top_k(-_distances(latent, dvm.latent), config.neighbours)
+    near = -closeness <= dvm.reach
+    mean = jnp.sum(jnp.where(near, dvm.elbo[index], 0.0), axis=-1) / jnp.maximum(near.sum(axis=-1), 1)
+    covered = near.any(axis=-1)
+    return jnp.where(covered, mean - elbo, 0.0), valid.reshape(-1), covered
+
+
+def _evaluate(config, variables, scaler, window):
+    """ELBO [n], decoded at the latent's mean so that a score is repeatable, and latent mean [n, latent]."""
+    network = _VAE(config, window.shape[-1])
+    return network.apply(variables, scaler(window), jnp.zeros((window.shape[0], config.latent)))
+
+
+def _distances(a: Float[Array, "n latent"], b: Float[Array, "m latent"]) -> Float[Array, "n m"]:
+    square = jnp.sum(a**2, axis=-1)[:, None] + jnp.sum(b**2, axis=-1) - 2.0 * a @ b.T
+    return jnp.sqrt(jnp.maximum(square, 0.0))

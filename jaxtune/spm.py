@@ -1,0 +1,180 @@
+"""The search-parameter model: does the truth lie above a guess? (Section III-B.1 and IV-A.4.)
+
+A window of 50 steps and a guess of all parameters are encoded by a three-layer MLP each; a two-layer head for every
+parameter reads both and answers with a logit, trained by logistic regression on `truth > guess`. Departures from the paper:
+the answer is used with its sign (its rule `mu + alpha q` with q in (0, 1) can only grow); guesses are drawn over the
+query box independently of the truth, the centre among them, so that the answers over a sweep of guesses are one minus a
+distribution function; a window's encoding serves several guesses.
+"""
+
+from dataclasses import dataclass
+
+import chex
+import jax
+import jax.numpy as jnp
+import optax
+from flax import linen as nn
+from jaxtyping import Array, Bool, Float
+
+from jaxtune import dist as dists
+from jaxtune import windows
+from jaxtune.types import Named, ParamDist, Trajectory
+
+
+@dataclass(frozen=True, kw_only=True)
+class SPMConfig:
+    """Sizes of the search-parameter model and its training."""
+
+    window: int = 50
+    """Steps in a window."""
+    stride: int = 10
+    """Steps between the windows of a measured episode."""
+    hidden: tuple[int, int, int] = (256, 128, 128)
+    """Layers of the trajectory encoder; the guess encoder has a quarter of their width."""
+    head: int = 64
+    """Hidden width of every parameter's head."""
+    dropout: float = 0.1
+    """Share of the trajectory encoder's units dropped in training."""
+    train_steps: int = 1500
+    """Gradient steps."""
+    batch: int = 256
+    """Windows in a gradient step."""
+    guesses: int = 8
+    """Guesses judged for every window of a batch, the centre among them."""
+    learning_rate: float = 1e-3
+    """Peak of a one-cycle cosine schedule."""
+    weight_decay: float = 1e-3
+    """Decoupled weight decay."""
+    sweep: int = 33
+    """Guesses in a sweep over the box."""
+
+
+class _Network(nn.Module):
+    config: SPMConfig
+    num_params: int
+
+    def setup(self):
+        self.window_layers = [nn.Dense(width) for width in self.config.hidden]
+        self.guess_layers = [nn.Dense(width // 4) for width in self.config.hidden]
+        self.dropout = nn.Dropout(self.config.dropout)
+        self.head_hidden = nn.Dense(self.num_params * self.config.head)
+        self.head_out = self.param(
+            "head_out", nn.initializers.lecun_normal(), (self.config.head, self.num_params)
+        )
+
+    def __call__(self, window, guesses, deterministic: bool):
+        """Logits [batch, guesses, params] for windows [batch, time, channels], guesses [batch, guesses, params]."""
+        features = window.reshape(window.shape[0], -1)
+        for layer in self.window_layers:
+            features = self.dropout(nn.elu(layer(features)), deterministic=deterministic)
+        for layer in self.guess_layers:
+            guesses = nn.elu(layer(guesses))
+        features = jnp.broadcast_to(features[:, None], (*guesses.shape[:2], features.shape[-1]))
+        hidden = nn.elu(self.head_hidden(jnp.concatenate([features, guesses], axis=-1)))
+        hidden = hidden.reshape(*hidden.shape[:-1], self.num_params, self.config.head)
+        return jnp.einsum("...ph,hp->...p", hidden, self.head_out)
+
+
+@chex.dataclass(frozen=True)
+class SPM:
+    """A trained search-parameter model and the distribution it was trained on."""
+
+    variables: dict
+    scaler: windows.Scaler
+    dist: ParamDist
+
+
+def train(
+    key: jax.Array, config: SPMConfig, trajectory: Trajectory, params: Named, dist: ParamDist
+) -> tuple[SPM, jax.Array]:
+    """Trains on simulated episodes.
+
+    Args:
+      key: random key.
+      config: sizes.
+      trajectory: [episodes, time].
+      params: the true parameters of every episode, [episodes] by name.
+      dist: the distribution they were drawn from; its support is the query box.
+
+    Returns:
+      The model, and its logistic loss per parameter in nats, the mean over the last tenth of the steps (log 2 = ignorance).
+    """
+    key_init, key_train = jax.random.split(key)
+    truth = dists.normalise(dist, params)
+    low, high = dists.normalised_box(dist)
+    scaler = windows.fit_scaler(trajectory)
+    network = _Network(config, truth.shape[-1])
+    sizes = (1, config.window, scaler.mean.size), (1, 1, truth.shape[-1])
+    variables = network.init(key_init, *(jnp.zeros(size) for size in sizes), deterministic=True)
+    schedule = optax.cosine_onecycle_schedule(config.train_steps, config.learning_rate)
+    optimizer = optax.adamw(schedule, weight_decay=config.weight_decay)
+
+    def loss(variables, key):
+        key_window, key_guess, key_dropout = jax.random.split(key, 3)
+        window, episode = windows.draw(key_window, trajectory, config.batch, config.window)
+        shape = (config.batch, config.guesses, truth.shape[-1])
+        guesses = jax.random.uniform(key_guess, shape, minval=low, maxval=high).at[:, 0].set(0.0)
+        logits = network.apply(
+            variables, scaler(window), guesses, deterministic=False, rngs={"dropout": key_dropout}
+        )
+        label = truth[episode][:, None] > guesses
+        return optax.sigmoid_binary_cross_entropy(logits, label).mean(axis=(0, 1)).sum()
+
+    def descend(carry, key):
+        variables, opt_state = carry
+        value, grads = jax.value_and_grad(loss)(variables, key)
+        updates, opt_state = optimizer.update(grads, opt_state, variables)
+        return (optax.apply_updates(variables, updates), opt_state), value
+
+    (variables, _), losses = jax.lax.scan(
+        descend, (variables, optimizer.init(variables)), jax.random.split(key_train, config.train_steps)
+    )
+    tail = losses[-max(config.train_steps // 10, 1) :].mean() / truth.shape[-1]
+    return SPM(variables=variables, scaler=scaler, dist=dist), tail
+
+
+def logits(
+    config: SPMConfig, spm: SPM, trajectory: Trajectory, guesses: Float[Array, "guesses params"]
+) -> Float[Array, "guesses params"]:
+    """Evidence of a set of episodes, for each guess: the mean logit over the set's windows.
+
+    Args:
+      trajectory: [episodes, time], one set.
+      guesses: in units of the radius around the centre.
+    """
+    cut, valid = windows.grid(trajectory, config.window, config.stride)
+    cut, valid = cut.reshape(-1, *cut.shape[2:]), valid.reshape(-1)
+    network = _Network(config, guesses.shape[-1])
+    shape = (cut.shape[0], *guesses.shape)
+    answers = network.apply(spm.variables, spm.scaler(cut), jnp.broadcast_to(guesses, shape), deterministic=True)
+    return _masked_mean(answers, valid)
+
+
+def vote(config: SPMConfig, spm: SPM, trajectory: Trajectory) -> Float[Array, " params"]:
+    """Which way each parameter must move from the centre, in [-1, 1]; positive raises it."""
+    centre = jnp.zeros((1, len(spm.dist.centre)))
+    return 2.0 * jax.nn.sigmoid(logits(config, spm, trajectory, centre)[0]) - 1.0
+
+
+def estimate(config: SPMConfig, spm: SPM, trajectory: Trajectory) -> Float[Array, " params"]:
+    """Where the sweep's logit crosses zero, for each parameter, in units of the radius around the centre.
+
+    Guesses of different parameters are independent in training, so one sweep along the box's diagonal serves them all.
+    The crossing is found as the length of the part of the box where the logit is positive, which is the same where the
+    curve falls and stays inside the box where it never crosses.
+    """
+    low, high = dists.normalised_box(spm.dist)
+    share = jnp.linspace(0.0, 1.0, config.sweep)[:, None]
+    curve = logits(config, spm, trajectory, low + share * (high - low))
+    left, right = curve[:-1], curve[1:]
+    rise = jnp.where(left == right, 1.0, left - right)
+    crossing = jnp.clip(left / rise, 0.0, 1.0)
+    positive = jnp.where((left > 0) & (right > 0), 1.0, 0.0)
+    positive = jnp.where((left > 0) & (right <= 0), crossing, positive)
+    positive = jnp.where((left <= 0) & (right > 0), 1.0 - crossing, positive)
+    return low + (high - low) * positive.mean(axis=0)
+
+
+def _masked_mean(values: Float[Array, "windows ..."], valid: Bool[Array, " windows"]) -> Float[Array, "..."]:
+    weight = valid / jnp.maximum(valid.sum(), 1)
+    return jnp.tensordot(weight, values, axes=1)
