@@ -1,8 +1,8 @@
 """The paper's baselines, each a variant of the same `Tuner` (section IV-B).
 
-`spm` is Algorithm 1 without its gate: the paper's rule on whatever was measured, in a radius that never changes. `Untuned`
-trains on and never moves the distribution: wide, it is domain randomisation; around the target's parameters, the oracle
-that the paper calls pseudo-real.
+`spm` is Algorithm 1 without its gate: the paper's rule on whatever was measured, in a radius that never changes.
+`Untuned` trains on and never moves the distribution: wide, it is domain randomisation; around the target's
+parameters, the oracle that the paper calls pseudo-real.
 """
 
 import dataclasses

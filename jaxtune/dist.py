@@ -79,9 +79,7 @@ def normalised_box(dist: ParamDist) -> tuple[Float[Array, " params"], Float[Arra
 def at_bounds(dist: ParamDist) -> jax.Array:
     """True where every parameter's support fills its bounds, so that widening changes nothing."""
     low, high = box(dist)
-    full = jax.tree.map(
-        lambda a, lower, b, upper: (a <= lower) & (b >= upper), low, dist.lower, high, dist.upper
-    )
+    full = jax.tree.map(lambda a, lower, b, upper: (a <= lower) & (b >= upper), low, dist.lower, high, dist.upper)
     return ravel(full).all()
 
 

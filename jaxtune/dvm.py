@@ -6,8 +6,8 @@ reconstructed window lowers the statistic that the text calls high. Here
 
     novelty(x) = mean over Q of ELBO(simulated neighbour) - ELBO(x),
 
-where Q holds the nearest simulated windows in latent space, so that high means not covered. A window without a neighbour
-within reach has no novelty of its own; its caller gives it a finite cap.
+where Q holds the nearest simulated windows in latent space, so that high means not covered. A window without a
+neighbour within reach has no novelty of its own; its caller gives it a finite cap.
 """
 
 import math
@@ -127,9 +127,7 @@ def train(key: jax.Array, config: DVMConfig, trajectory: Trajectory) -> tuple[DV
     key_init, key_train, key_reference = jax.random.split(key, 3)
     scaler = windows.fit_scaler(trajectory)
     network = _VAE(config, scaler.mean.size)
-    variables = network.init(
-        key_init, jnp.zeros((1, config.window, scaler.mean.size)), jnp.zeros((1, config.latent))
-    )
+    variables = network.init(key_init, jnp.zeros((1, config.window, scaler.mean.size)), jnp.zeros((1, config.latent)))
     schedule = optax.cosine_onecycle_schedule(config.train_steps, config.learning_rate)
     optimizer = optax.chain(optax.clip_by_global_norm(100.0), optax.adam(schedule))
     scale = 1.0 / (config.window * scaler.mean.size)

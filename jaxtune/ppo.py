@@ -1,8 +1,8 @@
 """One pure PPO update, made of Brax's networks, loss, advantage estimate and rollout.
 
-`brax.training.agents.ppo.train` owns its loop, its environments and its optimiser, and cannot be jitted. Here an update is
-a function of the learner's state and the environments' state, so training scans, vmaps over seeds, goes on where it
-stopped, and the physics it trains in may change between two updates without compiling anything anew.
+`brax.training.agents.ppo.train` owns its loop, its environments and its optimiser, and cannot be jitted. Here an
+update is a function of the learner's state and the environments' state, so training scans, vmaps over seeds, goes on
+where it stopped, and the physics it trains in may change between two updates without compiling anything anew.
 """
 
 from collections.abc import Callable
@@ -13,8 +13,8 @@ import jax
 import jax.numpy as jnp
 import optax
 from brax.envs.base import Env, State
-from brax.training.acting import generate_unroll
 from brax.training.acme import running_statistics, specs
+from brax.training.acting import generate_unroll
 from brax.training.agents.ppo import losses, networks
 from flax import linen
 
@@ -149,9 +149,7 @@ class PPO:
     def _pass(self, key, carry, normalizer, data):
         key_shuffle, key_loss = jax.random.split(key)
         order = jax.random.permutation(key_shuffle, self.config.num_envs)
-        batches = jax.tree.map(
-            lambda x: x[order].reshape(self.config.minibatches, -1, *x.shape[1:]), data
-        )
+        batches = jax.tree.map(lambda x: x[order].reshape(self.config.minibatches, -1, *x.shape[1:]), data)
         keys = jax.random.split(key_loss, self.config.minibatches)
         return jax.lax.scan(lambda carry, item: self._descend(*item, carry, normalizer), carry, (keys, batches))
 

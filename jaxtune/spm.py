@@ -1,10 +1,10 @@
 """The search-parameter model: does the truth lie above a guess? (Section III-B.1 and IV-A.4.)
 
 A window of 50 steps and a guess of all parameters are encoded by a three-layer MLP each; a two-layer head for every
-parameter reads both and answers with a logit, trained by logistic regression on `truth > guess`. Departures from the paper:
-the answer is used with its sign (its rule `mu + alpha q` with q in (0, 1) can only grow); guesses are drawn over the
-query box independently of the truth, the centre among them, so that the answers over a sweep of guesses are one minus a
-distribution function; a window's encoding serves several guesses.
+parameter reads both and answers with a logit, trained by logistic regression on `truth > guess`. Departures from the
+paper: the answer is used with its sign (its rule `mu + alpha q` with q in (0, 1) can only grow); guesses are drawn
+over the query box independently of the truth, the centre among them, so that the answers over a sweep of guesses are
+one minus a distribution function; a window's encoding serves several guesses.
 """
 
 from dataclasses import dataclass
@@ -35,11 +35,11 @@ class SPMConfig:
     """Hidden width of every parameter's head."""
     dropout: float = 0.1
     """Share of the trajectory encoder's units dropped in training."""
-    train_steps: int = 1500
+    train_steps: int = 2000
     """Gradient steps."""
     batch: int = 256
     """Windows in a gradient step."""
-    guesses: int = 8
+    guesses: int = 4
     """Guesses judged for every window of a batch, the centre among them."""
     learning_rate: float = 1e-3
     """Peak of a one-cycle cosine schedule."""
@@ -58,9 +58,7 @@ class _Network(nn.Module):
         self.guess_layers = [nn.Dense(width // 4) for width in self.config.hidden]
         self.dropout = nn.Dropout(self.config.dropout)
         self.head_hidden = nn.Dense(self.num_params * self.config.head)
-        self.head_out = self.param(
-            "head_out", nn.initializers.lecun_normal(), (self.config.head, self.num_params)
-        )
+        self.head_out = self.param("head_out", nn.initializers.lecun_normal(), (self.config.head, self.num_params))
 
     def __call__(self, window, guesses, deterministic: bool):
         """Logits [batch, guesses, params] for windows [batch, time, channels], guesses [batch, guesses, params]."""
@@ -97,7 +95,8 @@ def train(
       dist: the distribution they were drawn from; its support is the query box.
 
     Returns:
-      The model, and its logistic loss per parameter in nats, the mean over the last tenth of the steps (log 2 = ignorance).
+      The model, and its logistic loss per parameter in nats, the mean over the last tenth of the steps (log 2 =
+      ignorance).
     """
     key_init, key_train = jax.random.split(key)
     truth = dists.normalise(dist, params)
@@ -114,9 +113,7 @@ def train(
         window, episode = windows.draw(key_window, trajectory, config.batch, config.window)
         shape = (config.batch, config.guesses, truth.shape[-1])
         guesses = jax.random.uniform(key_guess, shape, minval=low, maxval=high).at[:, 0].set(0.0)
-        logits = network.apply(
-            variables, scaler(window), guesses, deterministic=False, rngs={"dropout": key_dropout}
-        )
+        logits = network.apply(variables, scaler(window), guesses, deterministic=False, rngs={"dropout": key_dropout})
         label = truth[episode][:, None] > guesses
         return optax.sigmoid_binary_cross_entropy(logits, label).mean(axis=(0, 1)).sum()
 

@@ -1,7 +1,6 @@
-"""Algorithm 1: train the policy, measure, verify, widen or update, again.
+"""Algorithm 1: measure, verify, widen or update, train the policy, again.
 
     for each tuning
-      policy   <- train_policy(policy, dist)
       measured <- measure(policy)
       do
         D_q, held-out sets <- simulate(policy, draws of dist)
@@ -9,13 +8,17 @@
         if the verdict is `widen`: radius <- radius * widen_factor
       while the verdict is `widen`
       if the verdict is `accept`: dist <- update(D_q, measured, dist)
+      policy <- train_policy(policy, dist)
 
-Departures from the paper: the radius grows only where the check fails (in print it grows before the test), is capped by the
-bounds, and the loop ends with a verdict; the threshold is not set by hand but is a quantile of the novelty of held-out
-simulated sets of as many episodes, which makes the gate a conformal test; the update is signed.
+Departures from the paper: a tuning ends, not starts, with training the policy, so that the first one finds the policy
+that was trained in the first distribution, and the last one leaves a policy that knows the last; the radius grows
+only where the check fails (in print it grows before the test), is capped by the bounds, and the loop ends with a
+verdict; the threshold is not set by hand but is a quantile of the novelty of held-out simulated sets of as many
+episodes, which makes the gate a conformal test; the update is signed.
 
-Everything here is pure. How a policy is trained, how episodes are simulated and measured, how a set is verified and how the
-distribution is updated are functions handed in; with a target in JAX, `Tuner.run` is one program that can be vmapped.
+Everything here is pure. How a policy is trained, how episodes are simulated and measured, how a set is verified and
+how the distribution is updated are functions handed in; with a target in JAX, `Tuner.run` is one program that can be
+vmapped.
 """
 
 from collections.abc import Callable
@@ -32,6 +35,8 @@ from jaxtune.dvm import DVMConfig
 from jaxtune.spm import SPMConfig
 from jaxtune.types import Named, ParamDist, Trajectory, Verdict
 
+_IDENTIFIABLE = 0.8  # an interval this much narrower than one that ignores the data tells something
+
 Policy = Any
 TrainPolicy = Callable[[jax.Array, Policy, ParamDist], tuple[Policy, dict]]
 Simulate = Callable[[jax.Array, Policy, Named], Trajectory]
@@ -42,7 +47,7 @@ Measure = Callable[[jax.Array, Policy], Trajectory]
 class TunerConfig:
     """Sizes of a tuning."""
 
-    episodes: int = 600
+    episodes: int = 800
     """Simulated episodes in D_q, each with its own parameters."""
     set_episodes: int = 5
     """Episodes in a measured set, and in every held-out set that it is compared with."""
@@ -155,9 +160,9 @@ def calibrated_gate(
 ) -> GateInfo:
     """Novelty of a measured set against that of held-out simulated sets (Eq. 2, sign mended).
 
-    A set's score is the mean over its valid windows. A window without a neighbour counts as novel as the most novel window
-    of the calibration. The threshold is the conformal quantile: a set drawn like the held-out ones exceeds it with
-    probability at most `1 - level`.
+    A set's score is the mean over its valid windows. A window without a neighbour counts as novel as the most novel
+    window of the calibration. The threshold is the conformal quantile: a set drawn like the held-out ones exceeds it
+    with probability at most `1 - level`.
     """
     model, elbo = dvm.train(key, config.dvm, collected.trajectory)
     held_out = jax.lax.map(lambda episodes: dvm.novelty(config.dvm, model, episodes), collected.held_out)
@@ -197,7 +202,8 @@ def posterior_update(key, config, collected, measured, dist, knobs) -> tuple[Par
     """Moves the centre to where the sweep's logit crosses zero, and narrows the radius to what is still open.
 
     Held-out sets of known parameters calibrate it: the half width of the interval is the quantile `coverage` of their
-    errors. A parameter whose interval is as wide as one that ignores the data is not identifiable and left where it was.
+    errors. A parameter whose interval is as wide as one that ignores the data is not identifiable and left where it
+    was.
     """
     model, loss = spm.train(key, config.spm, collected.trajectory, collected.params, dist)
     held_out = jax.lax.map(lambda episodes: spm.estimate(config.spm, model, episodes), collected.held_out)
@@ -215,9 +221,6 @@ def posterior_update(key, config, collected, measured, dist, knobs) -> tuple[Par
     return moved, UpdateInfo(step=step, interval=interval, identifiable=identifiable, loss=loss)
 
 
-_IDENTIFIABLE = 0.8
-
-
 @dataclass(frozen=True, kw_only=True)
 class Tuner:
     """Algorithm 1 over the functions it is given.
@@ -226,8 +229,8 @@ class Tuner:
       config: sizes.
       train_policy: `(key, policy, dist) -> (policy, metrics)`.
       simulate: `(key, policy, params [episodes]) -> Trajectory [episodes, time]`.
-      measure: `(key, policy) -> Trajectory [set_episodes, time]`, of the same length, policy and commands; None where the
-        target is not JAX, and the measured set is handed to `tune`.
+      measure: `(key, policy) -> Trajectory [set_episodes, time]`, of the same length, policy and commands; None where
+        the target is not JAX, and the measured set is handed to `tune`.
       verify: scores a measured set.
       update: moves the distribution after an accepted set.
     """
@@ -244,10 +247,11 @@ class Tuner:
         return TunerState(policy=policy, dist=dist, knobs=knobs)
 
     def step(self, key: jax.Array, state: TunerState) -> tuple[TunerState, Info]:
-        """One tuning: train, measure, tune."""
-        key_train, key_measure, key_tune = jax.random.split(key, 3)
+        """One tuning: measure, tune, train."""
+        key_measure, key_tune, key_train = jax.random.split(key, 3)
+        state, info = self.tune(key_tune, state, self.measure(key_measure, state.policy))
         state, metrics = self.train(key_train, state)
-        return self.tune(key_tune, state, self.measure(key_measure, state.policy), metrics)
+        return state, info.replace(train=metrics)
 
     def run(self, key: jax.Array, state: TunerState, num_tunings: int) -> tuple[TunerState, Info]:
         """All tunings; every field of the info is stacked, [num_tunings, ...]."""
@@ -258,9 +262,7 @@ class Tuner:
         policy, metrics = self.train_policy(key, state.policy, state.dist)
         return state.replace(policy=policy), metrics
 
-    def tune(
-        self, key: jax.Array, state: TunerState, measured: Trajectory, metrics: dict | None = None
-    ) -> tuple[TunerState, Info]:
+    def tune(self, key: jax.Array, state: TunerState, measured: Trajectory) -> tuple[TunerState, Info]:
         """Verifies a measured set, widens until it is covered, and updates the distribution if it is."""
         key_gate, key_update = jax.random.split(key)
         carry = self._gate_loop(key_gate, state, measured)
@@ -270,7 +272,7 @@ class Tuner:
             lambda: (carry["dist"], no_update(carry["dist"])),
         )
         info = Info(
-            train=metrics or {},
+            train={},
             calls=carry["calls"],
             verdicts=carry["verdicts"],
             radius=carry["radius"],
@@ -309,9 +311,7 @@ class Tuner:
                 "not_finite": carry["not_finite"] + broken,
             }
 
-        return jax.lax.while_loop(
-            lambda carry: carry["verdict"] == Verdict.WIDEN, body, self._before_gate(key, state)
-        )
+        return jax.lax.while_loop(lambda carry: carry["verdict"] == Verdict.WIDEN, body, self._before_gate(key, state))
 
     def _before_gate(self, key, state):
         shapes = jax.eval_shape(self._collect, key, state.policy, state.dist)
@@ -368,6 +368,4 @@ def no_update(dist: ParamDist) -> UpdateInfo:
     """What an update that did not happen reports."""
     zeros = jnp.zeros(len(dist.centre))
     unknown = jnp.full_like(zeros, jnp.nan)
-    return UpdateInfo(
-        step=zeros, interval=unknown, identifiable=jnp.zeros_like(zeros, bool), loss=jnp.asarray(jnp.nan)
-    )
+    return UpdateInfo(step=zeros, interval=unknown, identifiable=jnp.zeros_like(zeros, bool), loss=jnp.asarray(jnp.nan))

@@ -1,8 +1,9 @@
 """What is known of BITeno, what is chosen, and the parameters by which its simulation may be wrong.
 
 Public: 15.5 kg, 0.95 m tall, legs of 0.65 m, three joints a leg, a policy at 100 Hz over a joint PD at 1000 Hz, 40
-observations, 6 actions and Table I of the paper. Everything else (masses of single links, limits, gains, feet) is a
-choice of this project, scaled from the nearest public robot, the point-footed LimX TRON1 (18.6 kg, the same six joints).
+  observations, 6 actions and Table I of the paper. Everything else (masses of single links, limits, gains, feet) is a
+  choice of this project, scaled from the nearest public robot, the point-footed LimX TRON1 (18.6 kg, the same six
+  joints).
 """
 
 from pathlib import Path
@@ -43,7 +44,8 @@ TABLE_ONE = {
 """Weights of the paper's Table I."""
 
 WALKING = {**TABLE_ONE, "raibert": -5.0, "action_rate": -0.01}
-"""Weights that make it walk. Under Table I alone this robot earns as much by buzzing (13 touchdowns a second and foot)."""
+"""Weights that make it walk. Under Table I alone this robot earns as much by buzzing (13 touchdowns a second and
+foot)."""
 
 
 def _mass(name: str, *bodies: str) -> Entry:
@@ -58,9 +60,7 @@ def _joints(name: str, *fields: str, bounds: tuple[float, float]) -> Entry:
 ENTRIES = {
     entry.name: entry
     for entry in (
-        Entry(
-            name="foot_friction", kind="geom", targets=FEET, fields=("geom_friction",), column=0, bounds=(0.15, 4.0)
-        ),
+        Entry(name="foot_friction", kind="geom", targets=FEET, fields=("geom_friction",), column=0, bounds=(0.15, 4.0)),
         *(_mass(f"{side}_{link}_mass", f"{side}_{link}") for side in SIDES for link in ("abductor", "thigh", "shank")),
         *(_mass(f"{link}_mass", f"left_{link}", f"right_{link}") for link in ("abductor", "thigh", "shank")),
         _mass("trunk_mass", "trunk"),
@@ -95,7 +95,8 @@ ENTRIES = {
         ),
     )
 }
-"""Everything that can be tuned, by name; multipliers of the nominal model, but the centre of mass, which is an offset."""
+"""Everything that can be tuned, by name; multipliers of the nominal model, but the centre of mass, which is an
+offset."""
 
 PARAMETER_SETS = {
     # The paper's own seven, in its order.

@@ -36,7 +36,8 @@ class TaskConfig:
     """The task; defaults are the paper's where it has one."""
 
     physics: Literal["exact", "fast"] = "exact"
-    """`exact`: 10 sub-steps of 1 ms. `fast`: 5 of 2 ms with fewer solver iterations; what is learnt there walks at 1 ms."""
+    """`exact`: 10 sub-steps of 1 ms. `fast`: 5 of 2 ms with fewer solver iterations; what is learnt there walks at 1
+    ms."""
     base: Literal["stand", "raibert"] = "stand"
     """What an action is added to: the standing pose, or Raibert's reference."""
     action_scale: float = 0.25
@@ -149,9 +150,7 @@ class Biteno:
         target = base + self.config.action_scale * action
 
         model = self.model(params)
-        data = self._data.replace(
-            qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.qacc_warmstart, ctrl=target
-        )
+        data = self._data.replace(qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.qacc_warmstart, ctrl=target)
         data, _ = jax.lax.scan(lambda data, _: (mjx.step(model, data), None), data, length=self._substeps)
 
         finite = jnp.isfinite(data.qpos).all() & jnp.isfinite(data.qvel).all()

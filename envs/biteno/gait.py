@@ -14,8 +14,9 @@ def advance(phase: jax.Array) -> jax.Array:
 def foot_reference(phase: jax.Array, command: jax.Array) -> jax.Array:
     """Where each foot's centre should be below its hip.
 
-    In stance (phase below the duty of one half) the foot sweeps back at the commanded speed, half a stride before to half
-    a stride behind the hip; in swing it returns and lifts. A reference without the lift would ask the robot to stand still.
+    In stance (phase below the duty of one half) the foot sweeps back at the commanded speed, half a stride before to
+    half a stride behind the hip; in swing it returns and lifts. A reference without the lift would ask the robot to
+    stand still.
 
     Args:
       phase: [2] cycles.

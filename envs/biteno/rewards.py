@@ -1,8 +1,9 @@
 """Table I of the paper, term by term, unweighted.
 
-Two slips in print are mended: orientation is the horizontal part of projected gravity (|g|^2 is always one, and a policy
-that pays for it learns to fall), and joint acceleration is squared (the square is missing). As in legged_gym, whose form
-this is, acceleration is a finite difference over a policy step and every term is multiplied by that step's length.
+Two slips in print are mended: orientation is the horizontal part of projected gravity (|g|^2 is always one, and a
+  policy that pays for it learns to fall), and joint acceleration is squared (the square is missing). As in
+  legged_gym, whose form this is, acceleration is a finite difference over a policy step and every term is multiplied
+  by that step's length.
 """
 
 from collections.abc import Mapping

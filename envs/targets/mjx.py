@@ -28,6 +28,8 @@ def rollout(robot: Biteno, key: jax.Array, act: Act, params: domain.Params, step
       params: physical values by name, each [episodes].
       steps: length of an episode.
     """
+    # Constant parameters would have the compiler work out every derived field of every model by itself, for minutes.
+    params = jax.lax.optimization_barrier(dict(params))
     count = next(iter(params.values())).shape[0]
     episode = jax.vmap(lambda key, params: _episode(robot, key, act, params, steps))
     keys = jax.random.split(key, count)
@@ -73,8 +75,6 @@ class MjxTarget:
         return rollout(self.robot, key, act, params, steps)
 
 
-def simulate(
-    robot: Biteno, key: jax.Array, act: Act, coordinates: Named, steps: int
-) -> Trajectory:
+def simulate(robot: Biteno, key: jax.Array, act: Act, coordinates: Named, steps: int) -> Trajectory:
     """Plays one episode for every draw of the tuner's distribution, [episodes] by name in search coordinates."""
     return rollout(robot, key, act, domain.from_coordinates(robot.entries, coordinates), steps)

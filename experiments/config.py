@@ -1,0 +1,117 @@
+"""Sizes of the experiments: what a preset buys, each number a field."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from envs import domain
+from envs.biteno import TaskConfig, constants
+from jaxtune.dvm import DVMConfig
+from jaxtune.ppo import PPOConfig
+from jaxtune.spm import SPMConfig
+from jaxtune.tuner import TunerConfig
+
+WALK = Path(__file__).parent / "policies" / "walk"
+"""The policy that ships with the package."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Preset:
+    """Everything that decides how long an experiment takes."""
+
+    task: TaskConfig = field(default_factory=lambda: TaskConfig(physics="fast", base="raibert"))
+    ppo: PPOConfig = field(default_factory=PPOConfig)
+    tuner: TunerConfig = field(default_factory=TunerConfig)
+    policy_radius: float = 0.1
+    """The policy trains within this radius of the centre, however wide the tuner's own is."""
+    episode_steps: int = 250
+    """Steps of a simulated or measured episode."""
+    epochs: int = 40
+    """PPO updates in a tuning; each is one rollout and what is learnt of it."""
+    tunings: int = 5
+    """Tunings in a run."""
+    evaluation_episodes: int = 32
+    """Episodes of the full time limit over which a return is the mean."""
+    scratch_updates: int = 1500
+    """PPO updates of a policy trained from scratch."""
+    chunk: int = 10
+    """PPO updates between two lines of progress."""
+    sweep: TunerConfig = field(
+        default_factory=lambda: TunerConfig(
+            episodes=120,
+            set_episodes=3,
+            held_out_sets=19,
+            max_widenings=4,
+            spm=SPMConfig(hidden=(64, 64, 64), head=16, train_steps=400, batch=64),
+            dvm=DVMConfig(channels=32, train_steps=300, batch=64, references=512),
+        )
+    )
+    """Sizes of every tuning in a sweep, where many run side by side."""
+    sweep_steps: int = 100
+    """Steps of an episode in a sweep."""
+    sweep_tunings: int = 3
+    """Tunings in a sweep."""
+
+
+_TINY = TunerConfig(
+    episodes=24,
+    set_episodes=2,
+    held_out_sets=5,
+    max_widenings=1,
+    spm=SPMConfig(train_steps=20, batch=16, hidden=(32, 32, 32), head=8),
+    dvm=DVMConfig(train_steps=20, batch=16, channels=8, references=64),
+)
+
+_SMOKE = Preset(
+    task=TaskConfig(physics="fast", base="raibert", episode_s=1.0),
+    ppo=PPOConfig(num_envs=16, unroll_steps=8, epochs=1, minibatches=2),
+    tuner=_TINY,
+    episode_steps=80,
+    epochs=2,
+    tunings=2,
+    evaluation_episodes=4,
+    scratch_updates=2,
+    chunk=2,
+    sweep=_TINY,
+    sweep_steps=80,
+    sweep_tunings=2,
+)
+
+_LARGE = TunerConfig(
+    episodes=4000,
+    held_out_sets=199,
+    spm=SPMConfig(hidden=(512, 256, 256), train_steps=6000, batch=1024),
+    dvm=DVMConfig(channels=128, train_steps=4000, batch=512, references=8192),
+)
+
+_GPU = Preset(
+    task=TaskConfig(physics="exact", base="raibert"),
+    ppo=PPOConfig(num_envs=8192, minibatches=8, learning_rate=1e-3, entropy_cost=0.005),
+    tuner=_LARGE,
+    episode_steps=400,
+    epochs=100,
+    evaluation_episodes=256,
+    scratch_updates=400,
+)
+
+PRESETS = {"smoke": _SMOKE, "cpu": Preset(), "gpu": _GPU}
+
+
+def preset(name: str) -> Preset:
+    """A preset by name.
+
+    Raises:
+      ValueError: there is none of this name.
+    """
+    if name not in PRESETS:
+        raise ValueError(f"preset: got '{name}', expected one of {', '.join(PRESETS)}")
+    return PRESETS[name]
+
+
+def chosen(parameters: str) -> dict[str, domain.Entry]:
+    """Rows of the parameter table: a set's name, or names joined by commas.
+
+    Raises:
+      ValueError: a name is neither.
+    """
+    names = constants.PARAMETER_SETS.get(parameters) or tuple(name.strip() for name in parameters.split(","))
+    return domain.select(constants.ENTRIES, names)

@@ -1,0 +1,157 @@
+"""Every picture the experiments draw."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+_COLOURS = {"ours": "tab:blue", "spm": "tab:orange", "dr": "tab:green", "oracle": "tab:gray"}
+_MARKS = {"accept": "o", "widen": "^", "unexplained": "X", "radius_exhausted": "s", "not_finite": "x"}
+
+
+def training(path: Path, curve: Sequence[dict]) -> None:
+    """Reward, Table I return and falls over the steps of a training run."""
+    steps = np.array([line["steps"] for line in curve]) / 1e6
+    panels = {
+        "per second": {"trained reward": "reward", "Table I": "score"},
+        "share of the best": {"linear tracking": "linear_tracking", "angular tracking": "angular_tracking"},
+        "episode ends per 20 s": {"ends": "done"},
+    }
+    scales = {"per second": 100.0, "share of the best": 1.0, "episode ends per 20 s": 2000.0}
+    figure, axes = plt.subplots(1, 3, figsize=(12, 3.2), layout="constrained")
+    for axis, (label, series) in zip(axes, panels.items(), strict=True):
+        for name, key in series.items():
+            axis.plot(steps, scales[label] * np.array([line[key] for line in curve]), label=name)
+        axis.set(xlabel="million steps", ylabel=label)
+        axis.grid(alpha=0.3)
+        axis.legend()
+    axes[2].set_yscale("log")
+    _save(figure, path)
+
+
+def sim2sim(out: Path, results: dict[str, list[dict]], off: Sequence[str], epochs: int) -> None:
+    """After the paper's Figs. 3 and 4: return, parameter error, and the gate over the tunings."""
+    _returns(out / "return.png", results, epochs)
+    _errors(out / "param_error.png", results, off)
+    _each_error(out / "param_error_each.png", results)
+    if any(line.get("verdicts") for runs in results.values() for run in runs for line in run["lines"]):
+        _gate(out / "gate.png", results)
+
+
+def sweep(path: Path, grid: np.ndarray, rows: Sequence[str], columns: Sequence[str], titles: Sequence[str]) -> None:
+    """One heat map for each panel of `grid` [panels, rows, columns]; `titles` holds row, column and panel names."""
+    row_label, column_label, *panels = titles
+    figure, axes = plt.subplots(
+        1, len(panels), figsize=(1.5 + 3.2 * len(panels), 3.4), layout="constrained", squeeze=False, sharey=True
+    )
+    finite = grid[np.isfinite(grid)]
+    low, high = (finite.min(), finite.max()) if finite.size else (0.0, 1.0)
+    for axis, values, title in zip(axes[0], grid, panels, strict=True):
+        image = axis.imshow(values, cmap="viridis_r", vmin=low, vmax=high, aspect="auto")
+        axis.set(xlabel=column_label, title=title)
+        axis.set_xticks(range(len(columns)), columns)
+        axis.set_yticks(range(len(rows)), rows)
+        for (row, column), value in np.ndenumerate(values):
+            dark = np.isfinite(value) and value > (low + high) / 2
+            axis.text(column, row, f"{value:.2f}", ha="center", va="center", color="white" if dark else "black")
+    axes[0, 0].set_ylabel(row_label)
+    figure.colorbar(image, ax=axes, label="mean parameter error at the end")
+    _save(figure, path)
+
+
+def _returns(path: Path, results: dict[str, list[dict]], epochs: int) -> None:
+    figure, axis = plt.subplots(figsize=(6, 4), layout="constrained")
+    for name, runs in results.items():
+        values = np.array([[line["return"] for line in run["lines"]] for run in runs])
+        _spread(axis, np.arange(values.shape[1]) * epochs, values, name)
+    axis.set(xlabel="PPO epochs (dots: tunings)", ylabel="return in the target, Table I weights (at most 70)")
+    axis.legend()
+    _save(figure, path)
+
+
+def _errors(path: Path, results: dict[str, list[dict]], off: Sequence[str]) -> None:
+    figure, axis = plt.subplots(figsize=(6, 4), layout="constrained")
+    for name, runs in results.items():
+        values = np.array([[np.mean([line["param_error"][p] for p in off]) for line in run["lines"]] for run in runs])
+        _spread(axis, np.arange(values.shape[1]), values, name)
+    axis.set(xlabel="tunings", ylabel="mean of |estimate / truth - 1|", ylim=(0, None))
+    axis.set_title(f"over {', '.join(off)}", fontsize=7)
+    axis.legend()
+    _save(figure, path)
+
+
+def _each_error(path: Path, results: dict[str, list[dict]]) -> None:
+    names = list(next(iter(results.values()))[0]["lines"][0]["param_error"])
+    figure, axes = plt.subplots(
+        1, len(names), figsize=(2.2 * len(names) + 1, 3), layout="constrained", sharey=True, squeeze=False
+    )
+    for axis, parameter in zip(axes[0], names, strict=True):
+        for name, runs in results.items():
+            values = np.array([[line["param_error"][parameter] for line in run["lines"]] for run in runs])
+            _spread(axis, np.arange(values.shape[1]), values, name)
+        axis.set_title(parameter, fontsize=9)
+        axis.set_xlabel("tunings")
+    axes[0, 0].set(ylabel="|estimate / truth - 1|", ylim=(0, None))
+    axes[0, -1].legend(fontsize=8)
+    _save(figure, path)
+
+
+def _gate(path: Path, results: dict[str, list[dict]]) -> None:
+    figure, (above, below) = plt.subplots(2, 1, figsize=(8, 5.5), layout="constrained", sharex=True)
+    used = set()
+    for name, runs in results.items():
+        for run in runs:
+            calls = [
+                (line["tuning"] + place / (len(line["verdicts"]) + 1), line, place)
+                for line in run["lines"]
+                for place in range(len(line.get("verdicts", ())))
+            ]
+            if not calls:
+                continue
+            when = [call[0] for call in calls]
+            above.plot(when, [line["radius"][i] for _, line, i in calls], color=_COLOURS[name], alpha=0.6)
+            gated = [(t, line, i) for t, line, i in calls if line["p_value"][i] is not None]
+            below.plot(
+                [t for t, *_ in gated], [line["novelty"][i] for _, line, i in gated], color=_COLOURS[name], alpha=0.6
+            )
+            below.plot(
+                [t for t, *_ in gated],
+                [line["threshold"][i] for _, line, i in gated],
+                color="tab:red",
+                lw=0.8,
+                alpha=0.6,
+            )
+            for moment, line, place in calls:
+                verdict = line["verdicts"][place]
+                label = None if verdict in used else verdict
+                used.add(verdict)
+                above.plot(moment, line["radius"][place], _MARKS[verdict], color=_COLOURS[name], label=label)
+                if line["p_value"][place] is not None:
+                    below.plot(moment, line["novelty"][place], _MARKS[verdict], color=_COLOURS[name])
+    for name in results:
+        above.plot([], [], color=_COLOURS[name], label=name)
+    below.plot([], [], color="tab:red", lw=0.8, label="threshold")
+    above.set(ylabel="largest radius, log space", ylim=(0, None))
+    above.legend(fontsize=8)
+    below.set(xlabel="tunings (fractions: gate calls within one)", ylabel="novelty, nats a window")
+    below.legend(fontsize=8)
+    for axis in (above, below):
+        axis.grid(alpha=0.3)
+    _save(figure, path)
+
+
+def _spread(axis, x: np.ndarray, values: np.ndarray, name: str) -> None:
+    """Mean over seeds as a line, least to largest as a band."""
+    axis.plot(x, values.mean(axis=0), "o-", ms=3, color=_COLOURS[name], label=name)
+    axis.fill_between(x, values.min(axis=0), values.max(axis=0), color=_COLOURS[name], alpha=0.15)
+    axis.grid(alpha=0.3)
+
+
+def _save(figure, path: Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=120)
+    plt.close(figure)

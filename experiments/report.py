@@ -1,0 +1,87 @@
+"""Summaries and closing tables."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+
+def sim2sim(args, results: dict[str, list[dict]], off: Sequence[str]) -> dict:
+    """The summary of a run; `falls_in_target` counts falls in the closing evaluation, `measured_falls` while
+    measuring."""
+    methods, seconds = {}, {}
+    for name, runs in results.items():
+        first, last = ([run["lines"][end] for run in runs] for end in (0, -1))
+        names = list(first[0]["param_error"])
+        calls = [[line for line in run["lines"] if "verdicts" in line] for run in runs]
+        methods[name] = {
+            "return_start": [line["return"] for line in first],
+            "return_end": [line["return"] for line in last],
+            "param_names": names,
+            "param_error_start": [[line["param_error"][p] for p in names] for line in first],
+            "param_error_end": [[line["param_error"][p] for p in names] for line in last],
+            **{
+                field: [[value for line in lines for value in line[field]] for lines in calls]
+                for field in ("radius", "novelty", "threshold", "p_value", "verdicts")
+            },
+            "real_episodes": [run["measured_episodes"] for run in runs],
+            "falls_in_target": [line["falls"] for line in last],
+            "measured_falls": [sum(line["measured_falls"] for line in lines) for lines in calls],
+            "not_finite": [sum(line["not_finite"] for line in lines) for lines in calls],
+        }
+        seconds[name] = [line["seconds"] for line in last]
+    return {
+        "case": args.case,
+        "start": args.start,
+        "preset": args.preset,
+        "seeds": args.seeds,
+        "off": list(off),
+        "methods": methods,
+        "seconds": seconds,
+    }
+
+
+def print_sim2sim(console: Console, summary: dict, results: dict[str, list[dict]]) -> None:
+    """Two tables: the methods side by side, and what became of each parameter."""
+    table = Table(title=f"case {summary['case']}, start {summary['start']:g}X, mean over {summary['seeds']} seed(s)")
+    for column in (
+        "method",
+        "return in target",
+        "falls",
+        "error of what was off",
+        "gate calls",
+        "target episodes",
+        "s",
+    ):
+        table.add_column(column, justify="left" if column == "method" else "right")
+    for name, method in summary["methods"].items():
+        columns = [method["param_names"].index(p) for p in summary["off"]]
+        error = [np.array(method[f"param_error_{end}"])[:, columns].mean() for end in ("start", "end")]
+        verdicts = [verdict for seed in method["verdicts"] for verdict in seed]
+        table.add_row(
+            name,
+            f"{np.mean(method['return_start']):.1f} -> {np.mean(method['return_end']):.1f}",
+            f"{np.mean(method['falls_in_target']):.1f}",
+            f"{error[0]:.3f} -> {error[1]:.3f}",
+            ", ".join(f"{verdicts.count(verdict)} {verdict}" for verdict in dict.fromkeys(verdicts)) or "-",
+            f"{np.mean(method['real_episodes']):.0f}",
+            f"{np.mean(summary['seconds'][name]):.0f}",
+        )
+    console.print(table)
+
+    table = Table(title="|estimate / truth - 1| at the end (not identifiable in the last tuning: ~)")
+    table.add_column("parameter")
+    for name in summary["methods"]:
+        table.add_column(name, justify="right")
+    first = next(iter(summary["methods"].values()))
+    for column, parameter in enumerate(first["param_names"]):
+        cells = []
+        for name, method in summary["methods"].items():
+            lines = [run["lines"][-1] for run in results[name]]
+            unknown = any(line.get("identifiable", {}).get(parameter) is False for line in lines)
+            mean = np.array(method["param_error_end"])[:, column].mean()
+            cells.append(f"{'~ ' if unknown else ''}{mean:.3f}")
+        table.add_row(f"{parameter}{' *' if parameter in summary['off'] else ''}", *cells)
+    table.caption = "* off at the start"
+    console.print(table)

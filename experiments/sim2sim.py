@@ -1,0 +1,250 @@
+"""Tunes the simulator of a walking BITeno to another simulator: `python -m experiments.sim2sim --out DIR`.
+
+The simulator starts at its nominal model, where the starting policy was trained; the target's parameters are the
+nominal ones divided by `start`, so that the simulator starts at `start` times the target. What the table calls error
+is |estimate / truth - 1|, which is 0.5 at both of the paper's starts, 0.5X and 1.5X.
+"""
+
+import dataclasses
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from rich.progress import Progress
+
+from envs import domain
+from envs.targets.mjx import MjxTarget
+from experiments import checkpoint, plots, report
+from experiments.checkpoint import as_json, write_json
+from experiments.config import WALK, Preset, chosen, preset
+from experiments.loop import Loop, Policy
+from experiments.train import bars, console, policy_config, run, walk
+from jaxtune import baselines, tuner
+from jaxtune import dist as dists
+from jaxtune.types import ParamDist, Verdict
+
+CASES: dict[str, Callable[[str], bool]] = {
+    "friction": lambda name: name == "foot_friction",
+    "mass": lambda name: name.endswith("_mass"),
+}
+"""Which of the tuned parameters the target has otherwise."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Args:
+    """Tunes a simulator to a target in another simulator, and compares with the baselines."""
+
+    out: Path = Path("runs/sim2sim")
+    """Folder of the run; the same command with the same folder goes on after the last finished (method, seed)."""
+    case: str = "mass"
+    """What is off: friction or mass."""
+    start: float = 0.5
+    """Where the simulator starts, as a multiple of the target."""
+    methods: tuple[str, ...] = ("ours", "dr")
+    """Which of ours, spm, dr, oracle."""
+    seeds: int = 1
+    """Number of seeds, from 0."""
+    preset: str = "cpu"
+    """Sizes: smoke, cpu or gpu."""
+    policy: str = "walk"
+    """Starting policy: walk (ships with the package), scratch (trained first), or a folder of experiments.train."""
+    parameters: str = "legs6"
+    """Parameters that are tuned: legs6, whole_body, or names joined by commas."""
+    radius: float = 0.2
+    """First radius of ours and spm, in log space."""
+    dr_radius: float = 0.4
+    """Radius of domain randomisation."""
+    update: str = "posterior"
+    """How ours moves the distribution: posterior (sweep, move, narrow) or vote (the paper's rule)."""
+    step_size: float = 0.5
+    """Radii per unit vote in the paper's rule."""
+    widen_factor: float = 1.5
+    """What a failed check multiplies the radius by."""
+    level: float = 0.95
+    """The threshold is this quantile of the novelty of held-out simulated sets."""
+    threshold: float | None = None
+    """A fixed threshold in its stead, in nats per window."""
+
+
+@dataclass(frozen=True)
+class Method:
+    """One row of the comparison."""
+
+    tuner: Any
+    dist: ParamDist
+    sets: int
+    """Measured sets in a tuning."""
+
+
+UPDATES = {"posterior": tuner.posterior_update, "vote": tuner.vote_update}
+
+
+def methods(args: Args, loop: Loop, target: MjxTarget) -> dict[str, Callable[[], Method]]:
+    """The four methods, each the same tuner with other functions or another distribution."""
+    nominal = domain.nominal(loop.entries)
+    narrow, free = (loop.tuner(target, radius) for radius in (loop.preset.policy_radius, float("inf")))
+    untuned = baselines.Untuned(tuner=free)
+    ours = dataclasses.replace(narrow, update=UPDATES[args.update])
+    start = loop.dist(nominal, args.radius)
+    truth = {**nominal, **target.params}
+    return {
+        "ours": lambda: Method(ours, start, 1),
+        "spm": lambda: Method(baselines.spm(narrow), start, 1),
+        "dr": lambda: Method(untuned, loop.dist(nominal, args.dr_radius), 0),
+        "oracle": lambda: Method(untuned, loop.dist(truth, loop.preset.policy_radius), 0),
+    }
+
+
+def check(args: Args) -> tuple[Preset, dict[str, domain.Entry], tuner.Knobs]:
+    """Reads the arguments; whatever is wrong with them is said before anything is compiled.
+
+    Raises:
+      ValueError: names the field, the value and what is allowed.
+    """
+    sizes, entries = preset(args.preset), chosen(args.parameters)
+    allowed = {"case": CASES, "update": UPDATES, "methods": ("ours", "spm", "dr", "oracle")}
+    for field, values in allowed.items():
+        asked = getattr(args, field)
+        for value in asked if isinstance(asked, tuple) else (asked,):
+            if value not in values:
+                raise ValueError(f"{field}: got '{value}', expected one of {', '.join(values)}")
+    if not any(map(CASES[args.case], entries)):
+        raise ValueError(f"parameters: got '{args.parameters}', but case '{args.case}' needs one that it is about")
+    for field in ("start", "radius", "dr_radius", "seeds"):
+        value = getattr(args, field)
+        if not 0 < value < float("inf"):
+            raise ValueError(f"{field}: got {value}, expected a positive, finite number")
+    for name in filter(CASES[args.case], entries):
+        low, high = entries[name].bounds
+        if not low <= 1.0 / args.start <= high:
+            raise ValueError(f"start: got {args.start}, expected {1 / high:g} to {1 / low:g} ({name}'s bounds)")
+    knobs = tuner.knobs(
+        step_size=args.step_size, widen_factor=args.widen_factor, level=args.level, threshold=args.threshold
+    )
+    return sizes, entries, knobs
+
+
+def true_params(args, loop: Loop) -> dict[str, float]:
+    """What the target has: nominal values, those of the case divided by `start`."""
+    off = CASES[args.case]
+    return {name: value / args.start if off(name) else value for name, value in domain.nominal(loop.entries).items()}
+
+
+def starting_policy(args: Args, loop: Loop) -> Policy:
+    """Loads the starting policy, or trains it and keeps it in the run's folder."""
+    fresh = loop.init(jax.random.PRNGKey(0))
+    place = {"walk": WALK, "scratch": args.out / "policy"}.get(args.policy, Path(args.policy))
+    if args.policy == "scratch" and not (place / "config.json").exists():
+        with bars() as progress:
+            policy, curve = walk(jax.random.PRNGKey(0), loop, loop.preset.scratch_updates, progress)
+        checkpoint.save(place, policy.learner, policy_config(loop))
+        write_json(place / "curve.json", {"curve": curve})
+    learner = checkpoint.load(place, fresh.learner, policy_config(loop))
+    return loop.init(jax.random.PRNGKey(0), learner)
+
+
+class Runner:
+    """Runs (method, seed) pairs, each into a file of its own."""
+
+    def __init__(self, args: Args, loop: Loop, target: MjxTarget, policy: Policy, knobs: tuner.Knobs):
+        self._args, self._loop, self._policy, self._knobs = args, loop, policy, knobs
+        self._target = target
+        self._methods = methods(args, loop, target)
+        self._evaluate = jax.jit(lambda key, policy: loop.evaluate(key, policy, target))
+        self._steps = {}
+
+    def __call__(self, name: str, seed: int, progress: Progress) -> dict:
+        """Runs one pair, or reads what an earlier call left."""
+        path = self._args.out / "results" / f"{name}_{seed}.json"
+        tunings = self._loop.preset.tunings
+        task = progress.add_task(f"{name} seed {seed}", total=tunings)
+        if not path.exists():
+            path.parent.mkdir(exist_ok=True)
+            lines = []
+            for line in self._tunings(name, seed):
+                lines.append(line)
+                note = f" return {line['return']:.1f} {' '.join(line.get('verdicts', ()))}"
+                progress.update(task, completed=line["tuning"], description=f"{name} seed {seed}{note}")
+            sets = self._methods[name]().sets * tunings
+            write_json(path, {"lines": lines, "measured_episodes": sets * self._loop.preset.tuner.set_episodes})
+        progress.update(task, completed=tunings)
+        return json.loads(path.read_text())
+
+    def _tunings(self, name: str, seed: int):
+        method = self._methods[name]()
+        # dr and oracle are one program: the distribution is an argument.
+        step = self._steps.setdefault(method.tuner, jax.jit(method.tuner.step))
+        key = jax.random.PRNGKey(seed)
+        key_evaluate, key_steps = jax.random.split(key)
+        state = method.tuner.init(self._policy, method.dist, self._knobs)
+        begin = time.monotonic()
+        info = None
+        for index in range(self._loop.preset.tunings + 1):
+            if index:
+                state, info = step(jax.random.fold_in(key_steps, index), state)
+            value, falls = self._evaluate(key_evaluate, state.policy)
+            line = {"method": name, "seed": seed, "tuning": index, "return": float(value), "falls": int(falls)}
+            line |= self._describe(state.dist) | (self._tell(info) if info is not None else {})
+            yield as_json(line | {"seconds": time.monotonic() - begin})
+
+    def _describe(self, dist: ParamDist) -> dict:
+        centre = domain.from_coordinates(self._loop.entries, dist.centre)
+        truth = domain.nominal(self._loop.entries) | dict(self._target.params)
+        return {
+            "estimate": {name: float(value) for name, value in centre.items()},
+            "radii": {name: float(value) for name, value in dist.radius.items()},
+            "param_error": {
+                name: abs(float(value) / truth[name] - 1) if self._loop.entries[name].log else abs(float(value))
+                for name, value in centre.items()
+            },
+        }
+
+    @staticmethod
+    def _tell(info: tuner.Info) -> dict:
+        calls = int(info.calls)
+        order = dists.names(info.dist)
+        gate = {name: np.asarray(value)[:calls] for name, value in info.gate.items()}
+        update = {
+            name: dict(zip(order, np.asarray(info.update[name]).tolist(), strict=True))
+            for name in ("step", "interval", "identifiable")
+        }
+        return {
+            "verdicts": [Verdict(int(verdict)).name.lower() for verdict in info.verdicts[:calls]],
+            "radius": np.asarray(info.radius)[:calls],
+            **gate,
+            **update,
+            "spm_loss": float(info.update.loss),
+            "measured_falls": int(info.measured_falls),
+            "not_finite": int(info.not_finite),
+            "training": {name: float(np.mean(value)) for name, value in info.train.items()},
+        }
+
+
+def main(args: Args) -> None:
+    """Runs what is not there yet, and writes metrics, summary and plots."""
+    sizes, entries, knobs = check(args)
+    identity = {**dataclasses.asdict(args), "sizes": sizes}
+    for field in ("out", "methods", "seeds"):
+        del identity[field]
+    checkpoint.enable_compilation_cache()
+    loop = Loop(sizes, entries)
+    checkpoint.open_run(args.out, identity)
+    target = MjxTarget(robot=loop.robot, params=true_params(args, loop))
+    runner = Runner(args, loop, target, starting_policy(args, loop), knobs)
+    with bars() as progress:
+        results = {name: [runner(name, seed, progress) for seed in range(args.seeds)] for name in args.methods}
+    summary = report.sim2sim(args, results, tuple(filter(CASES[args.case], entries)))
+    write_json(args.out / "summary.json", summary | {"versions": checkpoint.versions()})
+    lines = [line for runs in results.values() for result in runs for line in result["lines"]]
+    (args.out / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    plots.sim2sim(args.out, results, tuple(filter(CASES[args.case], entries)), sizes.epochs)
+    report.print_sim2sim(console, summary, results)
+
+
+if __name__ == "__main__":
+    run(main, Args)

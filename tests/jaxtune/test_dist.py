@@ -1,0 +1,116 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxtune import dist as dists
+
+
+def scalars(**values):
+    return {name: jnp.float32(value) for name, value in values.items()}
+
+
+@pytest.fixture
+def two():
+    """Centres 0 and 0.75 in bounds of +-1: the second box is cut by its upper bound."""
+    return dists.make(scalars(b=0.75, a=0.0), 0.5, scalars(a=-1, b=-1), scalars(a=1, b=1))
+
+
+def test_vectors_are_sorted_by_name_whatever_the_order_of_the_mapping(two):
+    assert dists.names(two) == ("a", "b")
+    vector = dists.ravel(scalars(b=2.0, a=1.0))
+    np.testing.assert_array_equal(vector, [1.0, 2.0])
+    assert dists.unravel(("a", "b"), vector) == {"a": 1.0, "b": 2.0}
+
+
+def test_ravel_keeps_leading_dimensions():
+    named = {"b": jnp.arange(6.0).reshape(2, 3), "a": jnp.zeros((2, 3))}
+    vector = dists.ravel(named)
+    assert vector.shape == (2, 3, 2)
+    np.testing.assert_array_equal(dists.unravel(("a", "b"), vector)["b"], named["b"])
+
+
+def test_box_is_cut_by_the_bounds(two):
+    low, high = dists.box(two)
+    assert low == {"a": -0.5, "b": 0.25}
+    assert high == {"a": 0.5, "b": 1.0}
+
+
+def test_normalised_box_is_in_radii_around_the_centre(two):
+    low, high = dists.normalised_box(two)
+    np.testing.assert_array_equal(low, [-1.0, -1.0])
+    np.testing.assert_array_equal(high, [1.0, 0.5])  # (1 - 0.75) / 0.5
+
+
+def test_normalise_by_hand(two):
+    np.testing.assert_allclose(dists.normalise(two, scalars(a=0.25, b=0.5)), [0.5, -0.5])
+
+
+def test_samples_fill_the_box_evenly(two):
+    count = 4000
+    draws = dists.sample(jax.random.key(0), two, count)
+    for name, (low, high) in {"a": (-0.5, 0.5), "b": (0.25, 1.0)}.items():
+        values = np.asarray(draws[name])
+        assert values.shape == (count,)
+        assert values.min() >= low
+        assert values.max() <= high
+        tenths = np.histogram(values, bins=10, range=(low, high))[0]
+        # 400 expected in each, standard deviation 19.
+        assert np.all(np.abs(tenths - count / 10) < 5 * 19)
+    # Independent draws correlate by 1 / sqrt(4000) = 0.016.
+    assert abs(np.corrcoef(draws["a"], draws["b"])[0, 1]) < 0.08
+
+
+def test_widen_multiplies_the_radius_up_to_the_width_of_the_bounds(two):
+    wider = dists.widen(two, jnp.float32(1.5))
+    assert wider.radius == {"a": 0.75, "b": 0.75}
+    assert dists.widen(two, jnp.float32(100.0)).radius == {"a": 2.0, "b": 2.0}
+    assert wider.centre == two.centre
+
+
+def test_at_bounds_only_when_every_parameter_is(two):
+    assert not dists.at_bounds(two)
+    # Radius 1 fills a (-1 to 1), but b from 0.75 - 1 = -0.25 only.
+    assert not dists.at_bounds(dists.widen(two, jnp.float32(2.0)))
+    # Radius 1.75 fills both.
+    assert dists.at_bounds(dists.widen(two, jnp.float32(3.5)))
+
+
+def test_a_radius_at_its_cap_is_at_the_bounds_from_any_centre():
+    # upper - (upper - lower) is not lower in float32 for these; widening must still end.
+    for lower, upper in ((-1.2732527, 0.6121195), (-0.7, 0.3), (-1.1, 0.9)):
+        for centre in (lower, upper, (lower + upper) / 3):
+            bounds = scalars(a=lower), scalars(a=upper)
+            dist = dists.make(scalars(a=np.clip(np.float32(centre), *np.float32([lower, upper]))), 0.1, *bounds)
+            assert dists.at_bounds(dists.widen(dist, jnp.float32(1e6))), (lower, upper, centre)
+
+
+def test_move_is_in_radii_and_stops_at_the_bounds(two):
+    moved = dists.move(two, jnp.array([0.5, 0.9]))
+    assert moved.centre == {"a": 0.25, "b": 1.0}  # 0.75 + 0.9 * 0.5 = 1.2
+    assert moved.radius == two.radius
+
+
+def test_make_needs_a_positive_radius():
+    for radius in (0.0, -0.5, float("nan")):
+        with pytest.raises(ValueError, match=f"radius: got {radius}"):
+            dists.make(scalars(a=0), radius, scalars(a=-1), scalars(a=1))
+
+
+@pytest.mark.parametrize("field", ["lower", "upper"])
+def test_make_needs_the_same_names_everywhere(field):
+    bounds = {"lower": scalars(a=-1), "upper": scalars(a=1)} | {field: scalars(wrong=1)}
+    with pytest.raises(ValueError, match=rf"{field}: got \['wrong'\], expected \['a'\]"):
+        dists.make(scalars(a=0), 0.1, **bounds)
+
+
+def test_make_needs_the_centre_within_the_bounds():
+    with pytest.raises(ValueError, match=r"centre\['a'\]: got 2.0, allowed -1.0 to 1.0"):
+        dists.make(scalars(a=2), 0.1, scalars(a=-1), scalars(a=1))
+    with pytest.raises(ValueError, match=r"centre\['b'\]: got nan"):
+        dists.make(scalars(a=0, b=jnp.nan), 0.1, scalars(a=-1, b=-1), scalars(a=1, b=1))
+
+
+def test_operations_batch_over_distributions(two):
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), two, dists.widen(two, jnp.float32(3.5)))
+    np.testing.assert_array_equal(jax.vmap(dists.at_bounds)(stacked), [False, True])

@@ -1,0 +1,180 @@
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import toys
+
+from jaxtune import dist as dists
+from jaxtune import dvm, windows
+from jaxtune.dvm import DVM
+
+CONFIG = toys.DVM
+CENTRE = {"friction": 0.0, "mass": 0.0}
+LOG_2_PI = math.log(2 * math.pi)
+
+
+@pytest.fixture(scope="module")
+def trained():
+    dist = toys.uniform(CENTRE, radius=0.2)
+    simulated = toys.Slider().simulate(jax.random.key(1), toys.policy(), dists.sample(jax.random.key(0), dist, 1024))
+    return jax.jit(lambda key: dvm.train(key, CONFIG, simulated))(jax.random.key(2))
+
+
+@pytest.fixture(scope="module")
+def model(trained):
+    return trained[0]
+
+
+@pytest.fixture(scope="module")
+def score(model):
+    """Mean novelty, validity and cover of every window of a measured set."""
+    novelty = jax.jit(lambda measured: dvm.novelty(CONFIG, model, measured))
+    return lambda measured: jax.tree.map(np.asarray, novelty(measured))
+
+
+def measured(wind=0.0, **truth):
+    return toys.Slider(wind=wind).measure(CENTRE | truth, 3)(jax.random.key(3), toys.policy())
+
+
+@pytest.mark.parametrize("time", [1, 2, 7, 50, 13])
+def test_double_is_the_transpose_of_halve(time):
+    half = math.ceil(time / 2)
+    x = jax.random.normal(jax.random.key(0), (2, time, 3))
+    y = jax.random.normal(jax.random.key(1), (2, half, 12))
+    assert dvm._halve(x).shape == y.shape
+    assert dvm._double(y, time).shape == x.shape
+    np.testing.assert_allclose(jnp.vdot(dvm._halve(x), y), jnp.vdot(x, dvm._double(y, time)), rtol=1e-4)
+
+
+def test_halve_by_hand():
+    # Patches of four steps, the first starting one step before the window, the last ending one after it.
+    x = jnp.arange(1.0, 5.0).reshape(1, 4, 1)
+    np.testing.assert_array_equal(dvm._halve(x), [[[0, 1, 2, 3], [2, 3, 4, 0]]])
+
+
+def test_window_survives_encoder_and_decoder_in_shape():
+    config = dvm.DVMConfig(window=50, latent=3, channels=4)
+    network = dvm._VAE(config, 5)
+    window, noise = jnp.zeros((2, 50, 5)), jnp.zeros((2, 3))
+    elbo, latent = network.init_with_output(jax.random.key(0), window, noise)[0]
+    assert elbo.shape == (2,)
+    assert latent.shape == (2, 3)
+
+
+def blank(config=CONFIG, channels=3, **params):
+    """Variables of a network that encodes and decodes everything as zero, but for what is given."""
+    network = dvm._VAE(config, channels)
+    shapes = jnp.zeros((1, config.window, channels)), jnp.zeros((1, config.latent))
+    variables = jax.tree.map(jnp.zeros_like, network.init(jax.random.key(0), *shapes))
+    return {"params": {**variables["params"], **params}}
+
+
+def test_elbo_by_hand():
+    # Latent mean 0.3 and log deviation -0.5 in each of six dimensions, reconstruction 0, noise exp(0.2) in every
+    # channel.
+    latent = {
+        "kernel": jnp.zeros((4 * 16, 12)),  # 50 steps are 25, 13, 7, 4 after four halvings
+        "bias": jnp.concatenate([jnp.full(6, 0.3), jnp.full(6, -0.5)]),
+    }
+    variables = blank(to_latent=latent, log_std=jnp.full(3, 0.2))
+    x = jax.random.normal(jax.random.key(1), (2, 50, 3))
+    elbo, mean = dvm._VAE(CONFIG, 3).apply(variables, x, jnp.ones((2, 6)))
+    likelihood = -0.5 * np.sum(np.square(x), axis=(1, 2)) / math.exp(0.4) - 150 * (0.2 + 0.5 * LOG_2_PI)
+    divergence = 6 * (0.5 * (0.3**2 + math.exp(-1.0) - 1.0) + 0.5)
+    np.testing.assert_allclose(elbo, likelihood - divergence, rtol=1e-5)
+    np.testing.assert_allclose(mean, 0.3, rtol=1e-6)
+
+
+def test_noise_level_has_a_floor():
+    x = jnp.zeros((1, 50, 3))
+    apply = dvm._VAE(CONFIG, 3).apply
+    floor, _ = apply(blank(log_std=jnp.full(3, -3.0)), x, jnp.zeros((1, 6)))
+    below, _ = apply(blank(log_std=jnp.full(3, -9.0)), x, jnp.zeros((1, 6)))
+    np.testing.assert_allclose(floor, 150 * (3.0 - 0.5 * LOG_2_PI), rtol=1e-5)
+    np.testing.assert_array_equal(below, floor)
+
+
+def placed(reach, neighbours=3):
+    """Every window is encoded at the origin; four simulated ones lie at 0.1, 0.2, 0.4 and 3 from it."""
+    config = dataclasses.replace(CONFIG, neighbours=neighbours)
+    latent = jnp.zeros((4, 6)).at[:, 2].set(jnp.array([0.4, -0.1, 3.0, 0.2]))
+    scaler = windows.Scaler(mean=jnp.zeros(3), std=jnp.ones(3))
+    elbo = jnp.array([-100.0, -300.0, 7.0, -200.0])
+    return config, DVM(variables=blank(), scaler=scaler, latent=latent, elbo=elbo, reach=jnp.float32(reach))
+
+
+@pytest.mark.parametrize(
+    ("reach", "neighbours", "expected"),
+    [
+        (0.25, 3, (-300.0 - 200.0) / 2),  # the third of three is out of reach
+        (0.25, 1, -300.0),
+        (1.0, 3, -200.0),
+        (5.0, 3, -200.0),  # the fourth is within reach and one too many
+        (5.0, 4, (-600.0 + 7.0) / 4),
+    ],
+)
+def test_novelty_is_the_mean_over_near_neighbours_less_its_own_elbo(reach, neighbours, expected):
+    config, model = placed(reach, neighbours)
+    trajectory = measured()
+    novelty, valid, covered = dvm.novelty(config, model, trajectory)
+    cut, _ = windows.grid(trajectory, config.window, config.stride)
+    # A blank network at rest: unit noise, no divergence but that of a unit Gaussian, which is none.
+    own = -0.5 * np.sum(np.square(cut), axis=(2, 3)).reshape(-1) - 75 * LOG_2_PI
+    assert novelty.shape == valid.shape == covered.shape == (9,)  # three windows of three episodes
+    assert valid.all() and covered.all()
+    np.testing.assert_allclose(novelty, expected - own, rtol=1e-4)
+
+
+def test_no_neighbour_within_reach_is_said_and_is_finite():
+    novelty, valid, covered = dvm.novelty(*placed(reach=0.05), measured())
+    assert valid.all()
+    assert not covered.any()
+    np.testing.assert_array_equal(novelty, 0.0)
+
+
+def test_elbo_rises_in_training(trained, model):
+    _, elbo = trained
+    # A window of unit-variance channels without any structure: 150 numbers at 1.42 nats each.
+    assert elbo > -0.6 * 150 * 0.5 * (1 + LOG_2_PI)
+    assert np.isfinite(model.elbo).all()
+    assert model.latent.shape == (CONFIG.references, CONFIG.latent)
+    assert model.reach > 0
+
+
+def test_windows_of_the_same_world_are_not_novel(score):
+    novelty, valid, covered = score(measured(friction=0.1, mass=-0.1))
+    assert valid.all() and covered.all()
+    assert abs(novelty.mean()) < 3.0
+
+
+@pytest.mark.parametrize(
+    "shifted", [{"wind": 0.5}, {"mass": 0.6}, {"mass": -0.6}, {"friction": -0.6, "mass": 0.6}], ids=str
+)
+def test_windows_of_another_world_are_novel(score, shifted):
+    novelty, _, covered = score(measured(**shifted))
+    assert np.isfinite(novelty).all()
+    # Eq. 2 as printed would have the other sign.
+    assert not covered.any() or novelty[covered].mean() > 5.0
+
+
+def test_a_world_far_away_has_no_neighbours_and_no_infinities(score):
+    far = measured()
+    novelty, valid, covered = score(far.replace(obs=1e3 * far.obs))
+    assert valid.all()
+    assert not covered.any()
+    np.testing.assert_array_equal(novelty, 0.0)
+
+
+def test_windows_after_a_fall_are_not_valid(score):
+    trajectory = measured()
+    _, valid, _ = score(trajectory.replace(alive=trajectory.alive.at[0].set(False).at[1, 55:].set(False)))
+    # Starts 0, 5 and 10 of windows of 50 in three episodes: dead from the start, for 55 steps, for all 60.
+    np.testing.assert_array_equal(valid.reshape(3, 3), [[0, 0, 0], [1, 1, 0], [1, 1, 1]])
+
+
+def test_score_is_repeatable(model):
+    first, second = (dvm.novelty(CONFIG, model, measured())[0] for _ in range(2))
+    np.testing.assert_array_equal(first, second)

@@ -1,0 +1,118 @@
+"""A small world with known truth, and sizes of the tuner that suit it."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+
+from jaxtune import dist as dists
+from jaxtune.dvm import DVMConfig
+from jaxtune.spm import SPMConfig
+from jaxtune.tuner import TunerConfig
+from jaxtune.types import ParamDist, Trajectory
+
+# Small enough for seconds on a CPU, large enough to find what the slider shows.
+SPM = SPMConfig(
+    window=50, stride=5, hidden=(64, 32, 32), head=16, dropout=0.05, train_steps=500, batch=128, guesses=4,
+    learning_rate=3e-3, weight_decay=1e-3, sweep=17,
+)  # fmt: skip
+DVM = DVMConfig(
+    window=50, stride=5, latent=6, channels=16, train_steps=400, batch=64, learning_rate=3e-3, references=512,
+    neighbours=5, reach=0.95,
+)  # fmt: skip
+TUNER = TunerConfig(
+    episodes=1024, set_episodes=3, held_out_sets=39, max_widenings=4, patience=2, coverage=0.9, min_radius=0.05,
+    spm=SPM, dvm=DVM,
+)  # fmt: skip
+
+# For tests of the bookkeeping, in which nothing needs to be learned.
+TINY_SPM = SPMConfig(
+    window=50, stride=10, hidden=(8, 8, 8), head=4, dropout=0.1, train_steps=4, batch=8, guesses=2,
+    learning_rate=1e-3, weight_decay=1e-3, sweep=5,
+)  # fmt: skip
+TINY_DVM = DVMConfig(
+    window=50, stride=10, latent=2, channels=4, train_steps=4, batch=8, learning_rate=1e-3, references=32,
+    neighbours=3, reach=0.95,
+)  # fmt: skip
+TINY = TunerConfig(
+    episodes=8, set_episodes=2, held_out_sets=4, max_widenings=2, patience=2, coverage=0.9, min_radius=0.05,
+    spm=TINY_SPM, dvm=TINY_DVM,
+)  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class Slider:
+    """A mass on a spring, pushed by a force of two tones: `mass v' = force - friction v - stiffness x + wind`.
+
+    Parameters are logarithms of multipliers of 1 kg and 1 Ns/m; those that are not `mass` or `friction` enter nowhere.
+    Observed are position and velocity, with noise. The tones surround the resonance of the nominal slider (2 rad/s), so
+    both parameters show within any 2.5 s.
+    """
+
+    steps: int = 60
+    noise: float = 0.02
+    """Standard deviation of both observations."""
+    wind: float = 0.0
+    """A steady push in N. No mass and no friction moves the point of rest, so they cannot stand in for it."""
+    limit: float = 1e3
+    """Position beyond which the episode ends."""
+
+    dt = 0.05
+    stiffness = 4.0
+    tones = (1.5, 4.0)
+
+    def simulate(self, key: jax.Array, policy: Mapping, params: Mapping) -> Trajectory:
+        """One episode for every draw of the parameters, [episodes] by name."""
+        count = params["mass"].shape[0]
+        return jax.vmap(lambda key, params: self._episode(key, policy, params))(jax.random.split(key, count), params)
+
+    def measure(self, truth: Mapping, count: int):
+        """The function that measures `count` episodes of a slider with these parameters."""
+        params = {name: jnp.full(count, value, jnp.float32) for name, value in truth.items()}
+        return lambda key, policy: self.simulate(key, policy, params)
+
+    def _episode(self, key, policy, params):
+        key_start, key_noise = jax.random.split(key)
+        time = self.dt * jnp.arange(self.steps)
+        force = policy["amplitude"] * jnp.sin(jnp.outer(time, jnp.array(self.tones))).sum(axis=-1)
+        mass, friction = jnp.exp(params["mass"]), jnp.exp(params["friction"])
+
+        def step(state, force):
+            position, velocity = state
+            push = force + self.wind - friction * velocity - self.stiffness * position
+            velocity = velocity + self.dt * push / mass
+            return (position + self.dt * velocity, velocity), jnp.stack(state)
+
+        start = 0.05 * jax.random.normal(key_start, (2,))
+        _, clean = jax.lax.scan(step, (start[0], start[1]), force)
+        alive = jnp.cumsum(jnp.abs(clean[:, 0]) > self.limit) == 0
+        return Trajectory(
+            obs=clean + self.noise * jax.random.normal(key_noise, clean.shape),
+            action=force[:, None],
+            alive=alive,
+            score=jnp.where(alive, 1.0 - clean[:, 0] ** 2, 0.0),
+            fell=~alive[-1],
+            not_finite=jnp.asarray(False),
+        )
+
+
+def policy() -> dict:
+    """The untrained policy of the slider."""
+    return {"amplitude": jnp.ones(()), "rounds": jnp.zeros(())}
+
+
+def train_policy(key, policy, dist):
+    """Counts how often it was asked; the force stays what it is, so that episodes of all tunings compare."""
+    rounds = policy["rounds"] + 1
+    return {**policy, "rounds": rounds}, {"rounds": rounds}
+
+
+def uniform(centre: Mapping, radius: float = 0.4, bound: float = 1.2) -> ParamDist:
+    """A distribution within `[-bound, bound]` for every parameter."""
+
+    def everywhere(value):
+        return {name: jnp.float32(value) for name in centre}
+
+    centre = {name: jnp.float32(value) for name, value in centre.items()}
+    return dists.make(centre, radius, everywhere(-bound), everywhere(bound))
