@@ -25,7 +25,7 @@ class Preset:
     """The policy trains within this radius of the centre, however wide the tuner's own is."""
     episode_steps: int = 250
     """Steps of a simulated or measured episode."""
-    epochs: int = 40
+    epochs: int = 30
     """PPO updates in a tuning; each is one rollout and what is learnt of it."""
     tunings: int = 5
     """Tunings in a run."""

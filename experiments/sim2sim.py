@@ -168,6 +168,8 @@ class Runner:
             lines = []
             for line in self._tunings(name, seed):
                 lines.append(line)
+                with (self._args.out / "metrics.jsonl").open("a") as log:
+                    log.write(json.dumps(line) + "\n")
                 note = f" return {line['return']:.1f} {' '.join(line.get('verdicts', ()))}"
                 progress.update(task, completed=line["tuning"], description=f"{name} seed {seed}{note}")
             sets = self._methods[name]().sets * tunings
@@ -240,6 +242,7 @@ def main(args: Args) -> None:
         results = {name: [runner(name, seed, progress) for seed in range(args.seeds)] for name in args.methods}
     summary = report.sim2sim(args, results, tuple(filter(CASES[args.case], entries)))
     write_json(args.out / "summary.json", summary | {"versions": checkpoint.versions()})
+    # What was logged as it came may hold lines of a run that was cut and started again.
     lines = [line for runs in results.values() for result in runs for line in result["lines"]]
     (args.out / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     plots.sim2sim(args.out, results, tuple(filter(CASES[args.case], entries)), sizes.epochs)

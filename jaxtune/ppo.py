@@ -100,6 +100,8 @@ class PPO:
             policy=self._networks.policy_network.init(key_policy),
             value=self._networks.value_network.init(key_value),
         )
+        # Brax leaves the deviations weakly typed; the second update would then be traced anew.
+        params = jax.tree.map(lambda leaf: jnp.asarray(leaf, leaf.dtype), params)
         return PPOState(
             params=params,
             normalizer=running_statistics.init_state(specs.Array((self._observation_size,), jnp.float32)),

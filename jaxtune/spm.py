@@ -35,7 +35,7 @@ class SPMConfig:
     """Hidden width of every parameter's head."""
     dropout: float = 0.1
     """Share of the trajectory encoder's units dropped in training."""
-    train_steps: int = 2000
+    train_steps: int = 1200
     """Gradient steps."""
     batch: int = 256
     """Windows in a gradient step."""

@@ -47,7 +47,7 @@ Measure = Callable[[jax.Array, Policy], Trajectory]
 class TunerConfig:
     """Sizes of a tuning."""
 
-    episodes: int = 800
+    episodes: int = 600
     """Simulated episodes in D_q, each with its own parameters."""
     set_episodes: int = 5
     """Episodes in a measured set, and in every held-out set that it is compared with."""
@@ -203,7 +203,7 @@ def posterior_update(key, config, collected, measured, dist, knobs) -> tuple[Par
 
     Held-out sets of known parameters calibrate it: the half width of the interval is the quantile `coverage` of their
     errors. A parameter whose interval is as wide as one that ignores the data is not identifiable and left where it
-    was.
+    was; one whose interval reaches past the box moves, but keeps its radius.
     """
     model, loss = spm.train(key, config.spm, collected.trajectory, collected.params, dist)
     held_out = jax.lax.map(lambda episodes: spm.estimate(config.spm, model, episodes), collected.held_out)
@@ -216,7 +216,9 @@ def posterior_update(key, config, collected, measured, dist, knobs) -> tuple[Par
     moved = dists.move(dist, step)
     radius = dists.ravel(dist.radius)
     narrowed = jnp.clip(radius * interval, jnp.minimum(config.min_radius, radius), radius)
-    radius = jnp.where(identifiable, narrowed, radius)
+    # Held-out truths all lie in the box; where the interval reaches past it, their errors do not bound the measured one.
+    inside = (step - interval >= low) & (step + interval <= high)
+    radius = jnp.where(identifiable & inside, narrowed, radius)
     moved = moved.replace(radius=dists.unravel(dists.names(dist), radius))
     return moved, UpdateInfo(step=step, interval=interval, identifiable=identifiable, loss=loss)
 
@@ -291,7 +293,7 @@ class Tuner:
             calls = carry["calls"]
             key_collect, key_verify = jax.random.split(jax.random.fold_in(key, calls))
             dist = carry["dist"]
-            collected = self._collect(key_collect, state.policy, dist)
+            collected = self.collect(key_collect, state.policy, dist)
             gate = self.verify(key_verify, self.config, collected, measured, state.knobs)
             better = gate.novelty < carry["least"]
             stalled = jnp.where(better, 0, carry["stalled"] + 1)
@@ -314,7 +316,7 @@ class Tuner:
         return jax.lax.while_loop(lambda carry: carry["verdict"] == Verdict.WIDEN, body, self._before_gate(key, state))
 
     def _before_gate(self, key, state):
-        shapes = jax.eval_shape(self._collect, key, state.policy, state.dist)
+        shapes = jax.eval_shape(self.collect, key, state.policy, state.dist)
         return {
             "calls": jnp.zeros((), int),
             "dist": state.dist,
@@ -326,7 +328,7 @@ class Tuner:
             **no_gate_log(self.config),
         }
 
-    def _collect(self, key, policy, dist) -> Collected:
+    def collect(self, key, policy, dist) -> Collected:
         """Episodes for training and held-out sets, simulated in one batch."""
         key_train, key_held_out, key_simulate = jax.random.split(key, 3)
         sets, each = self.config.held_out_sets, self.config.set_episodes

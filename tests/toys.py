@@ -1,5 +1,6 @@
 """A small world with known truth, and sizes of the tuner that suit it."""
 
+import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -7,14 +8,15 @@ import jax
 import jax.numpy as jnp
 
 from jaxtune import dist as dists
+from jaxtune import dvm, spm
 from jaxtune.dvm import DVMConfig
 from jaxtune.spm import SPMConfig
-from jaxtune.tuner import TunerConfig
+from jaxtune.tuner import Collected, TunerConfig
 from jaxtune.types import ParamDist, Trajectory
 
 # Small enough for seconds on a CPU, large enough to find what the slider shows.
 SPM = SPMConfig(
-    window=50, stride=5, hidden=(64, 32, 32), head=16, dropout=0.05, train_steps=500, batch=128, guesses=4,
+    window=50, stride=5, hidden=(128, 64, 64), head=16, dropout=0.0, train_steps=800, batch=128, guesses=4,
     learning_rate=3e-3, weight_decay=1e-3, sweep=17,
 )  # fmt: skip
 DVM = DVMConfig(
@@ -40,21 +42,27 @@ TINY = TunerConfig(
     spm=TINY_SPM, dvm=TINY_DVM,
 )  # fmt: skip
 
+quick_jit = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
+"""Compiles in half the time and runs several times slower: for what is run once on little data."""
+
+# One compilation for all tests of the same sizes.
+train_spm = jax.jit(spm.train, static_argnums=1)
+train_dvm = jax.jit(dvm.train, static_argnums=1)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Slider:
     """A mass on a spring, pushed by a force of two tones: `mass v' = force - friction v - stiffness x + wind`.
 
-    Parameters are logarithms of multipliers of 1 kg and 1 Ns/m; those that are not `mass` or `friction` enter nowhere.
-    Observed are position and velocity, with noise. The tones surround the resonance of the nominal slider (2 rad/s), so
-    both parameters show within any 2.5 s.
+    Parameters are `mass` and `friction`, logarithms of multipliers of 1 kg and 1 Ns/m, and where it is named a steady
+    `wind` in N: no mass and no friction moves the point of rest, so they cannot stand in for it. Other names enter
+    nowhere. Observed are position and velocity, with noise. The tones surround the resonance of the nominal slider
+    (2 rad/s), so mass and friction show within any 2.5 s.
     """
 
     steps: int = 60
     noise: float = 0.02
     """Standard deviation of both observations."""
-    wind: float = 0.0
-    """A steady push in N. No mass and no friction moves the point of rest, so they cannot stand in for it."""
     limit: float = 1e3
     """Position beyond which the episode ends."""
 
@@ -62,6 +70,7 @@ class Slider:
     stiffness = 4.0
     tones = (1.5, 4.0)
 
+    @functools.partial(jax.jit, static_argnames="self")
     def simulate(self, key: jax.Array, policy: Mapping, params: Mapping) -> Trajectory:
         """One episode for every draw of the parameters, [episodes] by name."""
         count = params["mass"].shape[0]
@@ -76,11 +85,11 @@ class Slider:
         key_start, key_noise = jax.random.split(key)
         time = self.dt * jnp.arange(self.steps)
         force = policy["amplitude"] * jnp.sin(jnp.outer(time, jnp.array(self.tones))).sum(axis=-1)
-        mass, friction = jnp.exp(params["mass"]), jnp.exp(params["friction"])
+        mass, friction, wind = jnp.exp(params["mass"]), jnp.exp(params["friction"]), params.get("wind", 0.0)
 
         def step(state, force):
             position, velocity = state
-            push = force + self.wind - friction * velocity - self.stiffness * position
+            push = force + wind - friction * velocity - self.stiffness * position
             velocity = velocity + self.dt * push / mass
             return (position + self.dt * velocity, velocity), jnp.stack(state)
 
@@ -116,3 +125,19 @@ def uniform(centre: Mapping, radius: float = 0.4, bound: float = 1.2) -> ParamDi
 
     centre = {name: jnp.float32(value) for name, value in centre.items()}
     return dists.make(centre, radius, everywhere(-bound), everywhere(bound))
+
+
+def collect(key: jax.Array, dist: ParamDist, config: TunerConfig = TUNER) -> Collected:
+    """Simulated episodes of one distribution, as the gate and an update see them."""
+    key_params, key_held_out, key_simulate = jax.random.split(key, 3)
+    params = dists.sample(key_params, dist, config.episodes)
+    truths = dists.sample(key_held_out, dist, config.held_out_sets)
+    each = {name: jnp.repeat(value, config.set_episodes) for name, value in truths.items()}
+    held_out = Slider().simulate(jax.random.fold_in(key_simulate, 1), policy(), each)
+    shape = config.held_out_sets, config.set_episodes
+    return Collected(
+        trajectory=Slider().simulate(key_simulate, policy(), params),
+        params=params,
+        held_out=jax.tree.map(lambda leaf: leaf.reshape(*shape, *leaf.shape[1:]), held_out),
+        held_out_params=truths,
+    )

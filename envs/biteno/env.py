@@ -187,7 +187,7 @@ class Biteno:
             reward=rewards.weigh(values, self.config.weights) - self.config.termination_cost * done,
             score=rewards.weigh(values, constants.TABLE_ONE),
             done=done,
-            not_finite=1.0 - finite,
+            not_finite=(~finite).astype(jnp.float32),
             steps=steps,
             terms=values,
             key=key,

@@ -1,0 +1,51 @@
+"""What all tests share: single precision, silence of others' deprecations, and whatever takes long to compile."""
+
+import jax
+import pytest
+
+# The precision that everything runs in, whatever the environment says.
+jax.config.update("jax_enable_x64", False)
+
+
+def pytest_configure(config):
+    # Brax imports JAXopt wherever its environments are imported.
+    config.addinivalue_line("filterwarnings", "ignore:JAXopt is no longer maintained:DeprecationWarning")
+
+
+# The fixtures import for themselves, since the line above rules only after this file has been read.
+
+
+@pytest.fixture(scope="session")
+def robot():
+    from envs.biteno import Biteno, TaskConfig
+
+    return Biteno(TaskConfig())
+
+
+@pytest.fixture(scope="session")
+def apply(robot):
+    """The robot's model with given parameters; pass all of them, or it compiles again."""
+    return jax.jit(robot.model)
+
+
+@pytest.fixture(scope="session")
+def fresh(robot, reset_keys):
+    """A robot after a reset for each of `reset_keys`."""
+    return jax.jit(jax.vmap(lambda key: robot.reset({}, key)))(reset_keys)
+
+
+@pytest.fixture(scope="session")
+def reset_keys():
+    return jax.random.split(jax.random.PRNGKey(0), 2000)
+
+
+@pytest.fixture(scope="session")
+def start(fresh):
+    """One robot after a reset."""
+    return jax.tree.map(lambda leaf: leaf[0], fresh)
+
+
+@pytest.fixture(scope="session")
+def step(robot):
+    """One robot's step; pass all parameters, or it compiles again."""
+    return jax.jit(robot.step)

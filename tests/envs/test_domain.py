@@ -1,0 +1,230 @@
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+import reference
+from mujoco import mjx
+
+from envs import domain
+from envs.biteno import constants
+from envs.biteno.constants import ENTRIES
+
+# Single precision reaches 2e-6 in the inverse weights and 5e-7 elsewhere (double precision 3e-15).
+RTOL = 1e-5
+
+SETS = {**constants.PARAMETER_SETS, "everything": tuple(ENTRIES)}
+
+# Compiled from the geometry and read by the viewer alone; the trunk's box travels with its mass where it is moved.
+NOT_PHYSICS = (".stat.meanmass", ".stat.meansize", ".stat.extent", ".stat.center", ".geom_pos", ".light_poscom0")
+
+# Every kind of joint, branches, a body welded to another and one welded to the world.
+GENERAL = """
+<mujoco>
+  <default><geom contype="0" conaffinity="0"/></default>
+  <worldbody>
+    <body name="wall" pos="0 0 1"><geom size="0.1" mass="3"/></body>
+    <body name="base" pos="0 0 1">
+      <freejoint/>
+      <geom type="box" size="0.1 0.2 0.3" pos="0.02 0.03 0.01" euler="20 10 5" mass="2"/>
+      <body name="arm" pos="0 0.2 0.1" euler="30 0 40">
+        <joint name="arm" type="ball" armature="0.02"/>
+        <geom type="capsule" size="0.05" fromto="0 0 0 0.1 0.2 -0.3" mass="1"/>
+        <body name="hand" pos="0.1 0.2 -0.3"><geom type="box" size="0.05 0.1 0.02" pos="0.05 0 0" mass="0.5"/></body>
+      </body>
+    </body>
+    <body name="sled" pos="1 0 0">
+      <joint name="sled" type="slide" axis="1 0 0" armature="0.1"/>
+      <geom type="box" size="0.1 0.1 0.2" mass="0.7"/>
+      <body name="wheel" pos="0 0 0.2">
+        <joint name="wheel" axis="0 1 0"/>
+        <geom type="cylinder" size="0.1 0.02" zaxis="0 1 0" mass="0.3"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <motor name="sled" joint="sled" gear="2"/>
+    <motor name="wheel" joint="wheel"/>
+  </actuator>
+</mujoco>
+"""
+
+
+@pytest.fixture(scope="module")
+def set_const():
+    return jax.jit(domain.set_const)
+
+
+def assert_fields(model, expected):
+    for name in reference.FIELDS:
+        np.testing.assert_allclose(getattr(model, name), getattr(expected, name), rtol=RTOL, err_msg=name)
+
+
+def floats(model):
+    """Every array of numbers in a model, by path."""
+    return {
+        jax.tree_util.keystr(path): np.asarray(leaf)
+        for path, leaf in jax.tree_util.tree_leaves_with_path(model)
+        if np.issubdtype(np.asarray(leaf).dtype, np.floating)
+    }
+
+
+def assert_models(model, expected):
+    got, expected = floats(model), floats(expected)
+    assert got.keys() == expected.keys()
+    for path in got:
+        if path not in NOT_PHYSICS:
+            np.testing.assert_allclose(got[path], expected[path], rtol=RTOL, atol=1e-7, err_msg=path)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("names", SETS.values(), ids=SETS)
+def test_parameters_applied_are_the_model_recompiled(apply, names, seed):
+    values = reference.draw(np.random.default_rng(seed), names)
+    model, expected = apply(values), reference.recompiled(values)
+    assert_fields(model, expected)
+    np.testing.assert_allclose(model.stat.meaninertia, expected.stat.meaninertia, rtol=RTOL)
+    # Nothing else may have moved, or been forgotten.
+    assert_models(model, mjx.put_model(expected))
+
+
+@pytest.mark.parametrize("name", ENTRIES)
+def test_each_parameter_alone_is_the_model_recompiled(apply, name):
+    # Alone, so that no other hides it: every row of the table moves the model, and moves it where it should.
+    values = reference.params(**{name: 1.7 if ENTRIES[name].log else 0.05})
+    model = apply(values)
+    assert_fields(model, reference.recompiled(values))
+    nominal = floats(apply(reference.params()))
+    assert any(np.any(leaf != nominal[path]) for path, leaf in floats(model).items())
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_derived_fields_are_those_of_mj_setconst(apply, seed):
+    values = reference.draw(np.random.default_rng(10 + seed), SETS["legs6"])
+    model = mujoco.MjModel.from_xml_path(str(constants.MODEL_PATH))
+    for name, value in values.items():
+        if name.endswith("_mass"):
+            for body in ENTRIES[name].targets:
+                model.body(body).mass *= value
+                model.body(body).inertia *= value
+    for foot in constants.FEET:
+        model.geom(foot).friction[0] *= values["foot_friction"]
+    # It leaves the mean inertia to the compiler.
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    assert_fields(apply(values), model)
+
+
+def test_nominal_values_leave_the_model_as_it_is(apply, robot):
+    model = mjx.put_model(robot.mj_model)
+    assert_fields(apply(reference.params()), robot.mj_model)
+    assert_models(apply(reference.params()), model)
+
+
+def test_what_twice_the_trunk_weighs(apply):
+    model = apply(reference.params(trunk_mass=2.0))
+    # 15.5 + 8 kg, carried by the world and by the trunk, and felt by each axis of the free joint.
+    np.testing.assert_allclose(model.body_subtreemass[:2], 23.5, rtol=1e-6)
+    np.testing.assert_allclose(model.dof_M0[:3], 23.5, rtol=1e-6)
+    # 8 (0.12^2 + 0.15^2) / 3 = 0.0984 kg m^2, twice.
+    np.testing.assert_allclose(model.body_inertia[1, 0], 0.1968, rtol=1e-6)
+    # A leg does not hear of it: 1.2 + 1.9 + 0.65 kg.
+    np.testing.assert_allclose(model.body_subtreemass[2], 3.75, rtol=1e-6)
+
+
+def test_derived_fields_of_every_kind_of_joint(set_const):
+    spec = mujoco.MjSpec.from_string(GENERAL)
+    stale = spec.compile()
+    # As after a change of mass: what was derived for the old one must not survive.
+    for name, factor in (("base", 0.4), ("arm", 3.0), ("hand", 2.0), ("sled", 1.5), ("wheel", 0.6)):
+        for geom in spec.body(name).geoms:
+            geom.mass *= factor
+    expected = spec.compile()
+    model = mjx.put_model(stale).replace(
+        body_mass=jnp.asarray(expected.body_mass, jnp.float32),
+        body_inertia=jnp.asarray(expected.body_inertia, jnp.float32),
+    )
+    assert np.any(np.abs(stale.dof_invweight0 / expected.dof_invweight0 - 1) > 0.1)
+    got = set_const(model)
+    for name in ("body_subtreemass", "body_invweight0", "dof_invweight0", "dof_M0", "actuator_acc0"):
+        np.testing.assert_allclose(getattr(got, name), getattr(expected, name), rtol=RTOL, err_msg=name)
+    np.testing.assert_allclose(got.stat.meaninertia, expected.stat.meaninertia, rtol=RTOL)
+
+
+def test_without_jit_and_without_the_rest_of_the_table_it_is_the_same(apply, robot, set_const, monkeypatch):
+    # Op by op, this one function would take longer than all others; see the slow test of the environment.
+    monkeypatch.setattr(domain, "set_const", set_const)
+    values = {"foot_friction": 0.5, "left_thigh_mass": 1.5, "trunk_com_x_m": 0.03, "torque_scale": 0.8}
+    # Each of them a number, as a report would write it; what is left out stays nominal.
+    assert_models(robot.model(values), apply(reference.params(**values)))
+
+
+def test_models_of_a_batch_are_those_of_a_loop(apply, robot):
+    rng = np.random.default_rng(20)
+    draws = [reference.draw(rng, ENTRIES) for _ in range(3)]
+    batch = {name: np.stack([values[name] for values in draws]) for name in ENTRIES}
+
+    def changed(values):
+        model = robot.model(values)
+        return {name: getattr(model, name) for name in reference.FIELDS}
+
+    models = jax.jit(jax.vmap(changed))(batch)
+    for row, values in enumerate(draws):
+        alone = apply(values)
+        for name in reference.FIELDS:
+            np.testing.assert_allclose(models[name][row], getattr(alone, name), rtol=RTOL, err_msg=name)
+
+
+def test_a_parameter_multiplies_or_adds_once_for_each_of_its_targets():
+    model = mjx.put_model(mujoco.MjModel.from_xml_path(str(constants.MODEL_PATH)))
+    # Rows in the order of the targets: joints by their degree of freedom, six of which are the trunk's.
+    assert ENTRIES["joint_damping"].rows(model).tolist() == [6, 7, 8, 9, 10, 11]
+    assert [model.names[model.name_bodyadr[row] :].split(b"\0")[0] for row in ENTRIES["shank_mass"].rows(model)] == [
+        b"left_shank",
+        b"right_shank",
+    ]
+
+
+@pytest.mark.xfail(strict=True, raises=KeyError, reason="apply leaves an unknown name to the dictionary")
+def test_applying_an_unknown_parameter_names_it(robot):
+    with pytest.raises(ValueError, match="'trunk_weight' is unknown"):
+        robot.model({"trunk_weight": 1.0})
+
+
+def test_select_takes_rows_in_the_order_of_the_names():
+    names = ("trunk_mass", "foot_friction")
+    assert tuple(domain.select(ENTRIES, names)) == names
+
+
+def test_an_unknown_parameter_is_named():
+    with pytest.raises(ValueError, match="'trunk_weight' is unknown; allowed: foot_friction, "):
+        domain.select(ENTRIES, ["trunk_mass", "trunk_weight"])
+
+
+@pytest.mark.parametrize(("kind", "target"), [("body", "tail"), ("geom", "trunk_geom"), ("joint", "tail")])
+def test_an_entry_for_an_object_that_is_not_there_is_named(robot, kind, target):
+    entry = domain.Entry(name="tail_mass", kind=kind, targets=("trunk", target), fields=(), bounds=(0.5, 2.0))
+    entry = entry if kind == "body" else domain.Entry(**{**vars(entry), "targets": (target,)})
+    with pytest.raises(ValueError, match=f"'tail_mass': the model has no {kind} named '{target}'"):
+        entry.rows(robot.mj_model)
+
+
+def test_coordinates_are_logarithms_of_multipliers_and_offsets_as_they_are():
+    params = {"trunk_mass": jnp.float32(2.0), "trunk_com_x_m": jnp.float32(-0.03)}
+    coordinates = domain.to_coordinates(ENTRIES, params)
+    # log 2 = 0.693147
+    np.testing.assert_allclose(coordinates["trunk_mass"], 0.693147, rtol=1e-6)
+    np.testing.assert_array_equal(coordinates["trunk_com_x_m"], np.float32(-0.03))
+
+
+def test_coordinates_and_back():
+    params = reference.draw(np.random.default_rng(30), ENTRIES)
+    back = domain.from_coordinates(ENTRIES, domain.to_coordinates(ENTRIES, params))
+    assert back.keys() == params.keys()
+    for name, value in params.items():
+        np.testing.assert_allclose(back[name], value, rtol=1e-6, err_msg=name)
+
+
+def test_the_nominal_robot_is_the_origin():
+    coordinates = domain.to_coordinates(ENTRIES, reference.params())
+    assert len(coordinates) == len(ENTRIES)
+    assert all(value == 0.0 for value in coordinates.values())

@@ -1,0 +1,58 @@
+"""Policies: saved, loaded, and the same next step; what belongs to another config is refused."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+from envs import domain
+from experiments import checkpoint
+from experiments.config import PRESETS, WALK, chosen
+from experiments.loop import Loop
+from experiments.train import policy_config
+
+
+@pytest.fixture(scope="module")
+def loop():
+    return Loop(PRESETS["smoke"], chosen("foot_friction"))
+
+
+def _train(loop, policy, key):
+    dist = loop.dist(domain.nominal(loop.entries), 0.1)
+    return jax.jit(lambda key, policy: loop.train(key, policy, dist, 1))(key, policy)
+
+
+def test_saved_policy_takes_the_same_next_step(loop, tmp_path):
+    policy = loop.init(jax.random.PRNGKey(0))
+    checkpoint.save(tmp_path, policy.learner, policy_config(loop))
+    other = loop.init(jax.random.PRNGKey(7))
+    loaded = other.replace(
+        learner=checkpoint.load(tmp_path, other.learner, policy_config(loop)), robots=policy.robots
+    )
+    expected, _ = _train(loop, policy, jax.random.PRNGKey(1))
+    found, metrics = _train(loop, loaded, jax.random.PRNGKey(1))
+    jax.tree.map(np.testing.assert_array_equal, found, expected)
+    assert np.isfinite(metrics["loss"]).all()
+
+
+def test_policy_of_another_config_is_refused(loop, tmp_path):
+    learner = loop.init(jax.random.PRNGKey(0)).learner
+    checkpoint.save(tmp_path, learner, policy_config(loop))
+    task = dataclasses.replace(loop.preset.task, action_scale=0.5)
+    other = Loop(dataclasses.replace(loop.preset, task=task), loop.entries)
+    with pytest.raises(ValueError, match=r"config\.action_scale is 0\.25 there, expected 0\.5"):
+        checkpoint.load(tmp_path, learner, policy_config(other))
+
+
+def test_missing_policy_is_named(loop, tmp_path):
+    with pytest.raises(ValueError, match=r"policy: .*no config\.json"):
+        checkpoint.load(tmp_path, None, policy_config(loop))
+
+
+def test_shipped_policy_loads_and_has_learnt(loop):
+    fresh = loop.init(jax.random.PRNGKey(0)).learner
+    shipped = checkpoint.load(WALK, fresh, policy_config(loop))
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(shipped.params))
+    # A learner that has seen the task knows that joints do not all move alike.
+    assert np.ptp(shipped.normalizer.std) > 0.1

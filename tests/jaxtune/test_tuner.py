@@ -1,0 +1,500 @@
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import toys
+
+from jaxtune import dist as dists
+from jaxtune import dvm, spm
+from jaxtune import tuner as tuners
+from jaxtune.tuner import GateInfo, Tuner, UpdateInfo, knobs
+from jaxtune.types import Trajectory, Verdict
+
+TWO = {"friction": 0.0, "mass": 0.0}
+THREE = {"colour": 0.0, "friction": 0.0, "mass": 0.0}  # colour enters no equation of the slider
+SLIDER = toys.Slider()
+
+
+def close(one, other, **tolerance):
+    jax.tree.map(functools.partial(np.testing.assert_allclose, **tolerance), one, other)
+
+
+# Knobs -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "expected"),
+    [
+        ("step_size", 0.0, "a positive number"),
+        ("step_size", -0.5, "a positive number"),
+        ("step_size", float("nan"), "a positive number"),
+        ("widen_factor", 1.0, "a number above 1"),
+        ("widen_factor", 0.5, "a number above 1"),
+        ("level", 0.0, "a number between 0 and 1"),
+        ("level", 1.0, "a number between 0 and 1"),
+        ("level", 95.0, "a number between 0 and 1"),
+        ("threshold", float("nan"), "a finite number"),
+        ("threshold", float("inf"), "a finite number"),
+    ],
+)
+def test_knobs_name_what_is_wrong_with_them(field, value, expected):
+    with pytest.raises(ValueError, match=f"{field}: got {value}, expected {expected}"):
+        knobs(**{field: value})
+
+
+def test_knobs_without_a_threshold_hold_nan():
+    assert np.isnan(knobs().threshold)
+    assert knobs(threshold=-2.0).threshold == -2.0
+
+
+# The loop, with a gate that follows a script -----------------------------------------------------------------------
+
+SCRIPTED = dataclasses.replace(toys.TINY, episodes=64, max_widenings=4, patience=2)
+FIRST_RADIUS = 0.2
+
+
+def scripted_gate(key, config, collected, measured, knobs):
+    """Reads its novelty from the first episode's scores: one for each width of the distribution, threshold 1.
+
+    Of 128 uniform draws the outermost is at more than 0.9 of the radius, so it tells how often the radius grew.
+    """
+    outermost = jnp.abs(dists.ravel(collected.params)).max()
+    widenings = jnp.round(jnp.log(outermost / FIRST_RADIUS) / jnp.log(1.5)).astype(int)
+    nan = jnp.asarray(jnp.nan)
+    threshold = jnp.where(jnp.isnan(knobs.threshold), 1.0, knobs.threshold)
+    novelty = measured.score[0, widenings]
+    return GateInfo(novelty=novelty, threshold=threshold, p_value=nan, uncovered=nan, elbo=nan)
+
+
+def half_step(key, config, collected, measured, dist, knobs):
+    step = jnp.full(len(dist.centre), 0.5)
+    info = UpdateInfo(step=step, interval=0.25 * step, identifiable=step > 0, loss=jnp.zeros(()))
+    return dists.move(dist, step), info
+
+
+@pytest.fixture(scope="module")
+def play():
+    """One tuning over a script of novelties; those that are not reached do not matter."""
+    tuner = Tuner(
+        config=SCRIPTED,
+        train_policy=toys.train_policy,
+        simulate=SLIDER.simulate,
+        verify=scripted_gate,
+        update=half_step,
+    )
+    tune = toys.quick_jit(tuner.tune)
+    blank = SLIDER.measure(TWO, 2)(jax.random.key(0), toys.policy())
+
+    def run(*novelties, bound=1.2):
+        measured = blank.replace(score=blank.score.at[0, : len(novelties)].set(jnp.array(novelties)))
+        start = tuner.init(toys.policy(), toys.uniform(TWO, FIRST_RADIUS, bound), knobs())
+        state, info = tune(jax.random.key(1), start, measured)
+        return start, state, info
+
+    return run
+
+
+def expect(info, *verdicts):
+    unused = SCRIPTED.max_widenings + 1 - len(verdicts)
+    np.testing.assert_array_equal(info.verdicts, [*verdicts, *[-1] * unused])
+    assert info.calls == len(verdicts)
+    for log in (info.radius, info.gate.novelty, info.gate.threshold):
+        np.testing.assert_array_equal(np.isnan(log), [False] * len(verdicts) + [True] * unused)
+
+
+def not_updated(state, info):
+    assert state.dist.centre == TWO
+    np.testing.assert_array_equal(info.update.step, 0.0)
+    assert not info.update.identifiable.any()
+    assert np.isnan(info.update.loss)
+
+
+def test_a_covered_set_is_accepted_without_widening(play):
+    start, state, info = play(0.5)
+    expect(info, Verdict.ACCEPT)
+    close(info.dist, start.dist, rtol=0)
+    # Half of a radius of 0.2.
+    close(state.dist.centre, {"friction": 0.1, "mass": 0.1}, rtol=1e-6)
+    close(state.dist.radius, start.dist.radius, rtol=0)
+    np.testing.assert_array_equal(info.update.step, 0.5)
+
+
+def test_a_novelty_at_the_threshold_is_covered(play):
+    expect(play(1.0)[2], Verdict.ACCEPT)
+
+
+def test_widening_ends_where_the_set_is_covered_and_the_update_uses_the_wider_distribution(play):
+    _, state, info = play(9.0, 5.0, 0.5)
+    expect(info, Verdict.WIDEN, Verdict.WIDEN, Verdict.ACCEPT)
+    np.testing.assert_allclose(info.radius[:3], [0.2, 0.3, 0.45], rtol=1e-6)
+    np.testing.assert_allclose(info.gate.novelty[:3], [9.0, 5.0, 0.5])
+    close(info.dist.radius, dict.fromkeys(TWO, 0.45), rtol=1e-6)
+    close(state.dist.centre, dict.fromkeys(TWO, 0.225), rtol=1e-6)
+
+
+def test_novelty_that_never_falls_is_unexplained(play):
+    _, state, info = play(5.0, 5.0, 5.0, 0.5)
+    # The first call is the least so far; two in a row that are not exhaust the patience before the fourth.
+    expect(info, Verdict.WIDEN, Verdict.WIDEN, Verdict.UNEXPLAINED)
+    not_updated(state, info)
+
+
+def test_patience_is_for_calls_in_a_row(play):
+    _, _, info = play(5.0, 6.0, 4.0, 4.5, 0.5)
+    expect(info, *[Verdict.WIDEN] * 4, Verdict.ACCEPT)
+
+
+def test_a_radius_that_may_grow_no_more_is_exhausted(play):
+    _, state, info = play(9.0, 8.0, 7.0, 6.0, 5.0)
+    expect(info, *[Verdict.WIDEN] * 4, Verdict.RADIUS_EXHAUSTED)
+    np.testing.assert_allclose(info.radius, 0.2 * 1.5 ** np.arange(5), rtol=1e-5)
+    not_updated(state, info)
+
+
+def test_widening_stops_where_the_bounds_are_filled(play):
+    _, state, info = play(9.0, 8.0, bound=0.3)
+    expect(info, Verdict.WIDEN, Verdict.RADIUS_EXHAUSTED)
+    assert dists.at_bounds(state.dist)
+    not_updated(state, info)
+
+
+@pytest.mark.parametrize("novelty", [jnp.nan, jnp.inf, -jnp.inf])
+def test_a_novelty_that_is_not_finite_ends_the_tuning_without_an_update(play, novelty):
+    start, state, info = play(novelty)
+    expect_not_finite(info)
+    close(state.dist, start.dist, rtol=0)
+    not_updated(state, info)
+
+
+def expect_not_finite(info):
+    assert info.calls == 1
+    assert info.verdicts[0] == Verdict.NOT_FINITE
+
+
+def test_a_novelty_that_breaks_after_widening_ends_it_too(play):
+    _, state, info = play(9.0, jnp.nan, 0.5)
+    np.testing.assert_array_equal(info.verdicts[:3], [Verdict.WIDEN, Verdict.NOT_FINITE, -1])
+    not_updated(state, info)
+
+
+def test_collected_episodes_keep_to_their_parameters():
+    def tell(key, policy, params):
+        """Episodes whose observation is their parameters."""
+        obs = jnp.broadcast_to(dists.ravel(params)[:, None], (params["mass"].shape[0], 60, 2))
+        alive = jnp.ones(obs.shape[:2], bool)
+        nothing = jnp.zeros(obs.shape[0], bool)
+        return Trajectory(obs=obs, action=obs, alive=alive, score=alive * 1.0, fell=nothing, not_finite=nothing)
+
+    config = dataclasses.replace(toys.TINY, episodes=7, held_out_sets=4, set_episodes=3)
+    tuner = Tuner(config=config, train_policy=toys.train_policy, simulate=tell)
+    dist = toys.uniform(TWO, 0.2)
+    collected = tuner.collect(jax.random.key(0), toys.policy(), dist)
+    assert collected.trajectory.obs.shape == (7, 60, 2)
+    assert collected.held_out.obs.shape == (4, 3, 60, 2)
+    assert collected.held_out.fell.shape == (4, 3)
+    np.testing.assert_array_equal(collected.trajectory.obs[:, 0], dists.ravel(collected.params))
+    for episode in range(3):
+        np.testing.assert_array_equal(collected.held_out.obs[:, episode, 0], dists.ravel(collected.held_out_params))
+    everything = np.concatenate([collected.params["mass"], collected.held_out_params["mass"]])
+    assert len(np.unique(everything)) == 11
+    assert np.abs(everything).max() <= 0.2
+
+
+# Identities of pure functions --------------------------------------------------------------------------------------
+
+
+def drawn_gate(key, config, collected, measured, knobs):
+    """Novelty that depends on every input and is below the threshold half of the time."""
+    value = jax.random.normal(key) + collected.trajectory.obs.mean() + measured.obs.mean()
+    nan = jnp.asarray(jnp.nan)
+    return GateInfo(novelty=value, threshold=jnp.zeros(()), p_value=nan, uncovered=nan, elbo=nan)
+
+
+def drawn_update(key, config, collected, measured, dist, knobs):
+    step = knobs.step_size * jax.random.normal(key, (len(dist.centre),)) + collected.params["mass"].mean()
+    info = UpdateInfo(step=step, interval=step, identifiable=step > 0, loss=jnp.zeros(()))
+    return dists.move(dist, step), info
+
+
+@pytest.fixture(scope="module")
+def drawn():
+    return Tuner(
+        config=toys.TINY,
+        train_policy=toys.train_policy,
+        simulate=SLIDER.simulate,
+        measure=SLIDER.measure(TWO, 2),
+        verify=drawn_gate,
+        update=drawn_update,
+    )
+
+
+def start(tuner, centre=TWO, radius=0.2, **settings):
+    return tuner.init(toys.policy(), toys.uniform(centre, radius), knobs(**settings))
+
+
+@pytest.fixture(scope="module")
+def drawn_step(drawn):
+    return toys.quick_jit(drawn.step)
+
+
+def test_run_is_a_loop_of_steps(drawn, drawn_step):
+    state, infos = toys.quick_jit(lambda key, state: drawn.run(key, state, 4))(jax.random.key(0), start(drawn))
+    looped = start(drawn)
+    for index, key in enumerate(jax.random.split(jax.random.key(0), 4)):
+        looped, info = drawn_step(key, looped)
+        close(jax.tree.map(lambda leaf, index=index: leaf[index], infos), info, rtol=1e-5, atol=1e-6)
+    close(state, looped, rtol=1e-5, atol=1e-6)
+    # The tunings of this key took different ways; else the test would show little.
+    assert len(np.unique(infos.calls)) > 1
+    assert state.policy["rounds"] == 4
+
+
+def test_a_jitted_step_is_measuring_tuning_and_training_without_jit(drawn, drawn_step):
+    key = jax.random.key(2)
+    key_measure, key_tune, key_train = jax.random.split(key, 3)
+    # As with a foreign target: the measured set comes from outside.
+    measured = drawn.measure(key_measure, toys.policy())
+    state, info = dataclasses.replace(drawn, measure=None).tune(key_tune, start(drawn), measured)
+    state, metrics = drawn.train(key_train, state)
+    close((state, info.replace(train=metrics)), drawn_step(key, start(drawn)), rtol=1e-5, atol=1e-6)
+
+
+@pytest.fixture(scope="module")
+def counted():
+    """A whole tuner of tiny models, and how often its simulation was traced."""
+    traces = []
+
+    def simulate(key, policy, params):
+        traces.append(1)
+        return SLIDER.simulate(key, policy, params)
+
+    tuner = Tuner(config=toys.TINY, train_policy=toys.train_policy, simulate=simulate, measure=SLIDER.measure(TWO, 2))
+    return tuner, toys.quick_jit(tuner.step), traces
+
+
+def test_distribution_and_knobs_change_without_a_new_trace(counted):
+    tuner, step, traces = counted
+    first, _ = step(jax.random.key(0), start(tuner))
+    before = len(traces)
+    step(jax.random.key(1), first)
+    step(jax.random.key(2), start(tuner, {"friction": 0.4, "mass": -0.3}, radius=0.5))
+    step(jax.random.key(3), start(tuner, step_size=0.1, widen_factor=2.0, level=0.5))
+    step(jax.random.key(4), start(tuner, threshold=3.0))
+    assert len(traces) == before
+
+
+def test_vmap_over_seeds_and_starts_is_a_loop(counted):
+    tuner, step, _ = counted
+    keys = jax.random.split(jax.random.key(5), 3)
+    # A threshold that nothing passes, one that all pass and a calibrated one: the lanes end after different calls.
+    starts = [start(tuner, threshold=-1e6), start(tuner, {"friction": 0.4, "mass": -0.3}, threshold=1e6), start(tuner)]
+    together = toys.quick_jit(jax.vmap(tuner.step))(keys, jax.tree.map(lambda *leaves: jnp.stack(leaves), *starts))
+    alone = [step(key, state) for key, state in zip(keys, starts, strict=True)]
+    close(together, jax.tree.map(lambda *leaves: jnp.stack(leaves), *alone), rtol=1e-3, atol=1e-3)
+    assert len({int(info.calls) for _, info in alone}) > 1
+
+
+# The calibrated gate on the slider ---------------------------------------------------------------------------------
+
+SETS = 24
+
+
+def stacked(truth, count=SETS, seed=0):
+    """Measured sets, [sets, set_episodes, time]; a name of the truth may hold one value for each."""
+    truth = {name: jnp.broadcast_to(jnp.float32(value), count) for name, value in (TWO | truth).items()}
+    each = {name: jnp.repeat(value, toys.TUNER.set_episodes) for name, value in truth.items()}
+    sets = SLIDER.simulate(jax.random.key(seed), toys.policy(), each)
+    return jax.tree.map(lambda leaf: leaf.reshape(count, -1, *leaf.shape[1:]), sets)
+
+
+@pytest.fixture(scope="module")
+def gate():
+    """Scores of many measured sets against one collection of radius 0.2 around zero."""
+    dist = toys.uniform(TWO, 0.2)
+
+    @functools.cache
+    def prepare(seed):
+        collected = toys.collect(jax.random.key(seed), dist)
+        return collected, toys.train_dvm(jax.random.key(seed), toys.DVM, collected.trajectory)
+
+    @jax.jit
+    def score(collected, trained, sets, knobs):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(dvm, "train", lambda key, config, trajectory: trained)
+            one = functools.partial(tuners.calibrated_gate, jax.random.key(0), toys.TUNER, collected)
+            return jax.vmap(one, in_axes=(0, None))(sets, knobs)
+
+    return lambda sets, seed=0, **settings: jax.tree.map(np.asarray, score(*prepare(seed), sets, knobs(**settings)))
+
+
+def test_p_values_of_sets_from_the_distribution_are_even(gate):
+    # Sets drawn like the held-out ones, against three collections: 72 p-values, uniform if the gate is calibrated.
+    draw = [dists.sample(jax.random.key(seed), toys.uniform(TWO, 0.2), SETS) for seed in range(3)]
+    scores = [gate(stacked(truth, seed=10 + seed), seed) for seed, truth in enumerate(draw)]
+    p_values = np.concatenate([score.p_value for score in scores])
+    # Each collection's p-values share one calibration of 39, so the deviation of their mean is that of three times
+    # 1 / sqrt(12 * 39), 0.027, besides that of 72 draws, 0.034.
+    assert abs(p_values.mean() - 0.5) < 0.13
+    # 0.05 expected.
+    assert (p_values <= 0.05).mean() < 0.15
+    assert (p_values <= 0.25).mean() < 0.45
+    for score in scores:
+        # The reach leaves one reference in twenty without a full Q; hardly a window is without any neighbour.
+        assert score.uncovered.mean() < 0.05
+
+
+def test_threshold_and_p_value_say_the_same(gate):
+    score = gate(stacked({"mass": jnp.linspace(-0.4, 0.4, SETS)}))
+    # Rank 38 of 39: a set above it has at most one held-out set as novel, p = (1 + 1) / 40.
+    np.testing.assert_array_equal(score.novelty > score.threshold, score.p_value < 0.06)
+    assert 0 < (score.novelty > score.threshold).sum() < SETS
+
+
+@pytest.mark.parametrize(
+    "shifted", [{"mass": 0.6}, {"mass": -0.6}, {"friction": -0.6, "mass": 0.5}, {"wind": 0.5}], ids=str
+)
+def test_gate_rings_for_another_world(gate, shifted):
+    score = gate(stacked(shifted))
+    assert np.isfinite(score.novelty).all()
+    assert (score.novelty > score.threshold).mean() > 0.9
+    assert (score.p_value <= 0.05).mean() > 0.9
+
+
+def test_a_set_far_from_everything_has_the_finite_cap(gate):
+    sets = stacked({})
+    far = gate(sets.replace(obs=1e3 * sets.obs))
+    assert np.all(far.uncovered == 1.0)
+    assert np.isfinite(far.novelty).all()
+    # The cap is the worst window of the calibration, the same for all, and no mean of windows exceeds it.
+    np.testing.assert_allclose(far.novelty, far.novelty[0], rtol=1e-5)
+    assert np.all(far.novelty > far.threshold)
+
+
+def test_a_set_without_a_window_has_no_score(gate):
+    sets = stacked({})
+    score = gate(sets.replace(alive=sets.alive.at[0, :, 30:].set(False)))
+    assert np.isnan(score.novelty[0])
+    assert np.isfinite(score.novelty[1:]).all()
+
+
+def test_episodes_that_ended_early_lend_their_whole_windows(gate):
+    sets = stacked({})
+    fallen = sets.replace(
+        alive=sets.alive.at[:, 0, 52:].set(False),
+        obs=sets.obs.at[:, 0, 52:].set(1e6),
+    )
+    score = gate(fallen)
+    assert (score.novelty <= score.threshold).mean() > 0.8
+
+
+def test_a_fixed_threshold_replaces_the_calibrated_one(gate):
+    fixed, calibrated = gate(stacked({}), threshold=-3.0), gate(stacked({}))
+    np.testing.assert_array_equal(fixed.threshold, -3.0)
+    np.testing.assert_array_equal(fixed.p_value, calibrated.p_value)
+    median = gate(stacked({}), level=0.5)
+    assert np.all(median.threshold < calibrated.threshold)
+
+
+# The updates on the slider -----------------------------------------------------------------------------------------
+
+
+def apply(update, seed, dist, truth):
+    key = jax.random.key(seed)
+    measured = SLIDER.measure(truth, 3)(jax.random.fold_in(key, 2), toys.policy())
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(spm, "train", toys.train_spm)
+        return update(key, toys.TUNER, toys.collect(jax.random.fold_in(key, 1), dist), measured, dist, knobs())
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_vote_moves_half_a_radius_towards_the_truth(side):
+    dist = toys.uniform(THREE, 0.4)
+    moved, info = apply(tuners.vote_update, 0, dist, {"friction": side * 0.3, "mass": -side * 0.3})
+    # Votes are nearly unanimous at three quarters of the radius: 0.4 * 0.5 * 1.
+    np.testing.assert_allclose(moved.centre["friction"], side * 0.2, atol=0.04)
+    np.testing.assert_allclose(moved.centre["mass"], -side * 0.2, atol=0.04)
+    assert abs(moved.centre["colour"]) < 0.08
+    close(moved.radius, dist.radius, rtol=0)
+    np.testing.assert_allclose(info.step, dists.normalise(dist, moved.centre), rtol=1e-5)
+    assert np.all(np.abs(info.step) <= 0.5)
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_posterior_moves_to_the_truth_narrows_and_leaves_the_unseen_alone(side):
+    dist = toys.uniform(THREE | {"colour": 0.1}, 0.4)
+    truth = {"friction": side * 0.25, "mass": -side * 0.25}
+    moved, info = apply(tuners.posterior_update, 0, dist, truth)
+    np.testing.assert_array_equal(info.identifiable, [False, True, True])
+    for name, value in truth.items():
+        assert abs(moved.centre[name] - value) < 0.08
+        assert 0.05 <= moved.radius[name] < 0.2
+    assert moved.centre["colour"] == dist.centre["colour"]
+    assert moved.radius["colour"] == dist.radius["colour"]
+    assert info.step[0] == 0.0
+    # As wide as the 0.9 quantile of uniform draws, 0.9 of the radius.
+    np.testing.assert_allclose(info.interval[0], 0.9, atol=0.15)
+
+
+def test_posterior_narrows_no_further_than_it_may():
+    dist = toys.uniform(THREE, 0.06)
+    moved, info = apply(tuners.posterior_update, 1, dist, TWO)
+    assert info.identifiable[2]
+    for name in TWO:
+        assert 0.05 <= moved.radius[name] <= 0.06
+
+
+def test_an_interval_that_reaches_past_the_box_does_not_narrow_it():
+    # The truth lies two radii out. The held-out sets all lie inside, so their errors say nothing of it, and a narrow
+    # box at the edge shuts it out for good where the gate is too weak to ring.
+    dist = toys.uniform(THREE, 0.2)
+    moved, _ = apply(tuners.posterior_update, 2, dist, {"friction": 0.0, "mass": 0.4})
+    assert moved.centre["mass"] > 0.15
+    assert moved.radius["mass"] >= 0.2
+
+
+# All of it ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def find():
+    """Two tunings towards a truth from a centre of zero and a radius of 0.2."""
+
+    tuner = Tuner(config=toys.TUNER, train_policy=toys.train_policy, simulate=SLIDER.simulate)
+
+    @jax.jit
+    def run(key, state, truth):
+        measure = SLIDER.measure(truth, toys.TUNER.set_episodes)
+        return dataclasses.replace(tuner, measure=measure).run(key, state, 2)
+
+    return lambda seed, **truth: run(jax.random.key(seed), start(tuner, THREE), TWO | {"wind": 0.0} | truth)
+
+
+@pytest.mark.parametrize(("friction", "mass"), [(0.5, -0.5), (-0.5, 0.5)])
+def test_tuner_finds_a_truth_beyond_its_first_distribution(find, friction, mass):
+    state, info = find(0, friction=friction, mass=mass)
+    # The first radius cannot contain the truth, so a faithful run rings the alarm first.
+    assert info.verdicts[0, 0] == Verdict.WIDEN
+    last = np.take_along_axis(np.asarray(info.verdicts), np.asarray(info.calls)[:, None] - 1, axis=1)
+    assert np.all(last == Verdict.ACCEPT)
+    np.testing.assert_allclose(state.dist.centre["friction"], friction, atol=0.12)
+    np.testing.assert_allclose(state.dist.centre["mass"], mass, atol=0.06)
+    assert state.dist.centre["colour"] == 0.0
+    assert state.policy["rounds"] == 2
+    np.testing.assert_array_equal(info.train["rounds"], [1, 2])
+
+
+def test_tuner_stays_with_a_truth_that_it_starts_from(find):
+    state, info = find(1)
+    assert info.calls[0] == 1
+    np.testing.assert_array_equal(info.verdicts[:, 0], Verdict.ACCEPT)
+    np.testing.assert_allclose(dists.ravel(state.dist.centre), 0.0, atol=0.06)
+
+
+def test_tuner_does_not_bend_its_parameters_to_physics_that_it_lacks(find):
+    state, info = find(2, wind=1.0)
+    last = np.take_along_axis(np.asarray(info.verdicts), np.asarray(info.calls)[:, None] - 1, axis=1)
+    assert np.all((last == Verdict.UNEXPLAINED) | (last == Verdict.RADIUS_EXHAUSTED))
+    np.testing.assert_array_equal(dists.ravel(state.dist.centre), 0.0)
