@@ -201,9 +201,10 @@ def vote_update(key, config, collected, measured, dist, knobs) -> tuple[ParamDis
 def posterior_update(key, config, collected, measured, dist, knobs) -> tuple[ParamDist, UpdateInfo]:
     """Moves the centre to where the sweep's logit crosses zero, and narrows the radius to what is still open.
 
-    Held-out sets of known parameters calibrate it: the half width of the interval is the quantile `coverage` of their
-    errors. A parameter whose interval is as wide as one that ignores the data is not identifiable and left where it
-    was; one whose interval reaches past the box moves, but keeps its radius.
+    Held-out sets of known parameters calibrate it. The half width of the interval is the quantile `coverage` of their
+    errors; a parameter whose interval is as wide as one that ignores the data is not identifiable and left where it was,
+    unless its estimate is further out than those of the held-out sets, which no truth in the box explains. A parameter
+    whose interval reaches past the box moves but keeps its radius.
     """
     model, loss = spm.train(key, config.spm, collected.trajectory, collected.params, dist)
     held_out = jax.lax.map(lambda episodes: spm.estimate(config.spm, model, episodes), collected.held_out)
@@ -212,7 +213,9 @@ def posterior_update(key, config, collected, measured, dist, knobs) -> tuple[Par
     interval = jnp.quantile(jnp.abs(held_out - truth), config.coverage, axis=0)
     ignorant = jnp.quantile(jnp.abs((low + high) / 2 - truth), config.coverage, axis=0)
     identifiable = interval < _IDENTIFIABLE * ignorant
-    step = jnp.where(identifiable, spm.estimate(config.spm, model, measured), 0.0)
+    estimate = spm.estimate(config.spm, model, measured)
+    usual = jnp.quantile(jnp.abs(held_out), knobs.level, axis=0)
+    step = jnp.where(identifiable | (jnp.abs(estimate) > usual), estimate, 0.0)
     moved = dists.move(dist, step)
     radius = dists.ravel(dist.radius)
     narrowed = jnp.clip(radius * interval, jnp.minimum(config.min_radius, radius), radius)
