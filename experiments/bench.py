@@ -26,6 +26,8 @@ from experiments.train import console, run
 from jaxtune import dist as dists
 from jaxtune import tuner
 
+FIELDS = ("novelty", "threshold", "p_value")
+
 
 @dataclass(frozen=True, kw_only=True)
 class Args:
@@ -73,40 +75,41 @@ def alarm(args: Args) -> dict:
     dist = loop.dist(domain.nominal(loop.entries), args.radius)
     machine = loop.tuner(None, sizes.policy_radius)
 
-    @jax.jit
-    def call(key, params):
-        key_collect, key_verify, key_measure = jax.random.split(key, 3)
-        params = {name: jnp.full(sizes.tuner.set_episodes, value) for name, value in params.items()}
-        measured = loop.simulate(key_measure, policy, params)
-        collected = machine.collect(key_collect, policy, dist)
-        return tuner.calibrated_gate(key_verify, sizes.tuner, collected, measured, tuner.knobs())
-
     def masses(multiplier: float) -> dict:
         truth = {name: multiplier if name.endswith("_mass") else 1.0 for name in loop.entries}
-        return dict(domain.to_coordinates(loop.entries, truth))
+        return domain.to_coordinates(loop.entries, truth)
 
-    def drawn(seed: int) -> dict:
-        return jax.tree.map(lambda x: x[0], dists.sample(jax.random.PRNGKey(1000 + seed), dist, 1))
+    fixed = {"masses, start 0.5X": 2.0, "masses, start 1.5X": 2.0 / 3.0, "centre of the radius": 1.0}
+    names = [*fixed, "drawn within the radius"]
 
-    targets = {
-        "masses, start 0.5X": lambda seed: masses(2.0),
-        "masses, start 1.5X": lambda seed: masses(2.0 / 3.0),
-        "centre of the radius": lambda seed: masses(1.0),
-        "drawn within the radius": drawn,
-    }
-    rows = {}
-    for name, target in targets.items():
-        calls = [call(jax.random.PRNGKey(seed), target(seed)) for seed in range(args.seeds)]
-        novelty, threshold = (np.array([float(gate[field]) for gate in calls]) for field in ("novelty", "threshold"))
-        rows[name] = {
-            "rings": int((novelty > threshold).sum()),
+    @jax.jit
+    def call(key):
+        key_collect, key_verify, key_measure, key_draw = jax.random.split(key, 4)
+        drawn = jax.tree.map(lambda x: x[0], dists.sample(key_draw, dist, 1))
+        targets = jax.tree.map(lambda *x: jnp.stack(x), *map(masses, fixed.values()), drawn)
+        each = sizes.tuner.set_episodes
+        measured = loop.simulate(key_measure, policy, jax.tree.map(lambda x: jnp.repeat(x, each), targets))
+        sets = jax.tree.map(lambda x: x.reshape(-1, each, *x.shape[1:]), measured)
+        collected = machine.collect(key_collect, policy, dist)
+        # The model is trained once: only its score depends on the set.
+        gate = jax.vmap(lambda one: tuner.calibrated_gate(key_verify, sizes.tuner, collected, one, tuner.knobs()))
+        return gate(sets)
+
+    calls = []
+    for seed in range(args.seeds):
+        calls.append(jax.device_get(call(jax.random.PRNGKey(seed))))
+        console.print(
+            f"seed {seed}: " + ", ".join(f"p {p:.3f} {name}" for p, name in zip(calls[-1].p_value, names, strict=True))
+        )
+    novelty, threshold, p_value = (np.stack([gate[field] for gate in calls], -1) for field in FIELDS)
+    return {
+        name: {
+            "rings": int((novelty[row] > threshold[row]).sum()),
             "of": args.seeds,
-            "novelty": novelty,
-            "threshold": threshold,
-            "p_value": [float(gate.p_value) for gate in calls],
+            **{field: values[row] for field, values in zip(FIELDS, (novelty, threshold, p_value), strict=True)},
         }
-        console.print(f"{name}: rings in {rows[name]['rings']} of {args.seeds}")
-    return rows
+        for row, name in enumerate(names)
+    }
 
 
 def main(args: Args) -> None:

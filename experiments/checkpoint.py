@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import orbax.checkpoint as ocp
 
 _PACKAGES = ("jaxtune", "jax", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "orbax-checkpoint", "numpy")
@@ -106,7 +107,9 @@ def load(path: Path, like: Any, config: Any) -> Any:
         raise ValueError(f"policy: {path} holds no config.json; expected a folder that experiments.train has written")
     _same(f"policy: {path} was made with another config", json.loads(stored.read_text())["config"], as_json(config))
     with ocp.StandardCheckpointer() as checkpointer:
-        return checkpointer.restore(path.absolute() / "state", jax.tree.map(ocp.utils.to_shape_dtype_struct, like))
+        state = checkpointer.restore(path.absolute() / "state", jax.tree.map(ocp.utils.to_shape_dtype_struct, like))
+    # Orbax ties arrays to their device; a step whose input is tied and whose output is not would be compiled twice.
+    return jax.tree.map(jnp.asarray, jax.device_get(state))
 
 
 def _same(message: str, found: Any, wanted: Any, where: str = "config") -> None:

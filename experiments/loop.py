@@ -8,8 +8,8 @@ import jax.numpy as jnp
 from brax.envs.base import State
 
 from envs import domain
-from envs.biteno import Biteno, BraxBiteno
-from envs.targets.mjx import MjxTarget, rollout
+from envs.biteno import Biteno, BraxBiteno, constants
+from envs.targets.mjx import MjxTarget, simulate
 from experiments.config import Preset
 from jaxtune import dist as dists
 from jaxtune.ppo import PPO, PPOState
@@ -77,8 +77,7 @@ class Loop:
 
     def simulate(self, key: jax.Array, policy: Policy, params: Mapping[str, jax.Array]) -> Trajectory:
         """One episode for each draw, [episodes] by name in search coordinates."""
-        physical = domain.from_coordinates(self.entries, params)
-        return rollout(self.robot, key, self._act(policy), physical, self.preset.episode_steps)
+        return simulate(self.robot, key, self._act(policy), params, self.preset.episode_steps)
 
     def measure(self, key: jax.Array, policy: Policy, target: MjxTarget) -> Trajectory:
         """One measured set of the target."""
@@ -87,7 +86,7 @@ class Loop:
 
     def evaluate(self, key: jax.Array, policy: Policy, target: MjxTarget) -> tuple[jax.Array, jax.Array]:
         """Mean return under the weights of Table I, and number of falls, over whole episodes in the target."""
-        steps = round(self.preset.task.episode_s / 0.01)
+        steps = round(self.preset.task.episode_s / constants.POLICY_DT_S)
         trajectory = target.episodes(key, self._act(policy), self.preset.evaluation_episodes, steps)
         return trajectory.score.sum(axis=-1).mean(), trajectory.fell.sum()
 

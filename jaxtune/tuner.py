@@ -202,9 +202,9 @@ def posterior_update(key, config, collected, measured, dist, knobs) -> tuple[Par
     """Moves the centre to where the sweep's logit crosses zero, and narrows the radius to what is still open.
 
     Held-out sets of known parameters calibrate it. The half width of the interval is the quantile `coverage` of their
-    errors; a parameter whose interval is as wide as one that ignores the data is not identifiable and left where it was,
-    unless its estimate is further out than those of the held-out sets, which no truth in the box explains. A parameter
-    whose interval reaches past the box moves but keeps its radius.
+    errors; a parameter whose interval is as wide as one that ignores the data is not identifiable and left where it
+    was, unless its estimate is further out than those of the held-out sets, which no truth in the box explains. A
+    parameter whose interval reaches past the box moves but keeps its radius.
     """
     model, loss = spm.train(key, config.spm, collected.trajectory, collected.params, dist)
     held_out = jax.lax.map(lambda episodes: spm.estimate(config.spm, model, episodes), collected.held_out)
@@ -219,7 +219,8 @@ def posterior_update(key, config, collected, measured, dist, knobs) -> tuple[Par
     moved = dists.move(dist, step)
     radius = dists.ravel(dist.radius)
     narrowed = jnp.clip(radius * interval, jnp.minimum(config.min_radius, radius), radius)
-    # Held-out truths all lie in the box; where the interval reaches past it, their errors do not bound the measured one.
+    # Held-out truths all lie in the box; where the interval reaches past it, their errors do not bound the measured
+    # one.
     inside = (step - interval >= low) & (step + interval <= high)
     radius = jnp.where(identifiable & inside, narrowed, radius)
     moved = moved.replace(radius=dists.unravel(dists.names(dist), radius))

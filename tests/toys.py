@@ -16,15 +16,15 @@ from jaxtune.types import ParamDist, Trajectory
 
 # Small enough for seconds on a CPU, large enough to find what the slider shows.
 SPM = SPMConfig(
-    window=50, stride=5, hidden=(128, 64, 64), head=16, dropout=0.0, train_steps=800, batch=128, guesses=4,
+    window=50, stride=5, hidden=(128, 64, 64), head=16, dropout=0.0, train_steps=600, batch=96, guesses=4,
     learning_rate=3e-3, weight_decay=1e-3, sweep=17,
 )  # fmt: skip
 DVM = DVMConfig(
-    window=50, stride=5, latent=6, channels=16, train_steps=400, batch=64, learning_rate=3e-3, references=512,
+    window=50, stride=5, latent=6, channels=16, train_steps=300, batch=64, learning_rate=3e-3, references=512,
     neighbours=5, reach=0.95,
 )  # fmt: skip
 TUNER = TunerConfig(
-    episodes=1024, set_episodes=3, held_out_sets=39, max_widenings=4, patience=2, coverage=0.9, min_radius=0.05,
+    episodes=512, set_episodes=3, held_out_sets=39, max_widenings=4, patience=2, coverage=0.9, min_radius=0.05,
     spm=SPM, dvm=DVM,
 )  # fmt: skip
 
@@ -45,9 +45,12 @@ TINY = TunerConfig(
 quick_jit = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
 """Compiles in half the time and runs several times slower: for what is run once on little data."""
 
+long_jit = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 1})
+"""Compiles a little faster and runs as fast: for what trains."""
+
 # One compilation for all tests of the same sizes.
-train_spm = jax.jit(spm.train, static_argnums=1)
-train_dvm = jax.jit(dvm.train, static_argnums=1)
+train_spm = long_jit(spm.train, static_argnums=1)
+train_dvm = long_jit(dvm.train, static_argnums=1)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,22 +18,24 @@ def loop():
     return Loop(PRESETS["smoke"], chosen("foot_friction"))
 
 
-def _train(loop, policy, key):
+@pytest.fixture(scope="module")
+def train(loop):
     dist = loop.dist(domain.nominal(loop.entries), 0.1)
-    return jax.jit(lambda key, policy: loop.train(key, policy, dist, 1))(key, policy)
+    return jax.jit(lambda key, policy: loop.train(key, policy, dist, 1))
 
 
-def test_saved_policy_takes_the_same_next_step(loop, tmp_path):
+def test_saved_policy_takes_the_same_next_step(loop, train, tmp_path):
     policy = loop.init(jax.random.PRNGKey(0))
     checkpoint.save(tmp_path, policy.learner, policy_config(loop))
     other = loop.init(jax.random.PRNGKey(7))
-    loaded = other.replace(
-        learner=checkpoint.load(tmp_path, other.learner, policy_config(loop)), robots=policy.robots
-    )
-    expected, _ = _train(loop, policy, jax.random.PRNGKey(1))
-    found, metrics = _train(loop, loaded, jax.random.PRNGKey(1))
+    loaded = other.replace(learner=checkpoint.load(tmp_path, other.learner, policy_config(loop)), robots=policy.robots)
+    expected, _ = train(jax.random.PRNGKey(1), policy)
+    found, metrics = train(jax.random.PRNGKey(1), loaded)
     jax.tree.map(np.testing.assert_array_equal, found, expected)
     assert np.isfinite(metrics["loss"]).all()
+    # What was loaded, and what a step returns, is as good an input as what was made: nothing is compiled twice.
+    train(jax.random.PRNGKey(2), found)
+    assert train._cache_size() == 1
 
 
 def test_policy_of_another_config_is_refused(loop, tmp_path):

@@ -20,7 +20,7 @@ LOG_2_PI = math.log(2 * math.pi)
 @pytest.fixture(scope="module")
 def trained():
     dist = toys.uniform(CENTRE, radius=0.2)
-    simulated = toys.Slider().simulate(jax.random.key(1), toys.policy(), dists.sample(jax.random.key(0), dist, 1024))
+    simulated = toys.Slider().simulate(jax.random.key(1), toys.policy(), dists.sample(jax.random.key(0), dist, 512))
     return toys.train_dvm(jax.random.key(2), CONFIG, simulated)
 
 

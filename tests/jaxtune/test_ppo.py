@@ -93,7 +93,7 @@ def train(endless):
         learner, state, metrics = LEARNER.update(key, carry[0], endless, carry[1])
         return (learner, state), metrics
 
-    return jax.jit(lambda key, learner, state: jax.lax.scan(update, (learner, state), jax.random.split(key, 60)))
+    return toys.long_jit(lambda key, learner, state: jax.lax.scan(update, (learner, state), jax.random.split(key, 60)))
 
 
 GIVEN = {"gain": -0.5, "offset": 1.0}

@@ -17,7 +17,7 @@ COLOUR, FRICTION, MASS = range(3)
 @pytest.fixture(scope="module")
 def simulated():
     dist = toys.uniform(CENTRE)
-    params = dists.sample(jax.random.key(0), dist, 1024)
+    params = dists.sample(jax.random.key(0), dist, 512)
     return toys.Slider().simulate(jax.random.key(1), toys.policy(), params), params, dist
 
 
@@ -134,7 +134,7 @@ def test_ignorance_costs_what_the_calculation_says(simulated, trained):
     _, loss = trained
     # Labels that the episodes know nothing of. A uniform guess at place u of the box is right with probability u, so
     # its entropy is that of u, whose mean over u is 1/2 nat; the first of the four guesses is the centre, at log 2.
-    all_alike = jax.tree.map(lambda leaf: leaf[:1].repeat(1024, 0), trajectory)
+    all_alike = jax.tree.map(lambda leaf: leaf[:1].repeat(512, 0), trajectory)
     _, ignorant = toys.train_spm(jax.random.key(2), CONFIG, all_alike, params, dist)
     expected = (np.log(2) + 3 * 0.5) / 4
     np.testing.assert_allclose(ignorant, expected, atol=0.02)
