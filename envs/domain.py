@@ -97,10 +97,13 @@ def apply(model: mjx.Model, params: Params, entries: Mapping[str, Entry]) -> mjx
 
     Returns:
       A model as if it had been compiled with these values.
+
+    Raises:
+      ValueError: a name is not in the table.
     """
     fields = {}
-    for name, value in params.items():
-        entry = entries[name]
+    for name, entry in select(entries, tuple(params)).items():
+        value = params[name]
         rows = entry.rows(model)
         index = rows if entry.column is None else (rows, entry.column)
         for field in entry.fields:

@@ -100,13 +100,13 @@ class PPO:
             policy=self._networks.policy_network.init(key_policy),
             value=self._networks.value_network.init(key_value),
         )
-        # Brax leaves the deviations weakly typed; the second update would then be traced anew.
-        params = jax.tree.map(lambda leaf: jnp.asarray(leaf, leaf.dtype), params)
-        return PPOState(
+        state = PPOState(
             params=params,
             normalizer=running_statistics.init_state(specs.Array((self._observation_size,), jnp.float32)),
             opt_state=self._optimizer.init(params),
         )
+        # Some of Brax's leaves are weakly typed or Python's own; the second update would then be traced anew.
+        return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.asarray(leaf).dtype), state)
 
     def act(self, state: PPOState, *, deterministic: bool = True) -> Callable:
         """The policy as Brax has it: `(observation [..., obs], key) -> (action [..., act], extras)`."""

@@ -35,7 +35,7 @@ from jaxtune.dvm import DVMConfig
 from jaxtune.spm import SPMConfig
 from jaxtune.types import Named, ParamDist, Trajectory, Verdict
 
-_IDENTIFIABLE = 0.8  # an interval this much narrower than one that ignores the data tells something
+_IDENTIFIABLE = 0.9  # an interval this much narrower than one that ignores the data tells something
 
 Policy = Any
 TrainPolicy = Callable[[jax.Array, Policy, ParamDist], tuple[Policy, dict]]

@@ -27,6 +27,7 @@ _ACTION_LIMIT = 10.0
 _MIN_HEIGHT_M = 0.35
 _MAX_TILT_COS = np.cos(np.pi / 4)
 
+_BASES = ("stand", "raibert")
 # time step in s, steps in a policy step, solver iterations, line-search iterations
 _PHYSICS = {"exact": (0.001, 10, 3, 5), "fast": (0.002, 5, 2, 5)}
 
@@ -93,8 +94,9 @@ class Biteno:
     def __init__(self, config: TaskConfig, entries: Mapping[str, domain.Entry] = constants.ENTRIES):
         if set(config.weights) != set(constants.TABLE_ONE):
             raise ValueError(f"weights: got {sorted(config.weights)}, expected {sorted(constants.TABLE_ONE)}")
-        if config.physics not in _PHYSICS:
-            raise ValueError(f"physics: got '{config.physics}', expected one of {', '.join(_PHYSICS)}")
+        for name, allowed in {"physics": _PHYSICS, "base": _BASES}.items():
+            if getattr(config, name) not in allowed:
+                raise ValueError(f"{name}: got '{getattr(config, name)}', expected one of {', '.join(allowed)}")
         self.config = config
         self.entries = entries
         model = mujoco.MjModel.from_xml_path(str(constants.MODEL_PATH))
@@ -155,10 +157,11 @@ class Biteno:
 
         finite = jnp.isfinite(data.qpos).all() & jnp.isfinite(data.qvel).all()
         torque = data.qfrc_actuator[self._joint_dof]
-        qpos, qvel, warmstart, torque = jax.tree.map(
+        zeros = jnp.zeros_like(state.qvel)
+        qpos, qvel, warmstart, torque, action, target = jax.tree.map(
             lambda new, old: jnp.where(finite, new, old),
-            (data.qpos, data.qvel, data.qacc_warmstart, torque),
-            (self._home, jnp.zeros_like(state.qvel), jnp.zeros_like(state.qvel), jnp.zeros_like(torque)),
+            (data.qpos, data.qvel, data.qacc_warmstart, torque, action, target),
+            (self._home, zeros, zeros, jnp.zeros_like(torque), jnp.zeros_like(action), self._home[self._joint_qpos]),
         )
         key, key_command, key_noise = jax.random.split(state.key, 3)
         moved = state.replace(qpos=qpos, qvel=qvel)

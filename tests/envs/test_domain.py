@@ -175,14 +175,12 @@ def test_models_of_a_batch_are_those_of_a_loop(apply, robot):
             np.testing.assert_allclose(models[name][row], getattr(alone, name), rtol=RTOL, err_msg=name)
 
 
-def test_a_parameter_multiplies_or_adds_once_for_each_of_its_targets():
-    model = mjx.put_model(mujoco.MjModel.from_xml_path(str(constants.MODEL_PATH)))
-    # Rows in the order of the targets: joints by their degree of freedom, six of which are the trunk's.
+def test_rows_are_found_by_name(robot):
+    model = robot.mj_model
+    # A joint's row is its degree of freedom, and the first six are the trunk's.
     assert ENTRIES["joint_damping"].rows(model).tolist() == [6, 7, 8, 9, 10, 11]
-    assert [model.names[model.name_bodyadr[row] :].split(b"\0")[0] for row in ENTRIES["shank_mass"].rows(model)] == [
-        b"left_shank",
-        b"right_shank",
-    ]
+    assert [model.body(row).name for row in ENTRIES["shank_mass"].rows(model)] == ["left_shank", "right_shank"]
+    assert [model.geom(row).name for row in ENTRIES["foot_friction"].rows(model)] == ["left_foot", "right_foot"]
 
 
 @pytest.mark.xfail(strict=True, raises=KeyError, reason="apply leaves an unknown name to the dictionary")
@@ -203,8 +201,7 @@ def test_an_unknown_parameter_is_named():
 
 @pytest.mark.parametrize(("kind", "target"), [("body", "tail"), ("geom", "trunk_geom"), ("joint", "tail")])
 def test_an_entry_for_an_object_that_is_not_there_is_named(robot, kind, target):
-    entry = domain.Entry(name="tail_mass", kind=kind, targets=("trunk", target), fields=(), bounds=(0.5, 2.0))
-    entry = entry if kind == "body" else domain.Entry(**{**vars(entry), "targets": (target,)})
+    entry = domain.Entry(name="tail_mass", kind=kind, targets=(target,), fields=(), bounds=(0.5, 2.0))
     with pytest.raises(ValueError, match=f"'tail_mass': the model has no {kind} named '{target}'"):
         entry.rows(robot.mj_model)
 

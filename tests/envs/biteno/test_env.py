@@ -51,7 +51,7 @@ def scenes():
         clearance = (-0.003, 0.001, 0.2)[number % 3]
         values = NOMINAL if number < 12 else reference.draw(rng, constants.ENTRIES, share=0.5)
         yield values, *reference.random_state(rng, model, clearance), rng.normal(size=6).astype(np.float32)
-    # Two that slide on ice, one that stands with locked joints pressed into their limits.
+    # Two that slide on ice, and one in the air whose joints are beyond their limits.
     for speed in (2.0, -2.0):
         qpos, qvel = reference.random_state(rng, model, -0.002)
         qvel[0] = speed
@@ -380,6 +380,43 @@ def test_raiberts_base_is_the_reference_of_phase_and_command(start, monkeypatch)
     # As in test_gait: the left leg stands, the right one is folded at the top of its swing; 0.25 x 0.4 = 0.1 rad.
     target = [0.1, -0.352, 0.704, 0.0, -0.7275, 1.255]
     np.testing.assert_allclose(following.joint_error + following.qpos[7:], target, atol=1e-3)
+
+
+def test_every_term_is_handed_what_it_is_of(start, monkeypatch):
+    # Each sub-step, a physics that turns the left hip by 0.1 rad/s more and pushes every degree of freedom by 2 Nm.
+    idle(
+        monkeypatch,
+        lambda model, data: data.replace(qvel=data.qvel.at[7].add(0.1), qfrc_actuator=jnp.full(12, 2.0)),
+    )
+    state = tilted(start, 0.0).replace(
+        qvel=jnp.zeros(12).at[2].set(0.3).at[5].set(0.5),
+        phase=jnp.array([0.25, 0.75]),
+        command=jnp.array([0.5, 0.0, 0.0]),
+        action=jnp.array([0.0, 0, 0, 0, 0, 2.0]),
+        steps=jnp.int32(499),
+    )
+    state = jax.jit(Biteno(TaskConfig()).step)(NOMINAL, state, jnp.array([1.0, 0, 0, 0, 0, 0]))
+    expected = {
+        # The command of this step, not the one it draws: 0.5 m/s and rad/s missed, exp(-4 / 4).
+        "linear_tracking": 0.367879,
+        "angular_tracking": 0.367879,
+        "linear_velocity_z": 0.09,
+        "angular_velocity_xy": 0.0,
+        # The joints' 6 x 4, not the trunk's.
+        "torque": 24.0,
+        "orientation": 0.0,
+        # 1 rad/s in 0.01 s is 100 rad/s^2.
+        "joint_acceleration": 1e4,
+        # 1 and 2.
+        "action_rate": 5.0,
+        "joint_default": 0.0,
+        # The phase of this step: the right leg at the top of its swing is off by 0.277194 and 0.554388 rad, the left
+        # one by 0.001929 and 0.003857: 0.384183 + 0.000019.
+        "raibert": 0.384202,
+    }
+    assert state.terms.keys() == expected.keys()
+    for name, value in expected.items():
+        np.testing.assert_allclose(state.terms[name], value, rtol=1e-4, atol=1e-6, err_msg=name)
 
 
 @pytest.mark.parametrize(("physics", "substep_s"), [("exact", 0.001), ("fast", 0.002)])
