@@ -68,7 +68,7 @@ def select(entries: Mapping[str, Entry], names: Sequence[str]) -> dict[str, Entr
     """
     for name in names:
         if name not in entries:
-            raise ValueError(f"parameter '{name}' is unknown; allowed: {', '.join(entries)}")
+            raise ValueError(f"parameters: '{name}' is unknown; allowed: {', '.join(entries)}")
     return {name: entries[name] for name in names}
 
 

@@ -79,7 +79,15 @@ def normalised_box(dist: ParamDist) -> tuple[Float[Array, " params"], Float[Arra
 def at_bounds(dist: ParamDist) -> jax.Array:
     """True where every parameter's support fills its bounds, so that widening changes nothing."""
     low, high = box(dist)
-    full = jax.tree.map(lambda a, lower, b, upper: (a <= lower) & (b >= upper), low, dist.lower, high, dist.upper)
+    # A radius as wide as the bounds fills them from any centre, though the sum may round to less.
+    full = jax.tree.map(
+        lambda a, lower, b, upper, radius: ((a <= lower) & (b >= upper)) | (radius >= upper - lower),
+        low,
+        dist.lower,
+        high,
+        dist.upper,
+        dist.radius,
+    )
     return ravel(full).all()
 
 

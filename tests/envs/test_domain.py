@@ -183,7 +183,6 @@ def test_rows_are_found_by_name(robot):
     assert [model.geom(row).name for row in ENTRIES["foot_friction"].rows(model)] == ["left_foot", "right_foot"]
 
 
-@pytest.mark.xfail(strict=True, raises=KeyError, reason="apply leaves an unknown name to the dictionary")
 def test_applying_an_unknown_parameter_names_it(robot):
     with pytest.raises(ValueError, match="'trunk_weight' is unknown"):
         robot.model({"trunk_weight": 1.0})

@@ -251,7 +251,6 @@ def test_broken_parameters_end_the_episode_and_leave_no_trace(start, step):
     assert_broke(step(reference.params(trunk_mass=np.nan), start, STILL))
 
 
-@pytest.mark.xfail(strict=True, reason="the observation after it still holds the action")
 def test_a_broken_action_ends_the_episode_and_leaves_no_trace(start, step):
     assert_broke(step(NOMINAL, start, np.full(6, np.nan, np.float32)))
 
@@ -439,7 +438,6 @@ def test_a_missing_weight_is_named():
         Biteno(TaskConfig(weights=weights))
 
 
-@pytest.mark.xfail(strict=True, reason="any other base is taken for the standing pose")
 def test_an_unknown_base_is_named():
     with pytest.raises(ValueError, match="base: got 'sitting', expected one of stand, raibert"):
         Biteno(TaskConfig(base="sitting"))
