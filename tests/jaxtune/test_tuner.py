@@ -464,11 +464,11 @@ def test_an_interval_that_reaches_past_the_box_does_not_narrow_it():
 
 
 def test_a_box_too_narrow_to_tell_is_left_when_the_truth_is_far_outside():
-    dist = toys.uniform(THREE, 0.03)
+    dist = toys.uniform(THREE, 0.02)
     moved, info = apply(tuners.posterior_update, 1, dist, {"friction": 0.5, "mass": 0.0})
     assert not info.identifiable[1]
-    assert info.step[1] > 0.8
-    np.testing.assert_allclose(moved.centre["friction"], 0.03 * info.step[1], rtol=1e-5)
+    assert info.step[1] > 0.1
+    np.testing.assert_allclose(moved.centre["friction"], 0.02 * info.step[1], rtol=1e-5)
     assert moved.radius["friction"] == dist.radius["friction"]
 
 
