@@ -115,9 +115,17 @@ def apply(model: mjx.Model, params: Params, entries: Mapping[str, Entry]) -> mjx
 def set_const(model: mjx.Model) -> mjx.Model:
     """Recomputes the fields that depend on masses, inertias and armatures: `mj_setConst` in JAX.
 
+    Like the compiler, and unlike `mj_setConst`, it keeps `stat.meaninertia` true as well.
+
     Covers `body_subtreemass`, `body_invweight0`, `dof_M0`, `dof_invweight0`, `actuator_acc0` and `stat.meaninertia`;
     fields of tendons, cameras and lights are left alone.
     """
+    # Where the default precision of products is a shortened one (on GPUs), weights would be off by a thousandth.
+    with jax.default_matmul_precision("highest"):
+        return _set_const(model)
+
+
+def _set_const(model: mjx.Model) -> mjx.Model:
     subtree = model.body_mass
     for body in range(model.nbody - 1, 0, -1):
         subtree = subtree.at[model.body_parentid[body]].add(subtree[body])

@@ -2,11 +2,12 @@
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from envs.biteno import constants
 
 _VELOCITY_SCALE = 2.0
-_COMMAND_SCALE = jnp.array([2.0, 2.0, 0.25])
+_COMMAND_SCALE = np.array([2.0, 2.0, 0.25], np.float32)
 _GYRO_SCALE = 0.25
 _JOINT_VELOCITY_SCALE = 0.05
 

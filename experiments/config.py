@@ -1,5 +1,6 @@
 """Sizes of the experiments: what a preset buys, each number a field."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -50,6 +51,8 @@ class Preset:
     """Steps of an episode in a sweep."""
     sweep_tunings: int = 3
     """Tunings in a sweep."""
+    compiler_options: Mapping[str, int] = field(default_factory=dict)
+    """Passed to `jax.jit`; a run of seconds is not worth minutes of optimisation."""
 
 
 _TINY = TunerConfig(
@@ -74,6 +77,7 @@ _SMOKE = Preset(
     sweep=_TINY,
     sweep_steps=80,
     sweep_tunings=2,
+    compiler_options={"xla_backend_optimization_level": 0},
 )
 
 _LARGE = TunerConfig(

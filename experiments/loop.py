@@ -1,6 +1,6 @@
 """BITeno's side of the tuner: how its policy is trained, its episodes simulated, its return measured."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import chex
 import jax
@@ -34,6 +34,10 @@ class Loop:
         self.robot = Biteno(preset.task)
         self._env = BraxBiteno(self.robot)
         self._ppo = PPO(preset.ppo, self.robot.observation_size, self.robot.action_size)
+
+    def jit(self, function: Callable) -> Callable:
+        """Compiles with the preset's options."""
+        return jax.jit(function, compiler_options=dict(self.preset.compiler_options))
 
     def dist(self, centre: Mapping[str, float], radius: float) -> ParamDist:
         """A distribution around physical values, in search coordinates, with the table's bounds."""

@@ -155,7 +155,7 @@ class Runner:
         self._args, self._loop, self._policy, self._knobs = args, loop, policy, knobs
         self._target = target
         self._methods = methods(args, loop, target)
-        self._evaluate = jax.jit(lambda key, policy: loop.evaluate(key, policy, target))
+        self._evaluate = loop.jit(lambda key, policy: loop.evaluate(key, policy, target))
         self._steps = {}
 
     def __call__(self, name: str, seed: int, progress: Progress) -> dict:
@@ -180,7 +180,9 @@ class Runner:
     def _tunings(self, name: str, seed: int):
         method = self._methods[name]()
         # dr and oracle are one program: the distribution is an argument.
-        step = self._steps.setdefault(method.tuner, jax.jit(method.tuner.step))
+        if method.tuner not in self._steps:
+            self._steps[method.tuner] = self._loop.jit(method.tuner.step)
+        step = self._steps[method.tuner]
         key = jax.random.PRNGKey(seed)
         key_evaluate, key_steps = jax.random.split(key)
         state = method.tuner.init(self._policy, method.dist, self._knobs)

@@ -100,7 +100,7 @@ def program(args: Args, loop: Loop, policy: Policy):
         # Policy and episodes are the same or of no use in every lane.
         return state.dist, info
 
-    return jax.jit(lambda columns: jax.vmap(one)(*columns.T))
+    return loop.jit(lambda columns: jax.vmap(one)(*columns.T))
 
 
 def errors(loop: Loop, truth: dict, centre: dict, off: Sequence[str]) -> np.ndarray:

@@ -51,7 +51,7 @@ def walk(key: jax.Array, loop: Loop, updates: int, progress: Progress | None = N
     policy = loop.init(key_init)
     dist = loop.dist(domain.nominal(loop.entries), loop.preset.policy_radius)
     chunk = min(loop.preset.chunk, updates)
-    train = jax.jit(lambda key, policy: loop.train(key, policy, dist, chunk))
+    train = loop.jit(lambda key, policy: loop.train(key, policy, dist, chunk))
     task = progress.add_task("training", total=updates * loop.preset.ppo.steps_per_update) if progress else None
     curve, start = [], time.monotonic()
     for index in range(-(-updates // chunk)):

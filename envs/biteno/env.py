@@ -251,6 +251,8 @@ class BraxBiteno(BraxEnv):
     @staticmethod
     def with_params(state: BraxState, params: domain.Params) -> BraxState:
         """The same robots, wherever they are, with other parameters [batch]."""
+        # A weakly typed value would have the next step compiled anew.
+        params = {name: jnp.asarray(value, jnp.float32) for name, value in params.items()}
         return state.replace(info={**state.info, "params": params})
 
     def step(self, state: BraxState, action: jax.Array) -> BraxState:

@@ -51,8 +51,8 @@ def _episode(robot: Biteno, key: jax.Array, act: Act, params: domain.Params, ste
         state, alive = carry
         action, _ = act(state.obs, key)
         following = robot.step(params, state, action)
-        score = jnp.where(alive, following.score, 0.0)
         broke = alive & (following.not_finite > 0)
+        score = jnp.where(alive & ~broke, following.score, 0.0)
         record = (state.obs, action, alive & ~broke, score, broke)
         return (following, alive & (following.done == 0)), record
 

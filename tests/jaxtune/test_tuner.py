@@ -88,8 +88,8 @@ def play():
     tune = toys.quick_jit(tuner.tune)
     blank = SLIDER.measure(TWO, 2)(jax.random.key(0), toys.policy())
 
-    def run(*novelties, bound=1.2):
-        measured = blank.replace(score=blank.score.at[0, : len(novelties)].set(jnp.array(novelties)))
+    def run(*novelties, bound=1.2, **ends):
+        measured = blank.replace(score=blank.score.at[0, : len(novelties)].set(jnp.array(novelties)), **ends)
         start = tuner.init(toys.policy(), toys.uniform(TWO, FIRST_RADIUS, bound), knobs())
         state, info = tune(jax.random.key(1), start, measured)
         return start, state, info
@@ -172,6 +172,12 @@ def test_a_novelty_that_is_not_finite_ends_the_tuning_without_an_update(play, no
 def expect_not_finite(info):
     assert info.calls == 1
     assert info.verdicts[0] == Verdict.NOT_FINITE
+
+
+def test_falls_and_broken_episodes_of_the_measured_set_are_counted(play):
+    _, _, info = play(0.5, fell=jnp.array([True, True]), not_finite=jnp.array([False, True]))
+    assert info.measured_falls == 2
+    assert info.not_finite == 1
 
 
 def test_a_novelty_that_breaks_after_widening_ends_it_too(play):
