@@ -79,7 +79,7 @@ def print_sim2sim(console: Console, summary: dict, results: dict[str, list[dict]
         cells = []
         for name, method in summary["methods"].items():
             lines = [run["lines"][-1] for run in results[name]]
-            unknown = any(line.get("identifiable", {}).get(parameter) is False for line in lines)
+            unknown = any(line.get("verdicts") and not line["identifiable"][parameter] for line in lines)
             mean = np.array(method["param_error_end"])[:, column].mean()
             cells.append(f"{'~ ' if unknown else ''}{mean:.3f}")
         table.add_row(f"{parameter}{' *' if parameter in summary['off'] else ''}", *cells)

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Shaped
 
 from jaxtune.types import Named, ParamDist
 
@@ -28,7 +28,7 @@ def make(centre: Named, radius: float, lower: Named, upper: Named) -> ParamDist:
         if not lower[name] <= value <= upper[name]:
             raise ValueError(f"centre['{name}']: got {value}, allowed {lower[name]} to {upper[name]}")
 
-    def strong(named: Named) -> dict:
+    def strong(named) -> dict:
         return {name: jnp.asarray(value, jnp.float32) for name, value in named.items()}
 
     return ParamDist(
@@ -41,7 +41,7 @@ def names(dist: ParamDist) -> tuple[str, ...]:
     return tuple(sorted(dist.centre))
 
 
-def ravel(params: Named) -> Float[Array, "... params"]:
+def ravel(params: Named) -> Shaped[Array, "... params"]:
     """Named values to a vector, at a network's door; sorted by name."""
     return jnp.stack([params[name] for name in sorted(params)], axis=-1)
 

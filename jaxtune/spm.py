@@ -95,8 +95,8 @@ def train(
       dist: the distribution they were drawn from; its support is the query box.
 
     Returns:
-      The model, and its logistic loss per parameter in nats, the mean over the last tenth of the steps (log 2 =
-      ignorance).
+      The model, and its logistic loss per parameter in nats, the mean over the last tenth of the steps. Ignorance costs
+      log 2 at the centre and 1/2, on average over the box, elsewhere.
     """
     key_init, key_train = jax.random.split(key)
     truth = dists.normalise(dist, params)
@@ -141,6 +141,7 @@ def logits(
     """
     cut, valid = windows.grid(trajectory, config.window, config.stride)
     cut, valid = cut.reshape(-1, *cut.shape[2:]), valid.reshape(-1)
+    cut = jnp.where(valid[:, None, None], cut, spm.scaler.mean)
     network = _Network(config, guesses.shape[-1])
     shape = (cut.shape[0], *guesses.shape)
     answers = network.apply(spm.variables, spm.scaler(cut), jnp.broadcast_to(guesses, shape), deterministic=True)
@@ -169,6 +170,8 @@ def estimate(config: SPMConfig, spm: SPM, trajectory: Trajectory) -> Float[Array
     positive = jnp.where((left > 0) & (right > 0), 1.0, 0.0)
     positive = jnp.where((left > 0) & (right <= 0), crossing, positive)
     positive = jnp.where((left <= 0) & (right > 0), 1.0 - crossing, positive)
+    # No evidence at all (a set without a valid window) leaves the estimate in the middle.
+    positive = jnp.where((left == 0) & (right == 0), 0.5, positive)
     return low + (high - low) * positive.mean(axis=0)
 
 

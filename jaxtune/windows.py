@@ -64,7 +64,8 @@ class Scaler:
 
 def fit_scaler(trajectory: Trajectory) -> Scaler:
     """The scaler of the steps that belong to an episode."""
-    channels = steps(trajectory)
+    # What follows an end may be anything, and zero times nan is nan.
+    channels = jnp.where(trajectory.alive[..., None], steps(trajectory), 0.0)
     weight = trajectory.alive[..., None] / jnp.maximum(trajectory.alive.sum(), 1)
     axes = tuple(range(channels.ndim - 1))
     mean = jnp.sum(weight * channels, axis=axes)
