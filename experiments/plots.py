@@ -137,7 +137,7 @@ def _gate(path: Path, results: dict[str, list[dict]]) -> None:
     below.plot([], [], color="tab:red", lw=0.8, label="threshold")
     above.set(ylabel="largest radius, log space", ylim=(0, None))
     above.legend(fontsize=8)
-    below.set(xlabel="tunings (fractions: gate calls within one)", ylabel="novelty, nats a window")
+    below.set(xlabel="tunings (fractions: gate calls within one)", ylabel="novelty, mean rank", ylim=(0, 1.05))
     below.legend(fontsize=8)
     for axis in (above, below):
         axis.grid(alpha=0.3)

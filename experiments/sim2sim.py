@@ -68,7 +68,7 @@ class Args:
     level: float = 0.95
     """The threshold is this quantile of the novelty of held-out simulated sets."""
     threshold: float | None = None
-    """A fixed threshold in its stead, in nats per window."""
+    """A fixed threshold in its stead, a mean rank between 0 and 1."""
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ reconstructed window lowers the statistic that the text calls high. Here
     novelty(x) = mean over Q of ELBO(simulated neighbour) - ELBO(x),
 
 where Q holds the nearest simulated windows in latent space, so that high means not covered. A window without a
-neighbour within reach has no novelty of its own; its caller gives it a finite cap.
+neighbour within reach has no novelty of its own; it is more novel than any that has.
 """
 
 import math
@@ -163,15 +163,15 @@ def novelty(
     """Eq. 2, window by window, for one set of episodes [episodes, time].
 
     Returns:
-      Novelty in nats per window; which windows are valid; which of them have a simulated neighbour within reach (the
-      novelty of the others is zero, and means nothing).
+      Novelty in nats per window, nan where a step is not finite; which windows are valid; which of them have a
+      simulated neighbour within reach (the novelty of the others is zero, and means nothing).
     """
     cut, valid = windows.grid(trajectory, config.window, config.stride)
     elbo, latent = _evaluate(config, dvm.variables, dvm.scaler, cut.reshape(-1, *cut.shape[2:]))
     closeness, index = jax.lax.top_k(-_distances(latent, dvm.latent), config.neighbours)
     near = -closeness <= dvm.reach
     mean = jnp.sum(jnp.where(near, dvm.elbo[index], 0.0), axis=-1) / jnp.maximum(near.sum(axis=-1), 1)
-    covered = near.any(axis=-1)
+    covered = near.any(axis=-1) | jnp.isnan(elbo)
     return jnp.where(covered, mean - elbo, 0.0), valid.reshape(-1), covered
 
 

@@ -2,9 +2,11 @@
 
 A window of 50 steps and a guess of all parameters are encoded by a three-layer MLP each; a two-layer head for every
 parameter reads both and answers with a logit, trained by logistic regression on `truth > guess`. Departures from the
-paper: the answer is used with its sign (its rule `mu + alpha q` with q in (0, 1) can only grow); guesses are drawn
-over the query box independently of the truth, the centre among them, so that the answers over a sweep of guesses are
-one minus a distribution function; a window's encoding serves several guesses.
+paper: a window enters as its moments (BayesSim, Ramos et al., RSS 2019, likewise reads covariances of states and
+actions), since a network that sees the raw steps of a few hundred episodes learns them by heart; the answer is used
+with its sign (its rule `mu + alpha q` with q in (0, 1) can only grow); guesses are drawn over the query box
+independently of the truth, the centre among them, so that the answers over a sweep of guesses are one minus a
+distribution function; a window's encoding serves several guesses.
 """
 
 from dataclasses import dataclass
@@ -20,6 +22,9 @@ from jaxtune import dist as dists
 from jaxtune import windows
 from jaxtune.types import Named, ParamDist, Trajectory
 
+_SCALED = 2048  # windows that the scale of the moments is read from
+_FAR = 10.0  # standard deviations; a moment that hardly varied in training must not drown all others later
+
 
 @dataclass(frozen=True, kw_only=True)
 class SPMConfig:
@@ -33,8 +38,6 @@ class SPMConfig:
     """Layers of the trajectory encoder; the guess encoder has a quarter of their width."""
     head: int = 64
     """Hidden width of every parameter's head."""
-    dropout: float = 0.1
-    """Share of the trajectory encoder's units dropped in training."""
     train_steps: int = 1200
     """Gradient steps."""
     batch: int = 256
@@ -56,15 +59,13 @@ class _Network(nn.Module):
     def setup(self):
         self.window_layers = [nn.Dense(width) for width in self.config.hidden]
         self.guess_layers = [nn.Dense(width // 4) for width in self.config.hidden]
-        self.dropout = nn.Dropout(self.config.dropout)
         self.head_hidden = nn.Dense(self.num_params * self.config.head)
         self.head_out = self.param("head_out", nn.initializers.lecun_normal(), (self.config.head, self.num_params))
 
-    def __call__(self, window, guesses, deterministic: bool):
-        """Logits [batch, guesses, params] for windows [batch, time, channels], guesses [batch, guesses, params]."""
-        features = window.reshape(window.shape[0], -1)
+    def __call__(self, features, guesses):
+        """Logits [batch, guesses, params] for moments [batch, moments] and guesses [batch, guesses, params]."""
         for layer in self.window_layers:
-            features = self.dropout(nn.elu(layer(features)), deterministic=deterministic)
+            features = nn.elu(layer(features))
         for layer in self.guess_layers:
             guesses = nn.elu(layer(guesses))
         features = jnp.broadcast_to(features[:, None], (*guesses.shape[:2], features.shape[-1]))
@@ -78,8 +79,29 @@ class SPM:
     """A trained search-parameter model and the distribution it was trained on."""
 
     variables: dict
-    scaler: windows.Scaler
+    steps: windows.Scaler  # of channels
+    moments: windows.Scaler  # of a window's moments
     dist: ParamDist
+
+
+def _read(steps: windows.Scaler, moments: windows.Scaler, window: Float[Array, "batch time channels"]):
+    """What the network sees of a window [batch, moments]."""
+    return jnp.clip(moments(_moments(steps(window))), -_FAR, _FAR)
+
+
+def _moments(window: Float[Array, "batch time channels"]) -> Float[Array, "batch moments"]:
+    """Mean of every channel, spread of its first and second differences, covariances at lag zero and one.
+
+    The gait clock is among the channels, so covariances tell phases.
+    """
+    batch, time, channels = window.shape
+    mean = window.mean(axis=1)
+    centred = window - mean[:, None]
+    step = jnp.diff(window, axis=1)
+    upper = jnp.triu_indices(channels)
+    at_once = jnp.einsum("bti,btj->bij", centred, centred)[:, *upper] / time
+    ahead = jnp.einsum("bti,btj->bij", step, centred[:, :-1]).reshape(batch, -1) / time
+    return jnp.concatenate([mean, step.std(axis=1), jnp.diff(step, axis=1).std(axis=1), at_once, ahead], axis=-1)
 
 
 def train(
@@ -98,22 +120,23 @@ def train(
       The model, and its logistic loss per parameter in nats, the mean over the last tenth of the steps. Ignorance costs
       log 2 at the centre and 1/2, on average over the box, elsewhere.
     """
-    key_init, key_train = jax.random.split(key)
+    key_init, key_moments, key_train = jax.random.split(key, 3)
     truth = dists.normalise(dist, params)
     low, high = dists.normalised_box(dist)
-    scaler = windows.fit_scaler(trajectory)
+    steps = windows.fit_scaler(trajectory)
+    window, _ = windows.draw(key_moments, trajectory, _SCALED, config.window)
+    moments = windows.scaler(_moments(steps(window)))
     network = _Network(config, truth.shape[-1])
-    sizes = (1, config.window, scaler.mean.size), (1, 1, truth.shape[-1])
-    variables = network.init(key_init, *(jnp.zeros(size) for size in sizes), deterministic=True)
+    variables = network.init(key_init, moments.mean[None], jnp.zeros((1, 1, truth.shape[-1])))
     schedule = optax.cosine_onecycle_schedule(config.train_steps, config.learning_rate)
     optimizer = optax.adamw(schedule, weight_decay=config.weight_decay)
 
     def loss(variables, key):
-        key_window, key_guess, key_dropout = jax.random.split(key, 3)
+        key_window, key_guess = jax.random.split(key)
         window, episode = windows.draw(key_window, trajectory, config.batch, config.window)
         shape = (config.batch, config.guesses, truth.shape[-1])
         guesses = jax.random.uniform(key_guess, shape, minval=low, maxval=high).at[:, 0].set(0.0)
-        logits = network.apply(variables, scaler(window), guesses, deterministic=False, rngs={"dropout": key_dropout})
+        logits = network.apply(variables, _read(steps, moments, window), guesses)
         label = truth[episode][:, None] > guesses
         return optax.sigmoid_binary_cross_entropy(logits, label).mean(axis=(0, 1)).sum()
 
@@ -127,7 +150,7 @@ def train(
         descend, (variables, optimizer.init(variables)), jax.random.split(key_train, config.train_steps)
     )
     tail = losses[-max(config.train_steps // 10, 1) :].mean() / truth.shape[-1]
-    return SPM(variables=variables, scaler=scaler, dist=dist), tail
+    return SPM(variables=variables, steps=steps, moments=moments, dist=dist), tail
 
 
 def logits(
@@ -141,10 +164,10 @@ def logits(
     """
     cut, valid = windows.grid(trajectory, config.window, config.stride)
     cut, valid = cut.reshape(-1, *cut.shape[2:]), valid.reshape(-1)
-    cut = jnp.where(valid[:, None, None], cut, spm.scaler.mean)
+    cut = jnp.where(valid[:, None, None], cut, spm.steps.mean)
     network = _Network(config, guesses.shape[-1])
-    shape = (cut.shape[0], *guesses.shape)
-    answers = network.apply(spm.variables, spm.scaler(cut), jnp.broadcast_to(guesses, shape), deterministic=True)
+    moments = _read(spm.steps, spm.moments, cut)
+    answers = network.apply(spm.variables, moments, jnp.broadcast_to(guesses, (len(cut), *guesses.shape)))
     return _masked_mean(answers, valid)
 
 

@@ -13,8 +13,9 @@
 Departures from the paper: a tuning ends, not starts, with training the policy, so that the first one finds the policy
 that was trained in the first distribution, and the last one leaves a policy that knows the last; the radius grows
 only where the check fails (in print it grows before the test), is capped by the bounds, and the loop ends with a
-verdict; the threshold is not set by hand but is a quantile of the novelty of held-out simulated sets of as many
-episodes, which makes the gate a conformal test; the update is signed.
+verdict; a set's novelty is the mean rank, not the mean, of Eq. 2 over its windows, and the threshold is not set by hand
+but is a quantile of the novelty of held-out simulated sets of as many episodes, which makes the gate a conformal test;
+the update is signed.
 
 Everything here is pure. How a policy is trained, how episodes are simulated and measured, how a set is verified and
 how the distribution is updated are functions handed in; with a target in JAX, `Tuner.run` is one program that can be
@@ -72,7 +73,7 @@ class Knobs:
     step_size: jax.Array  # radii per unit vote (the paper's alpha)
     widen_factor: jax.Array  # the paper's c
     level: jax.Array  # quantile of the held-out novelty that is the threshold
-    threshold: jax.Array  # a fixed threshold in its stead (the paper's sigma'); nan where there is none
+    threshold: jax.Array  # a fixed mean rank in its stead (the paper's sigma'); nan where there is none
 
 
 def knobs(
@@ -81,7 +82,7 @@ def knobs(
     """Knobs, checked.
 
     Raises:
-      ValueError: step size not positive, widening factor not above 1, level not in (0, 1), threshold not finite.
+      ValueError: step size not positive, widening factor not above 1, level or threshold not in (0, 1).
     """
     if not step_size > 0:
         raise ValueError(f"step_size: got {step_size}, expected a positive number")
@@ -89,8 +90,8 @@ def knobs(
         raise ValueError(f"widen_factor: got {widen_factor}, expected a number above 1")
     if not 0 < level < 1:
         raise ValueError(f"level: got {level}, expected a number between 0 and 1")
-    if threshold is not None and not jnp.isfinite(threshold):
-        raise ValueError(f"threshold: got {threshold}, expected a finite number")
+    if threshold is not None and not 0 < threshold < 1:
+        raise ValueError(f"threshold: got {threshold}, expected a number between 0 and 1")
     values = {"step_size": step_size, "widen_factor": widen_factor, "level": level}
     values["threshold"] = jnp.nan if threshold is None else threshold
     return Knobs(**{name: jnp.asarray(value, jnp.float32) for name, value in values.items()})
@@ -110,7 +111,9 @@ class Collected:
 class GateInfo:
     """One call of the gate."""
 
-    novelty: jax.Array  # of the measured set, nats per window
+    novelty: (
+        jax.Array
+    )  # of the measured set: mean rank of its windows among those of all sets, 1/2 where it is like them
     threshold: jax.Array
     p_value: jax.Array  # (1 + number of held-out sets at least as novel) / (sets + 1)
     uncovered: jax.Array  # share of measured windows without a simulated neighbour
@@ -160,33 +163,38 @@ def calibrated_gate(
 ) -> GateInfo:
     """Novelty of a measured set against that of held-out simulated sets (Eq. 2, sign mended).
 
-    A set's score is the mean over its valid windows. A window without a neighbour counts as novel as the most novel
-    window of the calibration. The threshold is the conformal quantile: a set drawn like the held-out ones exceeds it
-    with probability at most `1 - level`.
+    A set's score is the mean rank of its valid windows among the valid windows of all sets, measured and held out: the
+    novelty of single windows is heavy-tailed, and one held-out fall in the mean of nats hides a measured set that is a
+    little novel everywhere. A window without a neighbour ranks highest. The threshold is the conformal quantile: a set
+    drawn like the held-out ones exceeds it with probability at most `1 - level`.
     """
     model, elbo = dvm.train(key, config.dvm, collected.trajectory)
     held_out = jax.lax.map(lambda episodes: dvm.novelty(config.dvm, model, episodes), collected.held_out)
     scored = dvm.novelty(config.dvm, model, measured)
-    novelty, valid, covered = held_out
-    cap = jnp.max(jnp.where(valid & covered, novelty, -jnp.inf))
-
-    def score(novelty, valid, covered):
-        novelty = jnp.where(covered, novelty, cap)
-        return jnp.sum(novelty * valid, axis=-1) / valid.sum(axis=-1)
-
-    value = score(*scored)
+    novelty, valid, covered = jax.tree.map(lambda sets, one: jnp.concatenate([sets, one[None]]), held_out, scored)
+    novelty = jnp.where(covered, novelty, jnp.inf)
+    pool = jnp.sort(jnp.where(valid, novelty, jnp.inf), axis=None)
+    rank = jnp.searchsorted(pool, novelty, side="right") / valid.sum()
+    rank = jnp.where(jnp.isnan(novelty), jnp.nan, jnp.minimum(rank, 1.0))
+    score = jnp.sum(jnp.where(valid, rank, 0.0), axis=-1) / valid.sum(axis=-1)
     # A held-out set that fell before its first window ended has no score; it counts as the most novel.
-    calibration = jnp.nan_to_num(score(*held_out), nan=cap)
-    rank = jnp.ceil((config.held_out_sets + 1) * knobs.level).astype(int) - 1
-    calibrated = jnp.sort(calibration)[jnp.minimum(rank, config.held_out_sets - 1)]
-    _, valid, covered = scored
+    calibration, value = jnp.nan_to_num(score[:-1], nan=1.0), score[-1]
     return GateInfo(
         novelty=value,
-        threshold=jnp.where(jnp.isnan(knobs.threshold), calibrated, knobs.threshold),
+        threshold=jnp.where(jnp.isnan(knobs.threshold), _conformal_quantile(calibration, knobs.level), knobs.threshold),
         p_value=(1 + jnp.sum(calibration >= value)) / (config.held_out_sets + 1),
-        uncovered=jnp.sum(valid & ~covered) / jnp.maximum(valid.sum(), 1),
+        uncovered=jnp.sum(valid[-1] & ~covered[-1]) / jnp.maximum(valid[-1].sum(), 1),
         elbo=elbo,
     )
+
+
+def _conformal_quantile(values: jax.Array, level: jax.Array | float) -> jax.Array:
+    """What one more draw like `values` [n, ...] exceeds with probability at most `1 - level`.
+
+    That takes n of at least `level / (1 - level)`; of fewer, it is the largest.
+    """
+    rank = jnp.ceil((len(values) + 1) * level).astype(int) - 1
+    return jnp.sort(values, axis=0)[jnp.minimum(rank, len(values) - 1)]
 
 
 def vote_update(key, config, collected, measured, dist, knobs) -> tuple[ParamDist, UpdateInfo]:
@@ -201,21 +209,18 @@ def vote_update(key, config, collected, measured, dist, knobs) -> tuple[ParamDis
 def posterior_update(key, config, collected, measured, dist, knobs) -> tuple[ParamDist, UpdateInfo]:
     """Moves the centre to where the sweep's logit crosses zero, and narrows the radius to what is still open.
 
-    Held-out sets of known parameters calibrate it. The half width of the interval is the quantile `coverage` of their
-    errors; a parameter whose interval is as wide as one that ignores the data is not identifiable and left where it
-    was, unless its estimate is further out than those of the held-out sets, which no truth in the box explains. A
-    parameter whose interval reaches past the box moves but keeps its radius.
+    Held-out sets of known parameters calibrate it: the half width of the interval is the conformal quantile `coverage`
+    of their errors. A parameter whose interval is as wide as one that ignores the data is not identifiable and left
+    as it was. A parameter whose interval reaches past the box moves but keeps its radius.
     """
     model, loss = spm.train(key, config.spm, collected.trajectory, collected.params, dist)
     held_out = jax.lax.map(lambda episodes: spm.estimate(config.spm, model, episodes), collected.held_out)
     truth = dists.normalise(dist, collected.held_out_params)
     low, high = dists.normalised_box(dist)
-    interval = jnp.quantile(jnp.abs(held_out - truth), config.coverage, axis=0)
-    ignorant = jnp.quantile(jnp.abs((low + high) / 2 - truth), config.coverage, axis=0)
+    interval = _conformal_quantile(jnp.abs(held_out - truth), config.coverage)
+    ignorant = _conformal_quantile(jnp.abs((low + high) / 2 - truth), config.coverage)
     identifiable = interval < _IDENTIFIABLE * ignorant
-    estimate = spm.estimate(config.spm, model, measured)
-    usual = jnp.quantile(jnp.abs(held_out), knobs.level, axis=0)
-    step = jnp.where(identifiable | (jnp.abs(estimate) > usual), estimate, 0.0)
+    step = jnp.where(identifiable, spm.estimate(config.spm, model, measured), 0.0)
     moved = dists.move(dist, step)
     radius = dists.ravel(dist.radius)
     narrowed = jnp.clip(radius * interval, jnp.minimum(config.min_radius, radius), radius)

@@ -62,12 +62,17 @@ class Scaler:
         return (windows - self.mean) / self.std
 
 
+def scaler(values: Float[Array, "... channels"], weight: Float[Array, "... 1"] | None = None) -> Scaler:
+    """The scaler of values, weighted where a weight that sums to one is given."""
+    axes = tuple(range(values.ndim - 1))
+    weight = values.shape[-1] / values.size if weight is None else weight
+    mean = jnp.sum(weight * values, axis=axes)
+    variance = jnp.sum(weight * (values - mean) ** 2, axis=axes)
+    return Scaler(mean=mean, std=jnp.maximum(jnp.sqrt(variance), _MIN_STD))
+
+
 def fit_scaler(trajectory: Trajectory) -> Scaler:
     """The scaler of the steps that belong to an episode."""
     # What follows an end may be anything, and zero times nan is nan.
     channels = jnp.where(trajectory.alive[..., None], steps(trajectory), 0.0)
-    weight = trajectory.alive[..., None] / jnp.maximum(trajectory.alive.sum(), 1)
-    axes = tuple(range(channels.ndim - 1))
-    mean = jnp.sum(weight * channels, axis=axes)
-    variance = jnp.sum(weight * (channels - mean) ** 2, axis=axes)
-    return Scaler(mean=mean, std=jnp.maximum(jnp.sqrt(variance), _MIN_STD))
+    return scaler(channels, trajectory.alive[..., None] / jnp.maximum(trajectory.alive.sum(), 1))

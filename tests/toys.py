@@ -16,7 +16,7 @@ from jaxtune.types import ParamDist, Trajectory
 
 # Small enough for seconds on a CPU, large enough to find what the slider shows.
 SPM = SPMConfig(
-    window=50, stride=5, hidden=(128, 64, 64), head=16, dropout=0.0, train_steps=600, batch=96, guesses=4,
+    window=50, stride=5, hidden=(128, 64, 64), head=16, train_steps=600, batch=96, guesses=4,
     learning_rate=3e-3, weight_decay=1e-3, sweep=17,
 )  # fmt: skip
 DVM = DVMConfig(
@@ -30,7 +30,7 @@ TUNER = TunerConfig(
 
 # For tests of the bookkeeping, in which nothing needs to be learned.
 TINY_SPM = SPMConfig(
-    window=50, stride=10, hidden=(8, 8, 8), head=4, dropout=0.1, train_steps=4, batch=8, guesses=2,
+    window=50, stride=10, hidden=(8, 8, 8), head=4, train_steps=4, batch=8, guesses=2,
     learning_rate=1e-3, weight_decay=1e-3, sweep=5,
 )  # fmt: skip
 TINY_DVM = DVMConfig(

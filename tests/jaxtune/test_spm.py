@@ -148,7 +148,8 @@ def with_logits(monkeypatch, curve):
     # Normalised, the second parameter's box ends at (1 - 0.75) / 0.5 = 0.5.
     bounds = {"a": jnp.float32(-1), "b": jnp.float32(-1)}, {"a": jnp.float32(1), "b": jnp.float32(1)}
     dist = dists.make({"a": jnp.float32(0), "b": jnp.float32(0.75)}, 0.5, *bounds)
-    return SPM(variables={}, scaler=windows.Scaler(mean=jnp.zeros(3), std=jnp.ones(3)), dist=dist)
+    scaler = windows.Scaler(mean=jnp.zeros(3), std=jnp.ones(3))
+    return SPM(variables={}, steps=scaler, moments=scaler, dist=dist)
 
 
 @pytest.mark.parametrize("truth", [(-0.83, 0.41), (0.0, 0.0), (0.999, -0.999)])
