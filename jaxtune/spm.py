@@ -44,7 +44,7 @@ class SPMConfig:
     """Windows in a gradient step."""
     guesses: int = 4
     """Guesses judged for every window of a batch, the centre among them."""
-    learning_rate: float = 1e-3
+    learning_rate: float = 5e-4
     """Peak of a one-cycle cosine schedule."""
     weight_decay: float = 1e-3
     """Decoupled weight decay."""
