@@ -32,7 +32,8 @@ class Entry:
     """One row of the parameter table."""
 
     name: str
-    kind: Literal["body", "geom", "joint", "actuator"]
+    kind: Literal["body", "geom", "joint", "actuator", "control"]
+    """What the targets are; `control` is no part of the model and has neither targets nor fields."""
     targets: tuple[str, ...]
     """Names of the objects that share this value."""
     fields: tuple[str, ...]

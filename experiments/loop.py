@@ -31,7 +31,7 @@ class Loop:
     def __init__(self, preset: Preset, entries: Mapping[str, domain.Entry]):
         self.preset = preset
         self.entries = entries
-        self.robot = Biteno(preset.task)
+        self.robot = Biteno(preset.task, entries)
         self._env = BraxBiteno(self.robot)
         self._ppo = PPO(preset.ppo, self.robot.observation_size, self.robot.action_size)
 

@@ -17,6 +17,7 @@ FIELDS = (
     "dof_M0",
     "dof_armature",
     "dof_damping",
+    "dof_frictionloss",
     "actuator_acc0",
     "actuator_gainprm",
     "actuator_biasprm",
@@ -62,6 +63,8 @@ def recompiled(values):
         joint = spec.joint(name)
         joint.armature *= float(values["joint_armature"])
         joint.damping[0] *= float(values["joint_damping"])
+        # The robot of the whole table has a trace of friction in its joints, so that MJX solves for it.
+        joint.frictionloss = 1e-6 + float(values["joint_friction_nm"])
         actuator, scale = spec.actuator(name), float(values["torque_scale"])
         actuator.gainprm = actuator.gainprm * scale
         actuator.biasprm = actuator.biasprm * scale

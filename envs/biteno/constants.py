@@ -6,6 +6,7 @@ Public: 15.5 kg, 0.95 m tall, legs of 0.65 m, three joints a leg, a policy at 10
   joints).
 """
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -84,6 +85,7 @@ ENTRIES = {
             bounds=(0.3, 2.0),
         ),
         _joints("joint_damping", "dof_damping", bounds=(0.1, 10.0)),
+        replace(_joints("joint_friction_nm", "dof_frictionloss", bounds=(0.0, 5.0)), log=False),
         _joints("joint_armature", "dof_armature", bounds=(0.2, 5.0)),
         Entry(
             name="contact_time_constant",
@@ -93,10 +95,11 @@ ENTRIES = {
             column=0,
             bounds=(0.5, 4.0),
         ),
+        # Until it is over, the joints still follow the target before.
+        Entry(name="action_delay_s", kind="control", targets=(), fields=(), bounds=(0.0, POLICY_DT_S), log=False),
     )
 }
-"""Everything that can be tuned, by name; multipliers of the nominal model, but the centre of mass, which is an
-offset."""
+"""Everything that can be tuned, by name; multipliers of the nominal model, but where a unit says that it is added."""
 
 PARAMETER_SETS = {
     # The paper's own seven, in its order.
