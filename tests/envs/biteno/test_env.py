@@ -48,9 +48,11 @@ def scenes():
     model = mujoco.MjModel.from_xml_path(str(constants.MODEL_PATH))
     for number in range(24):
         # The lower foot 3 mm in the floor, just above it so that it lands on the way, or far from it.
-        clearance = (-0.003, 0.0005, 0.2)[number % 3]
+        clearance = (-0.003, 0.001, 0.2)[number % 3]
         values = NOMINAL if number < 12 else reference.draw(rng, constants.ENTRIES, share=0.5)
-        yield values, *reference.random_state(rng, model, clearance), rng.normal(size=6).astype(np.float32)
+        qpos, qvel = reference.random_state(rng, model, clearance)
+        qvel[2] = -abs(qvel[2])
+        yield values, qpos, qvel, rng.normal(size=6).astype(np.float32)
     # Two that slide on ice, and one in the air whose joints are beyond their limits.
     for speed in (2.0, -2.0):
         qpos, qvel = reference.random_state(rng, model, -0.002)
