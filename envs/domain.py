@@ -5,6 +5,7 @@ that scale every constraint at their old values. MuJoCo C recomputes them in `mj
 `set_const` is that function in JAX, and `apply` is the only door through which parameters enter a model.
 """
 
+import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -111,6 +112,21 @@ def apply(model: mjx.Model, params: Params, entries: Mapping[str, Entry]) -> mjx
             cell = fields.get(field, getattr(model, field)).at[index]
             fields[field] = cell.multiply(value) if entry.log else cell.add(value)
     return set_const(model.tree_replace(fields))
+
+
+def apply_mujoco(model: mujoco.MjModel, params: Params, entries: Mapping[str, Entry]) -> mujoco.MjModel:
+    """`apply` for a model of MuJoCo C, which is copied."""
+    model = copy.copy(model)
+    for name, entry in select(entries, tuple(params)).items():
+        value = float(params[name])
+        rows = entry.rows(model)
+        for field in entry.fields:
+            array = getattr(model, field)
+            cells = array[rows] if entry.column is None else array[rows, entry.column]
+            cells = cells * value if entry.log else cells + value
+            array[rows if entry.column is None else (rows, entry.column)] = cells
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    return model
 
 
 def set_const(model: mjx.Model) -> mjx.Model:

@@ -4,8 +4,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.biteno import constants
-
 _VELOCITY_SCALE = 2.0
 _COMMAND_SCALE = np.array([2.0, 2.0, 0.25], np.float32)
 _GYRO_SCALE = 0.25
@@ -15,11 +13,16 @@ NOISE = {"velocity": 0.1, "gyro": 0.2, "gravity": 0.05, "joint": 0.01, "joint_ve
 """Half width of the uniform noise, before scaling: m/s, rad/s, 1, rad, rad/s."""
 
 
-def rotate_inverse(quat: jax.Array, vector: jax.Array) -> jax.Array:
-    """Takes a world vector [3] into the frame of a body with orientation `quat` [4] (w, x, y, z)."""
-    w, axis = quat[0], -quat[1:]
+def rotate(quat: jax.Array, vector: jax.Array) -> jax.Array:
+    """Takes a vector [3] of a body with orientation `quat` [4] (w, x, y, z) into the world."""
+    w, axis = quat[0], quat[1:]
     cross = jnp.cross(axis, vector)
     return vector + 2.0 * (w * cross + jnp.cross(axis, cross))
+
+
+def rotate_inverse(quat: jax.Array, vector: jax.Array) -> jax.Array:
+    """Takes a world vector [3] into the frame of a body with orientation `quat` [4] (w, x, y, z)."""
+    return rotate(quat * jnp.array([1.0, -1.0, -1.0, -1.0]), vector)
 
 
 def projected_gravity(quat: jax.Array) -> jax.Array:
@@ -44,6 +47,7 @@ def observe(
     last_action: jax.Array,
     joint_error: jax.Array,
     phase: jax.Array,
+    stand: jax.Array,
 ) -> jax.Array:
     """Builds the observation in the paper's order (section IV-A.2).
 
@@ -56,6 +60,7 @@ def observe(
       last_action: [6].
       joint_error: [6] rad, last target less position.
       phase: [2] cycles, of each foot.
+      stand: [6] rad, joints in the standing pose.
 
     Returns:
       [40]: velocity 0:3, command 3:6, gyro 6:9, gravity 9:12, joint 12:18, joint velocity 18:24, last action 24:30,
@@ -67,13 +72,18 @@ def observe(
             command * _COMMAND_SCALE,
             gyro * _GYRO_SCALE,
             gravity,
-            joint - constants.STAND_RAD,
+            joint - stand,
             joint_velocity * _JOINT_VELOCITY_SCALE,
             last_action,
             joint_error,
             clock(phase),
         ]
     )
+
+
+def with_command(obs: jax.Array, command: jax.Array) -> jax.Array:
+    """The observation [40] that another command would have made."""
+    return obs.at[3:6].set(command * _COMMAND_SCALE)
 
 
 def disturb(key: jax.Array, readings: dict[str, jax.Array], scale: float) -> dict[str, jax.Array]:

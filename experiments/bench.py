@@ -20,9 +20,7 @@ from envs import domain
 from experiments import checkpoint
 from experiments.config import chosen, preset
 from experiments.loop import Loop
-from experiments.sim2sim import Args as TuningArgs
-from experiments.sim2sim import starting_policy
-from experiments.train import console, run
+from experiments.train import console, run, starting_policy
 from jaxtune import dist as dists
 from jaxtune import tuner
 
@@ -71,7 +69,7 @@ def alarm(args: Args) -> dict:
     """First gate calls with the target outside the radius, at its edge and drawn within it."""
     sizes = preset(args.preset)
     loop = Loop(sizes, chosen("legs6"))
-    policy = starting_policy(TuningArgs(policy=args.policy), loop)
+    policy = starting_policy(args.policy, loop)
     dist = loop.dist(domain.nominal(loop.entries), args.radius)
     machine = loop.tuner(None, sizes.policy_radius)
 

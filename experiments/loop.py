@@ -10,6 +10,7 @@ from brax.envs.base import State
 from envs import domain
 from envs.biteno import Biteno, BraxBiteno, constants
 from envs.targets.mjx import MjxTarget, simulate
+from envs.targets.protocol import Act
 from experiments.config import Preset
 from jaxtune import dist as dists
 from jaxtune.ppo import PPO, PPOState
@@ -81,17 +82,17 @@ class Loop:
 
     def simulate(self, key: jax.Array, policy: Policy, params: Mapping[str, jax.Array]) -> Trajectory:
         """One episode for each draw, [episodes] by name in search coordinates."""
-        return simulate(self.robot, key, self._act(policy), params, self.preset.episode_steps)
+        return simulate(self.robot, key, self.act(policy), params, self.preset.episode_steps)
 
     def measure(self, key: jax.Array, policy: Policy, target: MjxTarget) -> Trajectory:
         """One measured set of the target."""
         count = self.preset.tuner.set_episodes
-        return target.episodes(key, self._act(policy), count, self.preset.episode_steps)
+        return target.episodes(key, self.act(policy), count, self.preset.episode_steps)
 
     def evaluate(self, key: jax.Array, policy: Policy, target: MjxTarget) -> tuple[jax.Array, jax.Array]:
         """Mean return under the weights of Table I, and number of falls, over whole episodes in the target."""
         steps = round(self.preset.task.episode_s / constants.POLICY_DT_S)
-        trajectory = target.episodes(key, self._act(policy), self.preset.evaluation_episodes, steps)
+        trajectory = target.episodes(key, self.act(policy), self.preset.evaluation_episodes, steps)
         return trajectory.score.sum(axis=-1).mean(), trajectory.fell.sum()
 
     def tuner(self, target: MjxTarget, policy_radius: float) -> Tuner:
@@ -104,5 +105,6 @@ class Loop:
             measure=lambda key, policy: self.measure(key, policy, target),
         )
 
-    def _act(self, policy: Policy):
+    def act(self, policy: Policy) -> Act:
+        """What the policy does, without noise."""
         return self._ppo.act(policy.learner)

@@ -9,6 +9,8 @@ import numpy as np
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
+from envs.biteno.constants import DUTY, POLICY_DT_S
+
 _COLOURS = {"ours": "tab:blue", "spm": "tab:orange", "dr": "tab:green", "oracle": "tab:gray"}
 _MARKS = {"accept": "o", "widen": "^", "unexplained": "X", "radius_exhausted": "s", "not_finite": "x"}
 
@@ -61,6 +63,32 @@ def sweep(path: Path, grid: np.ndarray, rows: Sequence[str], columns: Sequence[s
     axes[0, 0].set_ylabel(row_label)
     figure.colorbar(image, ax=axes, label="mean parameter error at the end")
     _save(figure, path)
+
+
+def gait(path: Path, force: np.ndarray, phase: np.ndarray) -> None:
+    """Contacts of one episode over time, above what the clock asks for.
+
+    Args:
+      path: a PNG.
+      force: [time, 2] N, normal, left and right foot.
+      phase: [time, 2] cycles.
+    """
+    time = np.arange(len(force)) * POLICY_DT_S
+    figure, axis = plt.subplots(figsize=(9, 2.4), layout="constrained")
+    for foot, (name, colour) in enumerate((("left", "tab:blue"), ("right", "tab:orange"))):
+        for row, (on, shade) in enumerate(((phase[:, foot] < DUTY, 0.3), (force[:, foot] > 1.0, 1.0))):
+            low = 2.4 * foot + row
+            axis.fill_between(time, low, low + 0.9 * on, step="post", color=colour, alpha=shade, lw=0)
+        axis.text(-0.01, 2.4 * foot + 0.45, f"{name}, clock", ha="right", va="center", transform=_beside(axis))
+        axis.text(-0.01, 2.4 * foot + 1.45, f"{name}, floor", ha="right", va="center", transform=_beside(axis))
+    axis.set(xlabel="s", yticks=[], xlim=(0, time[-1]))
+    axis.spines[["left", "right", "top"]].set_visible(False)
+    _save(figure, path)
+
+
+def _beside(axis):
+    """Across in shares of the axes, up in data."""
+    return axis.get_yaxis_transform()
 
 
 def _returns(path: Path, results: dict[str, list[dict]], epochs: int) -> None:

@@ -21,9 +21,9 @@ from envs import domain
 from envs.targets.mjx import MjxTarget
 from experiments import checkpoint, plots, report
 from experiments.checkpoint import as_json, write_json
-from experiments.config import WALK, Preset, chosen, preset
+from experiments.config import Preset, chosen, preset
 from experiments.loop import Loop, Policy
-from experiments.train import bars, console, policy_config, run, walk
+from experiments.train import bars, console, run, starting_policy
 from jaxtune import baselines, tuner
 from jaxtune import dist as dists
 from jaxtune.types import ParamDist, Verdict
@@ -135,19 +135,6 @@ def true_params(args, loop: Loop) -> dict[str, float]:
     return {name: value / args.start if off(name) else value for name, value in domain.nominal(loop.entries).items()}
 
 
-def starting_policy(args: Args, loop: Loop) -> Policy:
-    """Loads the starting policy, or trains it and keeps it in the run's folder."""
-    fresh = loop.init(jax.random.PRNGKey(0))
-    place = {"walk": WALK, "scratch": args.out / "policy"}.get(args.policy, Path(args.policy))
-    if args.policy == "scratch" and not (place / "config.json").exists():
-        with bars() as progress:
-            policy, curve = walk(jax.random.PRNGKey(0), loop, loop.preset.scratch_updates, progress)
-        checkpoint.save(place, policy.learner, policy_config(loop))
-        write_json(place / "curve.json", {"curve": curve})
-    learner = checkpoint.load(place, fresh.learner, policy_config(loop))
-    return loop.init(jax.random.PRNGKey(0), learner)
-
-
 class Runner:
     """Runs (method, seed) pairs, each into a file of its own."""
 
@@ -239,7 +226,7 @@ def main(args: Args) -> None:
     loop = Loop(sizes, entries)
     checkpoint.open_run(args.out, identity)
     target = MjxTarget(robot=loop.robot, params=true_params(args, loop))
-    runner = Runner(args, loop, target, starting_policy(args, loop), knobs)
+    runner = Runner(args, loop, target, starting_policy(args.policy, loop, args.out), knobs)
     with bars() as progress:
         results = {name: [runner(name, seed, progress) for seed in range(args.seeds)] for name in args.methods}
     summary = report.sim2sim(args, results, tuple(filter(CASES[args.case], entries)))

@@ -22,10 +22,10 @@ from envs.targets.mjx import MjxTarget
 from experiments import checkpoint, plots
 from experiments.config import chosen, preset
 from experiments.loop import Loop, Policy
-from experiments.sim2sim import CASES, starting_policy, true_params
+from experiments.sim2sim import CASES, true_params
 from experiments.sim2sim import Args as TuningArgs
 from experiments.sim2sim import check as check_tuning
-from experiments.train import console, run
+from experiments.train import console, run, starting_policy
 from jaxtune import dist as dists
 from jaxtune import tuner
 from jaxtune.types import Verdict
@@ -117,7 +117,7 @@ def main(args: Args) -> None:
     checkpoint.enable_compilation_cache()
     loop = Loop(sizes, entries)
     checkpoint.open_run(args.out, {**dataclasses.asdict(args), "out": None, "sizes": sizes})
-    policy = starting_policy(one, loop)
+    policy = starting_policy(one.policy, loop, args.out)
     grid = lanes(args)
     sweep = program(args, loop, policy)
     begin = time.monotonic()

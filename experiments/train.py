@@ -13,7 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from envs import domain
 from experiments import checkpoint, plots
 from experiments.checkpoint import write_json
-from experiments.config import chosen, preset
+from experiments.config import WALK, chosen, preset
 from experiments.loop import Loop, Policy
 
 console = Console()
@@ -62,6 +62,21 @@ def walk(key: jax.Array, loop: Loop, updates: int, progress: Progress | None = N
         if progress:
             progress.update(task, completed=steps, description=f"reward {100 * line['reward']:.2f} a second")
     return policy, curve
+
+
+def starting_policy(name: str, loop: Loop, out: Path | None = None) -> Policy:
+    """Loads a policy: `walk`, which ships, a folder, or `scratch`, which is trained first and kept in `out`."""
+    fresh = loop.init(jax.random.PRNGKey(0))
+    place = WALK if name == "walk" else Path(name)
+    if name == "scratch":
+        place = out / "policy"
+        if not (place / "config.json").exists():
+            with bars() as progress:
+                policy, curve = walk(jax.random.PRNGKey(0), loop, loop.preset.scratch_updates, progress)
+            checkpoint.save(place, policy.learner, policy_config(loop))
+            write_json(place / "curve.json", {"curve": curve})
+    learner = checkpoint.load(place, fresh.learner, policy_config(loop))
+    return loop.init(jax.random.PRNGKey(0), learner)
 
 
 def bars() -> Progress:

@@ -1,5 +1,5 @@
 """The biped BITeno: model, task and gait."""
 
-from envs.biteno.env import Biteno, BraxBiteno, State, TaskConfig
+from envs.biteno.env import Biteno, BraxBiteno, Drive, Motion, State, TaskConfig
 
-__all__ = ["Biteno", "BraxBiteno", "State", "TaskConfig"]
+__all__ = ["Biteno", "BraxBiteno", "Drive", "Motion", "State", "TaskConfig"]

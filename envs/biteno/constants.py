@@ -24,6 +24,7 @@ HIP_HEIGHT_M = 0.612
 HIP_Y_M = np.array([0.10, -0.10])
 LINK_M = 0.31  # thigh and shank alike
 STANCE_DEPTH_M = 0.582  # hip axis to the foot's centre: HIP_HEIGHT_M less the foot's radius
+FOOT_RADIUS_M = 0.03
 POLICY_DT_S = 0.01
 
 CLOCK_HZ = 1.75

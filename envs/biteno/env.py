@@ -58,6 +58,10 @@ class TaskConfig:
     """Largest command forward in m/s, sideways in m/s, turning in rad/s."""
     zero_command_share: float = 0.1
     """Share of commands that are zero."""
+    push_mps: float = 0.0
+    """Speed that a push adds to the trunk, in a random horizontal direction."""
+    push_s: float = 4.0
+    """Time between two pushes."""
 
 
 @chex.dataclass(frozen=True)
@@ -81,6 +85,27 @@ class State:
     key: jax.Array
 
 
+@chex.dataclass(frozen=True)
+class Drive:
+    """What an action asks of the joints during a policy step."""
+
+    action: jax.Array  # [6] clipped
+    target: jax.Array  # [6] rad
+    targets: jax.Array  # [substeps, 6] rad, what has arrived of it at each sub-step
+    reference: jax.Array  # [6] rad, Raibert's q*
+
+
+@chex.dataclass(frozen=True)
+class Motion:
+    """Where an engine leaves the robot after a policy step."""
+
+    qpos: jax.Array  # [13] m, quaternion (w, x, y, z) and rad, in MuJoCo's order
+    qvel: jax.Array  # [12] m/s in the world, rad/s in the trunk, rad/s
+    qacc_warmstart: jax.Array  # [12]; zeros where the engine keeps its own
+    torque: jax.Array  # [6] Nm, of the last sub-step
+    foot_force: jax.Array  # [2, 3] N, world frame, of the floor on each foot in the last sub-step
+
+
 class Biteno:
     """One robot.
 
@@ -101,10 +126,11 @@ class Biteno:
         self.config = config
         self.entries = entries
         model = mujoco.MjModel.from_xml_path(str(constants.MODEL_PATH))
-        model.opt.timestep, self._substeps, model.opt.iterations, model.opt.ls_iterations = _PHYSICS[config.physics]
+        model.opt.timestep, self.substeps, model.opt.iterations, model.opt.ls_iterations = _PHYSICS[config.physics]
         joints = [model.joint(name) for name in constants.JOINTS]
-        self._joint_qpos = np.array([joint.qposadr[0] for joint in joints])
-        self._joint_dof = np.array([joint.dofadr[0] for joint in joints])
+        self.joint_qpos = np.array([joint.qposadr[0] for joint in joints])
+        self.joint_dof = np.array([joint.dofadr[0] for joint in joints])
+        self._shanks = np.array([model.body(f"{side}_shank").id for side in constants.SIDES])
         self._home = jnp.array(model.keyframe("home").qpos, jnp.float32)
         for entry in entries.values():
             if "dof_frictionloss" in entry.fields:
@@ -130,11 +156,11 @@ class Biteno:
         """
         del params
         key, key_joint, key_velocity, key_phase, key_command, key_noise = jax.random.split(key, 6)
-        joint = self._home[self._joint_qpos] + jax.random.uniform(key_joint, (6,), minval=-0.1, maxval=0.1)
+        joint = self._home[self.joint_qpos] + jax.random.uniform(key_joint, (6,), minval=-0.1, maxval=0.1)
         qvel = jax.random.uniform(key_velocity, (self.mj_model.nv,), minval=-0.2, maxval=0.2)
         zeros = jnp.zeros(6)
         state = State(
-            qpos=self._home.at[self._joint_qpos].set(joint),
+            qpos=self._home.at[self.joint_qpos].set(joint),
             qvel=qvel,
             qacc_warmstart=jnp.zeros_like(qvel),
             command=self._draw_command(key_command),
@@ -154,48 +180,67 @@ class Biteno:
 
     def step(self, params: domain.Params, state: State, action: jax.Array) -> State:
         """Moves the robot on by one policy step of 10 ms under an action [6]."""
+        return self.move(params, state, action)[0]
+
+    def move(self, params: domain.Params, state: State, action: jax.Array) -> tuple[State, Motion]:
+        """A step, and the motion behind it."""
+        drive = self.drive(params, state, action)
+        motion = self.simulate(params, state, drive)
+        return self.settle(state, drive, motion), motion
+
+    def drive(self, params: domain.Params, state: State, action: jax.Array) -> Drive:
+        """What an action [6] asks of the joints."""
         action = jnp.clip(action, -_ACTION_LIMIT, _ACTION_LIMIT)
         reference = gait.joint_reference(state.phase, state.command)
         base = reference if self.config.base == "raibert" else jnp.asarray(constants.STAND_RAD)
         target = base + self.config.action_scale * action
-
-        model = self.model(params)
-        held = state.joint_error + state.qpos[self._joint_qpos]
+        held = state.joint_error + state.qpos[self.joint_qpos]
         delay = params.get("action_delay_s", 0.0) / self.mj_model.opt.timestep
         # A sub-step in which the target changes has the mean of both.
-        arrived = jnp.clip(jnp.arange(1, self._substeps + 1) - delay, 0.0, 1.0)
+        arrived = jnp.clip(jnp.arange(1, self.substeps + 1) - delay, 0.0, 1.0)
+        targets = target + (1.0 - arrived[:, None]) * (held - target)
+        return Drive(action=action, target=target, targets=targets, reference=reference)
+
+    def simulate(self, params: domain.Params, state: State, drive: Drive) -> Motion:
+        """Physics in MJX; another engine may stand in for it."""
+        model = self.model(params)
         data = self._data.replace(qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.qacc_warmstart)
+        data, _ = jax.lax.scan(lambda data, ctrl: (mjx.step(model, data.replace(ctrl=ctrl)), None), data, drive.targets)
+        return Motion(
+            qpos=data.qpos,
+            qvel=data.qvel,
+            qacc_warmstart=data.qacc_warmstart,
+            torque=data.qfrc_actuator[self.joint_dof],
+            # Nothing but the floor touches a shank.
+            foot_force=mjx.rne_postconstraint(model, data).cfrc_ext[self._shanks, 3:],
+        )
 
-        def substep(data, arrived):
-            return mjx.step(model, data.replace(ctrl=target + (1.0 - arrived) * (held - target))), None
-
-        data, _ = jax.lax.scan(substep, data, arrived)
-
-        finite = jnp.isfinite(data.qpos).all() & jnp.isfinite(data.qvel).all()
-        torque = data.qfrc_actuator[self._joint_dof]
+    def settle(self, state: State, drive: Drive, motion: Motion) -> State:
+        """What the robot perceives, earns and is asked for after it moved."""
+        finite = jnp.isfinite(motion.qpos).all() & jnp.isfinite(motion.qvel).all()
         zeros = jnp.zeros_like(state.qvel)
         qpos, qvel, warmstart, torque, action, target = jax.tree.map(
             lambda new, old: jnp.where(finite, new, old),
-            (data.qpos, data.qvel, data.qacc_warmstart, torque, action, target),
-            (self._home, zeros, zeros, jnp.zeros_like(torque), jnp.zeros_like(action), self._home[self._joint_qpos]),
+            (motion.qpos, motion.qvel, motion.qacc_warmstart, motion.torque, drive.action, drive.target),
+            (self._home, zeros, zeros, jnp.zeros(6), jnp.zeros(6), self._home[self.joint_qpos]),
         )
-        key, key_command, key_noise = jax.random.split(state.key, 3)
-        moved = state.replace(qpos=qpos, qvel=qvel)
+        key, key_command, key_noise, key_push = jax.random.split(state.key, 4)
+        steps = state.steps + 1
+        moved = state.replace(qpos=qpos, qvel=self._push(key_push, qvel, steps))
         readings = self._readings(moved)
         values = rewards.terms(
             **readings,
             command=state.command,
-            last_joint_velocity=state.qvel[self._joint_dof],
+            last_joint_velocity=state.qvel[self.joint_dof],
             torque=torque,
             action=action,
             last_action=state.action,
-            joint_reference=reference,
+            joint_reference=drive.reference,
         )
         values = {name: jnp.where(finite, value, 0.0) for name, value in values.items()}
         fell = (readings["gravity"][2] > -_MAX_TILT_COS) | (qpos[2] < _MIN_HEIGHT_M)
         done = (fell | ~finite).astype(jnp.float32)
 
-        steps = state.steps + 1
         redraw = steps % round(self.config.command_s / constants.POLICY_DT_S) == 0
         moved = moved.replace(
             qacc_warmstart=warmstart,
@@ -219,8 +264,8 @@ class Biteno:
             "velocity": sensing.rotate_inverse(quat, state.qvel[:3]),
             "gyro": state.qvel[3:6],  # MuJoCo keeps a free joint's angular velocity in the body frame
             "gravity": sensing.projected_gravity(quat),
-            "joint": state.qpos[self._joint_qpos],
-            "joint_velocity": state.qvel[self._joint_dof],
+            "joint": state.qpos[self.joint_qpos],
+            "joint_velocity": state.qvel[self.joint_dof],
         }
 
     def _observe(self, state: State, key: jax.Array) -> jax.Array:
@@ -233,7 +278,21 @@ class Biteno:
             last_action=state.action,
             joint_error=state.joint_error,
             phase=state.phase,
+            stand=jnp.asarray(constants.STAND_RAD),
         )
+
+    @staticmethod
+    def ask(state: State, command: jax.Array) -> State:
+        """The same robot under another command [3]."""
+        return state.replace(command=command, obs=sensing.with_command(state.obs, command))
+
+    def _push(self, key: jax.Array, qvel: jax.Array, steps: jax.Array) -> jax.Array:
+        if not self.config.push_mps:
+            return qvel
+        angle = jax.random.uniform(key, maxval=2 * jnp.pi)
+        push = self.config.push_mps * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
+        due = steps % round(self.config.push_s / constants.POLICY_DT_S) == 0
+        return qvel.at[:2].add(jnp.where(due, push, 0.0))
 
     def _draw_command(self, key: jax.Array) -> jax.Array:
         key_size, key_zero = jax.random.split(key)

@@ -1,9 +1,14 @@
-"""The gait clock, and the joint angles that a foot following it would have (Raibert's heuristic)."""
+"""The gait clock, the joint angles of a foot that follows it (Raibert's heuristic), and how well a gait does."""
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from envs import sensing
 from envs.biteno import constants
+
+_TOUCH_N = 1.0  # a foot touches the floor
+_PRESS_N = 10.0  # and presses on it enough for a ratio of forces to mean something
 
 
 def advance(phase: jax.Array) -> jax.Array:
@@ -48,3 +53,121 @@ def leg_angles(foot: jax.Array) -> jax.Array:
 def joint_reference(phase: jax.Array, command: jax.Array) -> jax.Array:
     """Raibert's joint angles q* [6] rad for phases [2] and a command [3]."""
     return leg_angles(foot_reference(phase, command)).reshape(-1)
+
+
+def foot_motion(qpos: jax.Array, qvel: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Where the feet are, and how fast the lowest point of each moves over the ground.
+
+    The lowest point and not the centre, which moves while the foot rolls.
+
+    Args:
+      qpos, qvel: [13], [12], as in `Motion`.
+
+    Returns:
+      Centres [2, 3] m and velocities of the lowest points [2, 3] m/s, both in the world.
+    """
+    joint, joint_velocity = (values.reshape(2, 3) for values in (qpos[7:], qvel[6:]))
+    turn = jax.vmap(lambda axis: sensing.rotate(qpos[3:7], axis), out_axes=1)(jnp.eye(3))
+    centre, centre_velocity = jax.jvp(_foot_in_trunk, (joint,), (joint_velocity,))
+    spin = turn @ qvel[3:6]
+    abduction, knee = turn[:, 0], jax.vmap(lambda angle: turn @ _about_x(angle)[:, 1])(joint[:, 0])
+    shank_spin = spin + joint_velocity[:, :1] * abduction + joint_velocity[:, 1:].sum(axis=1, keepdims=True) * knee
+    lowest = jnp.array([0.0, 0.0, -constants.FOOT_RADIUS_M])
+    offset = centre @ turn.T
+    velocity = qvel[:3] + jnp.cross(spin, offset) + centre_velocity @ turn.T + jnp.cross(shank_spin, lowest)
+    return qpos[:3] + offset, velocity
+
+
+def _foot_in_trunk(joint: jax.Array) -> jax.Array:
+    hips = jnp.stack([jnp.zeros(2), jnp.asarray(constants.HIP_Y_M), jnp.zeros(2)], axis=-1)
+    thigh, shank = joint[:, 1], joint[:, 1] + joint[:, 2]
+    flat = -constants.LINK_M * jnp.stack(
+        [jnp.sin(thigh) + jnp.sin(shank), jnp.zeros(2), jnp.cos(thigh) + jnp.cos(shank)], axis=-1
+    )
+    return hips + jax.vmap(lambda angle, foot: _about_x(angle) @ foot)(joint[:, 0], flat)
+
+
+def _about_x(angle: jax.Array) -> jax.Array:
+    sin, cos = jnp.sin(angle), jnp.cos(angle)
+    return jnp.array([[1.0, 0.0, 0.0], [0.0, cos, -sin], [0.0, sin, cos]])
+
+
+def quality(
+    *,
+    qpos: np.ndarray,
+    qvel: np.ndarray,
+    torque: np.ndarray,
+    foot_force: np.ndarray,
+    command: np.ndarray,
+    phase: np.ndarray,
+    alive: np.ndarray,
+    fell: np.ndarray,
+) -> dict[str, float]:
+    """What tells a walk from a buzz; return does not.
+
+    Args:
+      qpos, qvel, torque, foot_force, command, phase: a recording, [episodes, time, ...].
+      alive, fell: of the same episodes, [episodes, time] and [episodes].
+
+    Returns:
+      By name: touchdowns a second and foot; swing clearance in m, the mean over swings of the foot's highest point
+      above the floor; share of time in which contact and clock agree; errors of the mean velocity in m/s and of the
+      mean turning rate in rad/s, over episodes after their first second; slip of the feet on the floor in m a second;
+      torque (root mean square, Nm); mechanical power in W, braking not regained; falls in 20 s; friction use, the 99th
+      percentile of tangential over normal force.
+    """
+    centre, velocity = (np.asarray(values) for values in _foot_motions(qpos, qvel))
+    seconds = alive.sum() * constants.POLICY_DT_S
+    height = centre[..., 2] - constants.FOOT_RADIUS_M
+    normal = foot_force[..., 2]
+    contact = normal > _TOUCH_N
+    living = alive[..., None]
+    landed = contact[:, 1:] & ~contact[:, :-1] & living[:, 1:]
+    pressed = living & (normal > _PRESS_N)
+    use = np.hypot(foot_force[..., 0], foot_force[..., 1])[pressed] / normal[pressed]
+    speed = np.hypot(velocity[..., 0], velocity[..., 1])
+    trunk = np.asarray(_trunk_velocities(qpos, qvel))
+    late = alive & (np.arange(alive.shape[1]) >= 1.0 / constants.POLICY_DT_S)
+    weight = late / np.maximum(late.sum(axis=1, keepdims=True), 1)
+    walked = late.any(axis=1)
+    error = np.einsum("et,etk->ek", weight, trunk - command)[walked]
+    return {
+        "touchdowns_per_s": landed.sum() / 2 / seconds,
+        "swing_clearance_m": _clearance(height, contact, living),
+        "clock_agreement": (contact == (phase < constants.DUTY))[alive].mean(),
+        "speed_error_mps": np.hypot(error[:, 0], error[:, 1]).mean(),
+        "turn_error_radps": np.abs(error[:, 2]).mean(),
+        "slip_mps": (speed * (contact & living)).sum() * constants.POLICY_DT_S / seconds,
+        "torque_nm": np.sqrt((torque[alive] ** 2).mean()),
+        "power_w": np.maximum(torque * qvel[..., 6:], 0.0).sum(axis=-1)[alive].mean(),
+        "falls_per_20s": fell.sum() / seconds * 20.0,
+        "friction_use_p99": np.quantile(use, 0.99) if use.size else np.nan,
+    }
+
+
+def _clearance(height: np.ndarray, contact: np.ndarray, living: np.ndarray) -> float:
+    """Mean over swings, from lift-off to touchdown, of the foot's highest point."""
+    highest = []
+    for episode, foot in np.ndindex(height.shape[0], height.shape[2]):
+        touching = contact[episode, living[episode, :, 0], foot]
+        edges = np.flatnonzero(np.diff(touching.astype(int)))
+        # A swing lies between two edges, the first of which is a lift-off.
+        starts = edges[:-1][touching[edges[:-1]]] + 1
+        ends = edges[1:][touching[edges[:-1]]] + 1
+        highest += [height[episode, a:b, foot].max() for a, b in zip(starts, ends, strict=True)]
+    return float(np.mean(highest)) if highest else 0.0
+
+
+@jax.jit
+def _foot_motions(qpos, qvel):
+    return jax.vmap(jax.vmap(foot_motion))(qpos, qvel)
+
+
+@jax.jit
+def _trunk_velocities(qpos, qvel):
+    """Forward, sideways, turning: [episodes, time, 3]."""
+
+    def one(qpos, qvel):
+        return jnp.append(sensing.rotate_inverse(qpos[3:7], qvel[:3])[:2], qvel[5])
+
+    return jax.vmap(jax.vmap(one))(qpos, qvel)

@@ -2,21 +2,28 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from envs import domain
 from envs.biteno import Biteno
+from envs.targets.protocol import Act, Recording, watch
 from jaxtune.types import Named, Trajectory
-
-Act = Callable[[jax.Array, jax.Array], tuple[jax.Array, dict]]
-"""A policy: `(observation [obs], key) -> (action [act], extras)`."""
 
 _CHUNK = 256  # small batches are fastest on a CPU; larger ones are worked off in turn
 
 
-def rollout(robot: Biteno, key: jax.Array, act: Act, params: domain.Params, steps: int) -> Trajectory:
+def rollout(
+    robot: Biteno,
+    key: jax.Array,
+    act: Act,
+    params: domain.Params,
+    steps: int,
+    command: jax.Array | None = None,
+    watch: Callable[..., Any] = lambda before, after, motion: (),
+) -> tuple[Trajectory, Any]:
     """Plays one episode for every parameter draw.
 
     An episode ends where the robot falls or the simulation breaks; the broken step is counted and masked.
@@ -27,43 +34,51 @@ def rollout(robot: Biteno, key: jax.Array, act: Act, params: domain.Params, step
       act: the policy.
       params: physical values by name, each [episodes].
       steps: length of an episode.
+      command: [episodes, 3], for the whole episode in the stead of those that are drawn.
+      watch: what is recorded of a step, `(state before, state after, motion) -> pytree`.
+
+    Returns:
+      The episodes, and what was recorded of them, [episodes, time, ...].
     """
     # Constant parameters would have the compiler work out every derived field of every model by itself, for minutes.
     params = jax.lax.optimization_barrier(dict(params))
     count = next(iter(params.values())).shape[0]
-    episode = jax.vmap(lambda key, params: _episode(robot, key, act, params, steps))
-    keys = jax.random.split(key, count)
+    episode = jax.vmap(lambda *drawn: _episode(robot, act, steps, watch, *drawn))
+    inputs = (jax.random.split(key, count), params) + (() if command is None else (command,))
     if count <= _CHUNK:
-        return episode(keys, params)
+        return episode(*inputs)
     # Chunks of equal size; the last one is filled up with repetitions.
     chunks = -(-count // _CHUNK)
     size = -(-count // chunks)
     fill = jnp.arange(chunks * size) % count
-    inputs = jax.tree.map(lambda x: x[fill].reshape(chunks, size, *x.shape[1:]), (keys, params))
+    inputs = jax.tree.map(lambda x: x[fill].reshape(chunks, size, *x.shape[1:]), inputs)
     stacked = jax.lax.map(lambda item: episode(*item), inputs)
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:count], stacked)
 
 
-def _episode(robot: Biteno, key: jax.Array, act: Act, params: domain.Params, steps: int) -> Trajectory:
+def _episode(robot, act, steps, watch, key, params, command=None) -> tuple[Trajectory, Any]:
     key_reset, key_act = jax.random.split(key)
 
     def step(carry, key):
         state, alive = carry
+        state = state if command is None else robot.ask(state, command)
         action, _ = act(state.obs, key)
-        following = robot.step(params, state, action)
+        following, motion = robot.move(params, state, action)
         broke = alive & (following.not_finite > 0)
         score = jnp.where(alive & ~broke, following.score, 0.0)
-        record = (state.obs, action, alive & ~broke, score, broke)
+        record = (state.obs, action, alive & ~broke, score, broke), watch(state, following, motion)
         return (following, alive & (following.done == 0)), record
 
     start = (robot.reset(params, key_reset), jnp.asarray(True))
-    (_, alive), (obs, action, valid, score, broke) = jax.lax.scan(step, start, jax.random.split(key_act, steps))
-    return Trajectory(obs=obs, action=action, alive=valid, score=score, fell=~alive, not_finite=broke.any())
+    (_, alive), (record, watched) = jax.lax.scan(step, start, jax.random.split(key_act, steps))
+    obs, action, valid, score, broke = record
+    trajectory = Trajectory(obs=obs, action=action, alive=valid, score=score, fell=~alive, not_finite=broke.any())
+    return trajectory, watched
 
 
 @dataclass(frozen=True, kw_only=True)
 class MjxTarget:
-    """A robot whose parameters are hidden from the tuner: it answers with episodes alone."""
+    """A robot in MJX, pure: `episodes` and `record` may be jitted."""
 
     robot: Biteno
     params: Mapping[str, float]
@@ -71,10 +86,18 @@ class MjxTarget:
 
     def episodes(self, key: jax.Array, act: Act, count: int, steps: int) -> Trajectory:
         """Measures `count` episodes of `steps` policy steps."""
-        params = {name: jnp.full(count, value, jnp.float32) for name, value in self.params.items()}
-        return rollout(self.robot, key, act, params, steps)
+        return rollout(self.robot, key, act, self._params(count), steps)[0]
+
+    def record(
+        self, key: jax.Array, act: Act, count: int, steps: int, command: jax.Array | None = None
+    ) -> tuple[Trajectory, Recording]:
+        """The same with the motion behind it, each episode under a command [episodes, 3] that stays, if given."""
+        return rollout(self.robot, key, act, self._params(count), steps, command, watch)
+
+    def _params(self, count: int) -> dict:
+        return {name: jnp.full(count, value, jnp.float32) for name, value in self.params.items()}
 
 
 def simulate(robot: Biteno, key: jax.Array, act: Act, coordinates: Named, steps: int) -> Trajectory:
     """Plays one episode for every draw of the tuner's distribution, [episodes] by name in search coordinates."""
-    return rollout(robot, key, act, domain.from_coordinates(robot.entries, coordinates), steps)
+    return rollout(robot, key, act, domain.from_coordinates(robot.entries, coordinates), steps)[0]

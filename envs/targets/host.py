@@ -1,0 +1,77 @@
+"""Episodes in engines that are not JAX: the physics is theirs, everything else the same code."""
+
+from collections.abc import Mapping
+from typing import Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from envs.biteno import Biteno, Drive, Motion, State
+from envs.targets.protocol import Act, Recording, watch
+from jaxtune.types import Trajectory
+
+
+class Engine(Protocol):
+    """Physics of many robots of one model."""
+
+    def start(self, state: State) -> None:
+        """Puts robots [episodes] where they begin."""
+
+    def move(self, state: State, drive: Drive) -> Motion:
+        """Moves every robot [episodes] on by a policy step; a state may differ from where the last motion ended."""
+
+
+class HostTarget:
+    """A robot in an engine of the host.
+
+    Args:
+      robot: task and robot; its MJX model is not used.
+      params: true physical values by name; only a report may read them.
+      engine: what moves it.
+    """
+
+    def __init__(self, robot: Biteno, params: Mapping[str, float], engine: Engine):
+        self.params = params
+        self._engine = engine
+        self._control = {name: value for name, value in params.items() if robot.entries[name].kind == "control"}
+        self._reset = jax.jit(jax.vmap(lambda key: robot.reset({}, key)))
+        self._ask = jax.jit(jax.vmap(robot.ask))
+        self._drive = jax.jit(jax.vmap(lambda state, action: robot.drive(self._control, state, action)))
+        self._settle = jax.jit(jax.vmap(robot.settle))
+
+    def episodes(self, key: jax.Array, act: Act, count: int, steps: int) -> Trajectory:
+        """Measures `count` episodes of `steps` policy steps."""
+        return self.record(key, act, count, steps)[0]
+
+    def record(
+        self, key: jax.Array, act: Act, count: int, steps: int, command: jax.Array | None = None
+    ) -> tuple[Trajectory, Recording]:
+        """The same with the motion behind it, each episode under a command [episodes, 3] that stays, if given."""
+        choose = jax.jit(jax.vmap(lambda obs, key: act(obs, key)[0]))
+        keys = jax.vmap(jax.random.split)(jax.random.split(key, count))
+        step_keys = np.asarray(jax.vmap(lambda key: jax.random.split(key, steps))(keys[:, 1]))
+        state = self._reset(keys[:, 0])
+        self._engine.start(state)
+        alive = np.ones(count, bool)
+        not_finite = np.zeros(count, bool)
+        records = []
+        for index in range(steps):
+            state = state if command is None else self._ask(state, command)
+            action = choose(state.obs, step_keys[:, index])
+            drive = self._drive(state, action)
+            motion = self._engine.move(state, drive)
+            following = self._settle(state, drive, motion)
+            broke = alive & (np.asarray(following.not_finite) > 0)
+            valid = alive & ~broke
+            score = np.where(valid, following.score, 0.0)
+            record = (state.obs, action, valid, score), watch(state, following, motion)
+            records.append(jax.tree.map(np.asarray, record))
+            alive &= np.asarray(following.done) == 0
+            not_finite |= broke
+            state = following
+        stacked = jax.tree.map(lambda *leaves: np.stack(leaves, axis=1), *records)
+        (obs, action, valid, score), recording = jax.tree.map(jnp.asarray, stacked)
+        fell, not_finite = jnp.asarray(~alive), jnp.asarray(not_finite)
+        trajectory = Trajectory(obs=obs, action=action, alive=valid, score=score, fell=fell, not_finite=not_finite)
+        return trajectory, recording

@@ -1,0 +1,73 @@
+"""BITeno in MuJoCo C, many robots over the machine's cores."""
+
+import os
+from collections.abc import Mapping
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from mujoco import rollout
+
+from envs import domain
+from envs.biteno import Biteno, Drive, Motion, State, constants
+from envs.targets.host import HostTarget
+
+_NET_FORCE = 3  # the sensor's way to reduce contacts to one
+_ITERATIONS = 100  # until it has converged, as MuJoCo does on its own
+
+
+class MujocoC:
+    """The engine. Options of MuJoCo by name (`cone`, `integrator`, `timestep`, ...) make it differ from MJX."""
+
+    def __init__(self, robot: Biteno, params: Mapping[str, float], threads: int | None = None, **options):
+        spec = mujoco.MjSpec.from_file(str(constants.MODEL_PATH))
+        for joint in constants.JOINTS:
+            kind = {"type": mujoco.mjtSensor.mjSENS_ACTUATORFRC, "objtype": mujoco.mjtObj.mjOBJ_ACTUATOR}
+            spec.add_sensor(name=f"{joint}_torque", objname=joint, **kind)
+        for foot in constants.FEET:
+            sensor = spec.add_sensor(name=f"{foot}_force", type=mujoco.mjtSensor.mjSENS_CONTACT)
+            sensor.objtype, sensor.objname = mujoco.mjtObj.mjOBJ_GEOM, foot
+            # Force alone, the sum over all contacts, in the world's frame.
+            sensor.intprm[:3] = [1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), _NET_FORCE, 1]
+        model = spec.compile()
+        model.opt.timestep = robot.mj_model.opt.timestep
+        model.opt.iterations = _ITERATIONS
+        for name, value in options.items():
+            setattr(model.opt, name, value)
+        ratio = robot.mj_model.opt.timestep / model.opt.timestep
+        self._repeats = round(ratio)
+        if self._repeats < 1 or abs(ratio - self._repeats) > 1e-6:
+            raise ValueError(f"timestep: got {model.opt.timestep}, which does not divide {robot.mj_model.opt.timestep}")
+        fields = {name: value for name, value in params.items() if robot.entries[name].kind != "control"}
+        self._model = domain.apply_mujoco(model, fields, robot.entries)
+        threads = os.cpu_count() if threads is None else threads
+        self._data = [mujoco.MjData(self._model) for _ in range(threads)]
+        self._pool = rollout.Rollout(nthread=threads)
+
+    def start(self, state: State) -> None:
+        """A state says all."""
+
+    def move(self, state: State, drive: Drive) -> Motion:
+        """Moves every robot on by a policy step."""
+        count = len(state.qpos)
+        start = np.concatenate([np.zeros((count, 1)), state.qpos, state.qvel], axis=1)
+        control = np.repeat(np.asarray(drive.targets, float), self._repeats, axis=1)
+        states, sensors = self._pool.rollout(
+            self._model, self._data, start, control, initial_warmstart=np.asarray(state.qacc_warmstart, float)
+        )
+        last, sensed = states[:, -1], sensors[:, -1]
+        qpos, qvel = np.split(last[:, 1:], [self._model.nq], axis=1)
+        torque, force = np.split(sensed, [len(constants.JOINTS)], axis=1)
+        return Motion(
+            qpos=jnp.asarray(qpos, jnp.float32),
+            qvel=jnp.asarray(qvel, jnp.float32),
+            qacc_warmstart=jnp.zeros((count, self._model.nv)),
+            torque=jnp.asarray(torque, jnp.float32),
+            # The sensor tells what the foot does to the floor.
+            foot_force=jnp.asarray(-force.reshape(count, 2, 3), jnp.float32),
+        )
+
+
+def target(robot: Biteno, params: Mapping[str, float], **options) -> HostTarget:
+    """A robot in MuJoCo C with these physical values."""
+    return HostTarget(robot, params, MujocoC(robot, params, **options))

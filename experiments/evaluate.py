@@ -1,0 +1,151 @@
+"""How well a policy walks in a target: `python -m experiments.evaluate --out DIR --target mujoco_c`.
+
+Three measurements: a grid of commands that stay for 5 s, episodes of the full time limit under the task's own commands,
+and the same with pushes.
+"""
+
+import dataclasses
+import itertools
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax
+import numpy as np
+from rich.table import Table
+
+from envs import domain
+from envs.biteno import constants, gait
+from envs.targets.protocol import Recording, Target
+from experiments import checkpoint, film, plots
+from experiments.checkpoint import write_json
+from experiments.config import PRESETS, chosen, preset
+from experiments.loop import Loop
+from experiments.targets import TARGETS
+from experiments.train import console, run, starting_policy
+from jaxtune.types import Trajectory
+
+GRID = tuple(itertools.product((-0.4, 0.0, 0.4, 0.8), (-0.3, 0.0, 0.3), (-0.8, 0.0, 0.8)))
+"""Commands forward in m/s, sideways in m/s, turning in rad/s."""
+
+_GRID_S = 5.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Args:
+    """Measures the gait of a policy in a target."""
+
+    out: Path = Path("runs/evaluate")
+    """Folder of evaluation.json, gait.png, film.png and walk.gif."""
+    policy: str = "walk"
+    """Policy: walk (ships with the package), or a folder of experiments.train."""
+    target: str = "mjx"
+    """Engine: mjx, mujoco_c or bullet."""
+    set: tuple[str, ...] = ()
+    """Parameters of the target that are not nominal, as name=value."""
+    preset: str = "cpu"
+    """Sizes of the network: smoke, cpu or gpu."""
+    physics: str = "exact"
+    """exact: sub-steps of 1 ms. fast: of 2 ms."""
+    episodes: int = 100
+    """Episodes of the full time limit, without and with pushes."""
+    push: float = 0.5
+    """Speed of a push in m/s; one comes every 4 s."""
+    seed: int = 0
+    """Seed of commands, resets and pushes."""
+    video: bool = False
+    """Write the walk as a GIF too."""
+
+
+def check(args: Args) -> dict[str, float]:
+    """Reads the arguments; returns the target's parameters.
+
+    Raises:
+      ValueError: names the field, the value and what is allowed.
+    """
+    for field, allowed in {"target": TARGETS, "preset": PRESETS}.items():
+        if getattr(args, field) not in allowed:
+            raise ValueError(f"{field}: got '{getattr(args, field)}', expected one of {', '.join(allowed)}")
+    if args.episodes < 1:
+        raise ValueError(f"episodes: got {args.episodes}, expected 1 or more")
+    if not 0 <= args.push < float("inf"):
+        raise ValueError(f"push: got {args.push}, expected a number that is not negative")
+    params = {}
+    for item in args.set:
+        name, _, value = item.partition("=")
+        try:
+            params[name] = float(value)
+        except ValueError:
+            raise ValueError(f"set: got '{item}', expected name=value") from None
+        (entry,) = domain.select(constants.ENTRIES, [name]).values()
+        low, high = entry.bounds
+        if not low <= params[name] <= high:
+            raise ValueError(f"set: got '{item}', expected {low:g} to {high:g}")
+    return params
+
+
+def measure(target: Target, key: jax.Array, act, count: int, steps: int, command=None) -> tuple[Trajectory, Recording]:
+    """Episodes on the host, and the motion behind them."""
+    return jax.tree.map(np.asarray, target.record(key, act, count, steps, command))
+
+
+def judge(trajectory: Trajectory, recording: Recording) -> dict[str, float]:
+    """Gait quality, and the return under the weights of Table I."""
+    values = gait.quality(**recording, alive=trajectory.alive, fell=trajectory.fell)
+    values["return"] = trajectory.score.sum(axis=1).mean()
+    return {name: float(value) for name, value in values.items()}
+
+
+def main(args: Args) -> None:
+    """Measures, prints and draws."""
+    params = check(args)
+    sizes = preset(args.preset)
+    entries = chosen(",".join(dict.fromkeys(("foot_friction", *params))))
+    task = dataclasses.replace(sizes.task, physics=args.physics)
+    checkpoint.enable_compilation_cache()
+    pushed = dataclasses.replace(task, push_mps=args.push)
+    loops = {
+        name: Loop(dataclasses.replace(sizes, task=task), entries)
+        for name, task in (("none", task), ("pushes", pushed))
+    }
+    policy = starting_policy(args.policy, loops["none"])
+    act = loops["none"].act(policy)
+    values = domain.nominal(entries) | params
+    targets = {name: TARGETS[args.target](loop.robot, values) for name, loop in loops.items()}
+    key = jax.random.PRNGKey(args.seed)
+    short, long = (round(seconds / constants.POLICY_DT_S) for seconds in (_GRID_S, task.episode_s))
+    command = np.array(GRID, np.float32)
+    grid = measure(targets["none"], key, act, len(command), short, command)
+    rows = {"grid": judge(*grid)}
+    for name, target in targets.items():
+        rows[name] = judge(*measure(target, jax.random.fold_in(key, len(rows)), act, args.episodes, long))
+
+    table = Table(title=f"{args.policy} in {args.target} {' '.join(args.set)}")
+    table.add_column("")
+    for name in rows:
+        table.add_column(name, justify="right")
+    for name in rows["grid"]:
+        table.add_row(name, *(f"{row[name]:.3f}" for row in rows.values()))
+    table.add_section()
+    table.add_row("clock_hz", *[f"{constants.CLOCK_HZ:.3f}"] * len(rows))
+    console.print(table)
+    args.out.mkdir(parents=True, exist_ok=True)
+    by_command = [
+        {"command": one, **judge(*jax.tree.map(lambda leaf, row=row: leaf[row : row + 1], grid))}
+        for row, one in enumerate(GRID)
+    ]
+    write_json(
+        args.out / "evaluation.json",
+        {"args": args, "rows": rows, "grid": by_command, "versions": checkpoint.versions()},
+    )
+    _, recording = jax.tree.map(lambda leaf: leaf[GRID.index((0.4, 0.0, 0.0))], grid)
+    plots.gait(args.out / "gait.png", recording.foot_force[..., 2], recording.phase)
+    try:
+        film.strip(args.out / "film.png", loops["none"].robot.mj_model, recording.qpos)
+        if args.video:
+            film.gif(args.out / "walk.gif", loops["none"].robot.mj_model, recording.qpos)
+    except film.NoPicture as error:
+        console.print(f"no film: {error}")
+
+
+if __name__ == "__main__":
+    run(main, Args)

@@ -1,0 +1,22 @@
+"""Targets by name."""
+
+from collections.abc import Callable, Mapping
+
+from envs.biteno import Biteno
+from envs.targets import mujoco_c
+from envs.targets.mjx import MjxTarget
+from envs.targets.protocol import Target
+
+
+def _bullet(robot: Biteno, params: Mapping[str, float]) -> Target:
+    # Not everyone has PyBullet.
+    from envs.targets import bullet
+
+    return bullet.target(robot, params)
+
+
+TARGETS: dict[str, Callable[[Biteno, Mapping[str, float]], Target]] = {
+    "mjx": lambda robot, params: MjxTarget(robot=robot, params=params),
+    "mujoco_c": mujoco_c.target,
+    "bullet": _bullet,
+}
