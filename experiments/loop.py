@@ -10,9 +10,10 @@ from brax.envs.base import State
 from envs import domain
 from envs.biteno import Biteno, BraxBiteno, constants
 from envs.targets.mjx import MjxTarget, simulate
-from envs.targets.protocol import Act
+from envs.targets.protocol import Act, Target
 from experiments.config import Preset
 from jaxtune import dist as dists
+from jaxtune.baselines import Untuned
 from jaxtune.ppo import PPO, PPOState
 from jaxtune.tuner import Tuner
 from jaxtune.types import ParamDist, Trajectory
@@ -84,19 +85,19 @@ class Loop:
         """One episode for each draw, [episodes] by name in search coordinates."""
         return simulate(self.robot, key, self.act(policy), params, self.preset.episode_steps)
 
-    def measure(self, key: jax.Array, policy: Policy, target: MjxTarget) -> Trajectory:
+    def measure(self, key: jax.Array, policy: Policy, target: Target) -> Trajectory:
         """One measured set of the target."""
         count = self.preset.tuner.set_episodes
         return target.episodes(key, self.act(policy), count, self.preset.episode_steps)
 
-    def evaluate(self, key: jax.Array, policy: Policy, target: MjxTarget) -> tuple[jax.Array, jax.Array]:
+    def evaluate(self, key: jax.Array, policy: Policy, target: Target) -> tuple[jax.Array, jax.Array]:
         """Mean return under the weights of Table I, and number of falls, over whole episodes in the target."""
         steps = round(self.preset.task.episode_s / constants.POLICY_DT_S)
         trajectory = target.episodes(key, self.act(policy), self.preset.evaluation_episodes, steps)
         return trajectory.score.sum(axis=-1).mean(), trajectory.fell.sum()
 
-    def tuner(self, target: MjxTarget, policy_radius: float) -> Tuner:
-        """Algorithm 1 against a target in JAX; the policy trains within `policy_radius` of the centre."""
+    def tuner(self, target: Target, policy_radius: float) -> Tuner:
+        """Algorithm 1 against a target; the policy trains within `policy_radius` of the centre."""
         epochs = self.preset.epochs
         return Tuner(
             config=self.preset.tuner,
@@ -104,6 +105,20 @@ class Loop:
             simulate=self.simulate,
             measure=lambda key, policy: self.measure(key, policy, target),
         )
+
+    def step(self, machine: Tuner | Untuned, target: Target) -> Callable:
+        """The compiled step of a tuner; what asks a target that is not JAX stays outside."""
+        if isinstance(machine, Untuned) or isinstance(target, MjxTarget):
+            return self.jit(machine.step)
+        tune, train = self.jit(machine.tune), self.jit(machine.train)
+
+        def step(key, state):
+            key_measure, key_tune, key_train = jax.random.split(key, 3)
+            state, info = tune(key_tune, state, machine.measure(key_measure, state.policy))
+            state, metrics = train(key_train, state)
+            return state, info.replace(train=metrics)
+
+        return step
 
     def act(self, policy: Policy) -> Act:
         """What the policy does, without noise."""

@@ -38,7 +38,7 @@ def training(path: Path, curve: Sequence[dict]) -> None:
 def sim2sim(out: Path, results: dict[str, list[dict]], off: Sequence[str], epochs: int) -> None:
     """After the paper's Figs. 3 and 4: return, parameter error, and the gate over the tunings."""
     _returns(out / "return.png", results, epochs)
-    _errors(out / "param_error.png", results, off)
+    _errors(out / "param_error.png", results, off or list(next(iter(results.values()))[0]["lines"][0]["param_error"]))
     _each_error(out / "param_error_each.png", results)
     if any(line.get("verdicts") for runs in results.values() for run in runs for line in run["lines"]):
         _gate(out / "gate.png", results)

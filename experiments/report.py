@@ -44,19 +44,20 @@ def sim2sim(args, results: dict[str, list[dict]], off: Sequence[str]) -> dict:
 
 def print_sim2sim(console: Console, summary: dict, results: dict[str, list[dict]]) -> None:
     """Two tables: the methods side by side, and what became of each parameter."""
-    table = Table(title=f"case {summary['case']}, start {summary['start']:g}X, mean over {summary['seeds']} seed(s)")
+    start = f", start {summary['start']:g}X" if summary["off"] else ""
+    table = Table(title=f"case {summary['case']}{start}, mean over {summary['seeds']} seed(s)")
     for column in (
         "method",
         "return in target",
         "falls",
-        "error of what was off",
+        "parameter error",
         "gate calls",
         "target episodes",
         "s",
     ):
         table.add_column(column, justify="left" if column == "method" else "right")
     for name, method in summary["methods"].items():
-        columns = [method["param_names"].index(p) for p in summary["off"]]
+        columns = [method["param_names"].index(p) for p in summary["off"] or method["param_names"]]
         error = [np.array(method[f"param_error_{end}"])[:, columns].mean() for end in ("start", "end")]
         verdicts = [verdict for seed in method["verdicts"] for verdict in seed]
         table.add_row(
@@ -83,5 +84,5 @@ def print_sim2sim(console: Console, summary: dict, results: dict[str, list[dict]
             mean = np.array(method["param_error_end"])[:, column].mean()
             cells.append(f"{'~ ' if unknown else ''}{mean:.3f}")
         table.add_row(f"{parameter}{' *' if parameter in summary['off'] else ''}", *cells)
-    table.caption = "* off at the start"
+    table.caption = "* off at the start" if summary["off"] else "truth is nominal; what is off is not among them"
     console.print(table)

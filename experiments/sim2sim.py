@@ -6,10 +6,11 @@ is |estimate / truth - 1|, which is 0.5 at both of the paper's starts, 0.5X and 
 """
 
 import dataclasses
+import functools
 import json
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -18,21 +19,39 @@ import numpy as np
 from rich.progress import Progress
 
 from envs import domain
+from envs.biteno import Biteno, constants
 from envs.targets.mjx import MjxTarget
+from envs.targets.protocol import Target
 from experiments import checkpoint, plots, report
 from experiments.checkpoint import as_json, write_json
 from experiments.config import Preset, chosen, preset
 from experiments.loop import Loop, Policy
+from experiments.targets import TARGETS
 from experiments.train import bars, console, run, starting_policy
 from jaxtune import baselines, tuner
 from jaxtune import dist as dists
 from jaxtune.types import ParamDist, Verdict
 
-CASES: dict[str, Callable[[str], bool]] = {
-    "friction": lambda name: name == "foot_friction",
-    "mass": lambda name: name.endswith("_mass"),
+
+@dataclass(frozen=True, kw_only=True)
+class Case:
+    """How the target differs from the simulator."""
+
+    off: Callable[[str], bool] = lambda name: False
+    """Which of the tuned parameters the target has otherwise: the nominal ones divided by `start`."""
+    hidden: Mapping[str, float] = field(default_factory=dict)
+    """What else it has otherwise, and nobody tunes."""
+    target: str = "mjx"
+    """Its engine."""
+
+
+CASES = {
+    "friction": Case(off=lambda name: name == "foot_friction"),
+    "mass": Case(off=lambda name: name.endswith("_mass")),
+    "bullet": Case(target="bullet"),
+    "weak_motor": Case(hidden={"torque_scale": 0.75}, target="bullet"),
 }
-"""Which of the tuned parameters the target has otherwise."""
+"""The paper's four gaps, Figs. 3.1 to 3.4."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,9 +61,11 @@ class Args:
     out: Path = Path("runs/sim2sim")
     """Folder of the run; the same command with the same folder goes on after the last finished (method, seed)."""
     case: str = "mass"
-    """What is off: friction or mass."""
+    """What is off: friction, mass, bullet (another engine) or weak_motor (three quarters of the torque, in bullet)."""
     start: float = 0.5
-    """Where the simulator starts, as a multiple of the target."""
+    """Where the simulator starts, as a multiple of the target; friction and mass alone."""
+    target: str | None = None
+    """Engine of the target, where not the case's own: mjx, mujoco_c or bullet."""
     methods: tuple[str, ...] = ("ours", "dr")
     """Which of ours, spm, dr, oracle."""
     seeds: int = 1
@@ -84,14 +105,14 @@ class Method:
 UPDATES = {"posterior": tuner.posterior_update, "vote": tuner.vote_update}
 
 
-def methods(args: Args, loop: Loop, target: MjxTarget) -> dict[str, Callable[[], Method]]:
+def methods(args: Args, loop: Loop, target: Target) -> dict[str, Callable[[], Method]]:
     """The four methods, each the same tuner with other functions or another distribution."""
     nominal = domain.nominal(loop.entries)
     narrow, free = (loop.tuner(target, radius) for radius in (loop.preset.policy_radius, float("inf")))
     untuned = baselines.Untuned(tuner=free)
     ours = dataclasses.replace(narrow, update=UPDATES[args.update])
     start = loop.dist(nominal, args.radius)
-    truth = {**nominal, **target.params}
+    truth = {name: target.params[name] for name in nominal}
     return {
         "ours": lambda: Method(ours, start, 1),
         "spm": lambda: Method(baselines.spm(narrow), start, 1),
@@ -107,19 +128,20 @@ def check(args: Args) -> tuple[Preset, dict[str, domain.Entry], tuner.Knobs]:
       ValueError: names the field, the value and what is allowed.
     """
     sizes, entries = preset(args.preset), chosen(args.parameters)
-    allowed = {"case": CASES, "update": UPDATES, "methods": ("ours", "spm", "dr", "oracle")}
-    for field, values in allowed.items():
-        asked = getattr(args, field)
+    allowed = {"case": CASES, "update": UPDATES, "methods": ("ours", "spm", "dr", "oracle"), "target": TARGETS}
+    for option, values in allowed.items():
+        asked = getattr(args, option)
         for value in asked if isinstance(asked, tuple) else (asked,):
-            if value not in values:
-                raise ValueError(f"{field}: got '{value}', expected one of {', '.join(values)}")
-    if not any(map(CASES[args.case], entries)):
+            if value is not None and value not in values:
+                raise ValueError(f"{option}: got '{value}', expected one of {', '.join(values)}")
+    case = CASES[args.case]
+    if not case.hidden and engine(args) == "mjx" and not any(map(case.off, entries)):
         raise ValueError(f"parameters: got '{args.parameters}', but case '{args.case}' needs one that it is about")
-    for field in ("start", "radius", "dr_radius", "seeds"):
-        value = getattr(args, field)
+    for option in ("start", "radius", "dr_radius", "seeds"):
+        value = getattr(args, option)
         if not 0 < value < float("inf"):
-            raise ValueError(f"{field}: got {value}, expected a positive, finite number")
-    for name in filter(CASES[args.case], entries):
+            raise ValueError(f"{option}: got {value}, expected a positive, finite number")
+    for name in filter(case.off, entries):
         low, high = entries[name].bounds
         if not low <= 1.0 / args.start <= high:
             raise ValueError(f"start: got {args.start}, expected {1 / high:g} to {1 / low:g} ({name}'s bounds)")
@@ -130,19 +152,31 @@ def check(args: Args) -> tuple[Preset, dict[str, domain.Entry], tuner.Knobs]:
 
 
 def true_params(args, loop: Loop) -> dict[str, float]:
-    """What the target has: nominal values, those of the case divided by `start`."""
-    off = CASES[args.case]
-    return {name: value / args.start if off(name) else value for name, value in domain.nominal(loop.entries).items()}
+    """What the target has."""
+    case, nominal = CASES[args.case], domain.nominal(loop.entries)
+    return {name: value / args.start if case.off(name) else value for name, value in nominal.items()} | case.hidden
+
+
+def engine(args) -> str:
+    """The target's engine."""
+    return args.target or CASES[args.case].target
+
+
+def make_target(args, loop: Loop) -> Target:
+    """The target of a case; its robot may differ in what is not tuned."""
+    params = true_params(args, loop)
+    return TARGETS[engine(args)](Biteno(loop.preset.task, domain.select(constants.ENTRIES, tuple(params))), params)
 
 
 class Runner:
     """Runs (method, seed) pairs, each into a file of its own."""
 
-    def __init__(self, args: Args, loop: Loop, target: MjxTarget, policy: Policy, knobs: tuner.Knobs):
+    def __init__(self, args: Args, loop: Loop, target: Target, policy: Policy, knobs: tuner.Knobs):
         self._args, self._loop, self._policy, self._knobs = args, loop, policy, knobs
         self._target = target
         self._methods = methods(args, loop, target)
-        self._evaluate = loop.jit(lambda key, policy: loop.evaluate(key, policy, target))
+        evaluate = functools.partial(loop.evaluate, target=target)
+        self._evaluate = loop.jit(evaluate) if isinstance(target, MjxTarget) else evaluate
         self._steps = {}
 
     def __call__(self, name: str, seed: int, progress: Progress) -> dict:
@@ -168,7 +202,7 @@ class Runner:
         method = self._methods[name]()
         # dr and oracle are one program: the distribution is an argument.
         if method.tuner not in self._steps:
-            self._steps[method.tuner] = self._loop.jit(method.tuner.step)
+            self._steps[method.tuner] = self._loop.step(method.tuner, self._target)
         step = self._steps[method.tuner]
         key = jax.random.PRNGKey(seed)
         key_evaluate, key_steps = jax.random.split(key)
@@ -178,14 +212,22 @@ class Runner:
         for index in range(self._loop.preset.tunings + 1):
             if index:
                 state, info = step(jax.random.fold_in(key_steps, index), state)
+                self._must_have_walked(info)
             value, falls = self._evaluate(key_evaluate, state.policy)
             line = {"method": name, "seed": seed, "tuning": index, "return": float(value), "falls": int(falls)}
             line |= self._describe(state.dist) | (self._tell(info) if info is not None else {})
             yield as_json(line | {"seconds": time.monotonic() - begin})
 
+    def _must_have_walked(self, info: tuner.Info) -> None:
+        verdict = info.verdicts[int(info.calls) - 1] if info.calls else Verdict.ACCEPT
+        if verdict == Verdict.NOT_FINITE and info.measured_falls == self._loop.preset.tuner.set_episodes:
+            raise ValueError(
+                f"target: every measured episode fell or broke within {self._loop.preset.tuner.dvm.window} steps"
+            )
+
     def _describe(self, dist: ParamDist) -> dict:
         centre = domain.from_coordinates(self._loop.entries, dist.centre)
-        truth = domain.nominal(self._loop.entries) | dict(self._target.params)
+        truth = self._target.params
         return {
             "estimate": {name: float(value) for name, value in centre.items()},
             "radii": {name: float(value) for name, value in dist.radius.items()},
@@ -220,21 +262,21 @@ def main(args: Args) -> None:
     """Runs what is not there yet, and writes metrics, summary and plots."""
     sizes, entries, knobs = check(args)
     identity = {**dataclasses.asdict(args), "sizes": sizes}
-    for field in ("out", "methods", "seeds"):
-        del identity[field]
+    for option in ("out", "methods", "seeds"):
+        del identity[option]
     checkpoint.enable_compilation_cache()
     loop = Loop(sizes, entries)
     checkpoint.open_run(args.out, identity)
-    target = MjxTarget(robot=loop.robot, params=true_params(args, loop))
+    target = make_target(args, loop)
     runner = Runner(args, loop, target, starting_policy(args.policy, loop, args.out), knobs)
     with bars() as progress:
         results = {name: [runner(name, seed, progress) for seed in range(args.seeds)] for name in args.methods}
-    summary = report.sim2sim(args, results, tuple(filter(CASES[args.case], entries)))
+    summary = report.sim2sim(args, results, tuple(filter(CASES[args.case].off, entries)))
     write_json(args.out / "summary.json", summary | {"versions": checkpoint.versions()})
     # What was logged as it came may hold lines of a run that was cut and started again.
     lines = [line for runs in results.values() for result in runs for line in result["lines"]]
     (args.out / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
-    plots.sim2sim(args.out, results, tuple(filter(CASES[args.case], entries)), sizes.epochs)
+    plots.sim2sim(args.out, results, tuple(filter(CASES[args.case].off, entries)), sizes.epochs)
     report.print_sim2sim(console, summary, results)
 
 

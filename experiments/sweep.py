@@ -22,7 +22,7 @@ from envs.targets.mjx import MjxTarget
 from experiments import checkpoint, plots
 from experiments.config import chosen, preset
 from experiments.loop import Loop, Policy
-from experiments.sim2sim import CASES, true_params
+from experiments.sim2sim import CASES, engine, true_params
 from experiments.sim2sim import Args as TuningArgs
 from experiments.sim2sim import check as check_tuning
 from experiments.train import console, run, starting_policy
@@ -73,6 +73,8 @@ def check(args: Args) -> TuningArgs:
     ):
         one = TuningArgs(**shared, step_size=step_size, widen_factor=widen_factor, radius=radius, level=level)
         check_tuning(one)
+    if engine(one) != "mjx":
+        raise ValueError(f"case: got '{one.case}', but a sweep is one program and needs a target in mjx")
     return one
 
 
@@ -124,7 +126,7 @@ def main(args: Args) -> None:
     dist, info = jax.block_until_ready(sweep(jnp.asarray(grid.reshape(-1, grid.shape[-1]))))
     seconds = time.monotonic() - begin
 
-    off = tuple(filter(CASES[args.case], entries))
+    off = tuple(filter(CASES[args.case].off, entries))
     final = errors(loop, true_params(args, loop), dist.centre, off).reshape(grid.shape[:-1])
     calls = np.asarray(info.calls).sum(axis=-1).reshape(grid.shape[:-1])
     names = ("step_size", "widen_factor", "radius", "level")

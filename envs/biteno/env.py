@@ -212,7 +212,7 @@ class Biteno:
             qacc_warmstart=data.qacc_warmstart,
             torque=data.qfrc_actuator[self.joint_dof],
             # Nothing but the floor touches a shank.
-            foot_force=mjx.rne_postconstraint(model, data).cfrc_ext[self._shanks, 3:],
+            foot_force=mjx.rne_postconstraint(model, data)._impl.cfrc_ext[self._shanks, 3:],
         )
 
     def settle(self, state: State, drive: Drive, motion: Motion) -> State:

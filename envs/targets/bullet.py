@@ -163,6 +163,12 @@ class Bullet:
             torque = np.clip(torque, self._limit[:, 0], self._limit[:, 1])
             client.setJointMotorControlArray(body, joints, pybullet.TORQUE_CONTROL, forces=torque)
             client.stepSimulation()
+        qpos, qvel = self._read(world)
+        return qpos, qvel, torque, np.stack([self._force(client, body, foot) for foot in feet])
+
+    def _read(self, world) -> tuple[np.ndarray, np.ndarray]:
+        """Positions and velocities as MuJoCo has them: of the trunk's origin, not of its centre of mass."""
+        client, body, joints, _ = world
         position, turned = client.getBasePositionAndOrientation(body)
         quat = np.roll(turned, 1)
         turn = _rotation(quat)
@@ -173,7 +179,7 @@ class Bullet:
         at_origin = velocity - np.cross(spin, turn @ self._com)
         qpos = np.concatenate([origin, quat, angle])
         qvel = np.concatenate([at_origin, turn.T @ spin, speed])
-        return qpos, qvel, torque, np.stack([self._force(client, body, foot) for foot in feet])
+        return qpos, qvel
 
     @staticmethod
     def _force(client, body: int, foot: int) -> np.ndarray:

@@ -18,6 +18,7 @@ READINGS = {
     "last_action": [0.11, 0.12, 0.13, 0.14, 0.15, 0.16],
     "joint_error": [0.21, 0.22, 0.23, 0.24, 0.25, 0.26],
     "phase": [0.25, 0.5],
+    "stand": [0.0, -0.35, 0.70] * 2,
 }
 OBSERVATION = [
     *(1.0, -0.5, 0.2),  # 0: velocity, twice
@@ -46,6 +47,12 @@ def test_observation_index_by_index():
     obs = sensing.observe(**{name: jnp.array(value) for name, value in READINGS.items()})
     assert obs.shape == (40,)
     np.testing.assert_allclose(obs, OBSERVATION, atol=1e-6)
+
+
+def test_another_command_changes_its_channels_alone():
+    obs = sensing.with_command(jnp.array(OBSERVATION), jnp.array([-0.4, 0.2, -0.6]))
+    # Twice, twice and a quarter.
+    np.testing.assert_allclose(obs, [*OBSERVATION[:3], -0.8, 0.4, -0.15, *OBSERVATION[6:]], atol=1e-6)
 
 
 @pytest.mark.parametrize("seed", range(5))

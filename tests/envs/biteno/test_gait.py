@@ -3,6 +3,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+import reference
 
 from envs.biteno import constants, gait
 
@@ -125,3 +126,86 @@ def test_the_reference_of_every_command_is_within_reach_and_range(robot, corner)
     assert np.all(np.linalg.norm(feet, axis=-1) < 2 * constants.LINK_M)
     _, angles = around_the_clock(gait.joint_reference, command)
     assert np.all((angles > lower) & (angles < upper))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_motion_of_the_feet_is_mujocos(robot, seed):
+    model = robot.mj_model
+    qpos, qvel = reference.random_state(np.random.default_rng(seed), model, 0.1)
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = qpos, qvel
+    mujoco.mj_forward(model, data)
+    centre, velocity = gait.foot_motion(jnp.asarray(qpos), jnp.asarray(qvel))
+    for row, foot in enumerate(constants.FEET):
+        np.testing.assert_allclose(centre[row], data.geom(foot).xpos, atol=1e-6)
+        # The shank's point that is lowest now.
+        lowest = data.geom(foot).xpos - [0.0, 0.0, model.geom(foot).size[0]]
+        jacobian = np.zeros((3, model.nv))
+        mujoco.mj_jac(model, data, jacobian, None, lowest, model.geom(foot).bodyid[0])
+        np.testing.assert_allclose(velocity[row], jacobian @ qvel, atol=1e-5)
+
+
+def walk(steps=400, height=0.612):
+    """Two feet that keep to the clock: still robot, forces by hand."""
+    home = np.tile(np.array([0, 0, height, 1, 0, 0, 0, *constants.STAND_RAD], np.float32), (1, steps, 1))
+    left = np.mod((np.arange(steps) + 1) * constants.CLOCK_HZ * constants.POLICY_DT_S, 1.0)
+    phase = np.stack([left, np.mod(left + 0.5, 1.0)], axis=-1)[None]
+    force = np.zeros((1, steps, 2, 3))
+    force[..., 2] = np.where(phase < 0.5, 150.0, 0.0)
+    force[..., 0] = 0.2 * force[..., 2]
+    return {
+        "qpos": home,
+        "qvel": np.zeros((1, steps, 12), np.float32),
+        "torque": np.full((1, steps, 6), 3.0),
+        "foot_force": force,
+        "command": np.zeros((1, steps, 3)),
+        "phase": phase,
+        "alive": np.ones((1, steps), bool),
+        "fell": np.zeros(1, bool),
+    }
+
+
+def test_quality_of_a_gait_by_hand():
+    values = gait.quality(**walk())
+    # Seven periods in 4 s, each with one touchdown a foot; the left foot begins on the floor.
+    assert 6.5 / 4 <= values["touchdowns_per_s"] <= 7 / 4
+    assert values["clock_agreement"] == 1.0
+    # The still foot's centre is 0.612 - 0.5824 above the floor, which is 0.4 mm below its radius.
+    np.testing.assert_allclose(values["swing_clearance_m"], -0.0004, atol=1e-4)
+    np.testing.assert_allclose(values["friction_use_p99"], 0.2, rtol=1e-6)
+    np.testing.assert_allclose(values["torque_nm"], 3.0)
+    assert values["power_w"] == values["slip_mps"] == values["speed_error_mps"] == values["falls_per_20s"] == 0.0
+
+
+def test_quality_tells_a_buzz_a_slide_and_a_fall():
+    case = walk()
+    buzz = {**case, "foot_force": case["foot_force"] * (np.arange(400) % 8 < 4)[None, :, None, None]}
+    assert gait.quality(**buzz)["touchdowns_per_s"] > 5
+    slide = {**case, "qvel": case["qvel"].copy(), "command": case["command"] + [0.1, 0.0, 0.3]}
+    slide["qvel"][..., 0] = 0.4
+    slide["qvel"][..., 7] = 2.0
+    values = gait.quality(**slide)
+    # Asked for 0.1 m/s and 0.3 rad/s, went 0.4 and 0.
+    np.testing.assert_allclose(values["speed_error_mps"], 0.3, rtol=1e-5)
+    np.testing.assert_allclose(values["turn_error_radps"], 0.3, rtol=1e-5)
+    # The left hip turns at 2 rad/s under 3 Nm.
+    np.testing.assert_allclose(values["power_w"], 6.0, rtol=1e-5)
+    # The right foot slides at 0.4 m/s while it touches, half of the time; the left one, swinging back at 2 rad/s over
+    # 0.612 m, at 0.4 - 1.22.
+    np.testing.assert_allclose(values["slip_mps"], (0.4 + 0.824) / 2, rtol=0.02)
+    fallen = {**case, "alive": case["alive"] & (np.arange(400) < 200)[None], "fell": np.ones(1, bool)}
+    # One fall in 2 s.
+    np.testing.assert_allclose(gait.quality(**fallen)["falls_per_20s"], 10.0)
+
+
+def test_clearance_is_the_mean_over_whole_swings():
+    case = walk()
+    lifted = case["qpos"].copy()
+    lifted[..., 2] += np.linspace(0.0, 0.4, 400)[None]
+    values = gait.quality(**{**case, "qpos": lifted})
+    # Each of the swings ends higher, by as much on the left as on the right.
+    left = case["phase"][0, :, 0]
+    ends = [np.flatnonzero(np.diff((phase < 0.5).astype(int)) == 1) for phase in (left, np.mod(left + 0.5, 1.0))]
+    begins = [np.flatnonzero(np.diff((phase < 0.5).astype(int)) == -1) for phase in (left, np.mod(left + 0.5, 1.0))]
+    whole = np.concatenate([end[end > begin[0]] for end, begin in zip(ends, begins, strict=True)])
+    np.testing.assert_allclose(values["swing_clearance_m"], np.mean(0.4 * whole / 399) - 0.0004, atol=1e-4)

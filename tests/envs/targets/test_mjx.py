@@ -43,17 +43,18 @@ class Script:
             obs=jnp.stack([start, 0.0]), score=nothing, done=nothing, not_finite=nothing, steps=nothing, start=start
         )
 
-    def step(self, params, state, action):
+    def move(self, params, state, action):
         steps = state.steps + 1
         broke = steps == params["breaks"]
         # Like BITeno's, what is left of a broken simulation is finite.
-        return state.replace(
+        following = state.replace(
             obs=jnp.stack([state.start, steps]),
             score=jnp.where(broke, 0.0, steps + params["pay"]),
             done=((steps == params["falls"]) | broke).astype(jnp.float32),
             not_finite=broke.astype(jnp.float32),
             steps=steps,
         )
+        return following, ()
 
 
 def act(obs, key):
@@ -70,7 +71,7 @@ def scripted(count, falls=NEVER, breaks=NEVER, pay=0.0):
 def played():
     """Four episodes of six steps: to the end, a fall in the third, a break in the third, a fall in the last."""
     params = scripted(4, falls=jnp.array([NEVER, 3, NEVER, 6]), breaks=jnp.array([NEVER, NEVER, 3, NEVER]))
-    return mjx.rollout(Script(), jax.random.key(0), act, params, 6)
+    return mjx.rollout(Script(), jax.random.key(0), act, params, 6)[0]
 
 
 def test_a_step_counts_if_it_began_alive_and_left_a_number(played):
@@ -106,11 +107,11 @@ def test_observation_and_action_of_a_step_belong_together(played):
 def test_chunks_change_nothing(monkeypatch, count):
     # 257 are two chunks of 129, the last one filled up by a repetition; 516 are three of 172.
     params = scripted(count, falls=jnp.arange(count) % 7 + 1, pay=jnp.arange(count))
-    chunked = mjx.rollout(Script(), jax.random.key(1), act, params, 8)
+    chunked = mjx.rollout(Script(), jax.random.key(1), act, params, 8)[0]
     assert chunked.fell.shape == (count,)
     assert chunked.obs.shape == (count, 8, 2)
     monkeypatch.setattr(mjx, "_CHUNK", count)
-    whole = mjx.rollout(Script(), jax.random.key(1), act, params, 8)
+    whole = mjx.rollout(Script(), jax.random.key(1), act, params, 8)[0]
     for got, expected in zip(jax.tree.leaves(chunked), jax.tree.leaves(whole), strict=True):
         np.testing.assert_array_equal(got, expected)
     # In the order of the draws.
@@ -145,7 +146,7 @@ def statue(obs, key):
 
 @pytest.fixture(scope="module")
 def play(robot):
-    return jax.jit(lambda key, params: mjx.rollout(robot, key, statue, params, STEPS))
+    return jax.jit(lambda key, params: mjx.rollout(robot, key, statue, params, STEPS)[0])
 
 
 @pytest.fixture(scope="module")
@@ -196,7 +197,7 @@ def test_a_target_keeps_its_truth_and_answers_with_episodes(robot, monkeypatch):
 
     def rollout(robot, key, act, params, steps):
         asked.update(params)
-        return steps
+        return steps, ()
 
     monkeypatch.setattr(mjx, "rollout", rollout)
     target = MjxTarget(robot=robot, params={"trunk_mass": 1.5, "foot_friction": 0.7})

@@ -1,0 +1,114 @@
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import reference
+
+from envs.biteno import Biteno, constants
+from envs.targets import mujoco_c
+from envs.targets.mjx import MjxTarget
+
+VALUES = reference.params(left_thigh_mass=1.5, torque_scale=0.8, foot_friction=0.7, action_delay_s=0.004)
+COUNT, STEPS = 3, 40
+KEY = jax.random.PRNGKey(3)
+
+
+def restless(obs, key):
+    """A policy that reads the observation and is not still."""
+    return 0.3 * jax.random.normal(key, (6,)) + 0.1 * obs[12:18], {}
+
+
+@pytest.fixture(scope="module")
+def recorded(robot):
+    """The same episodes in MuJoCo C and in MJX."""
+    command = jnp.array([[0.5, 0.0, 0.0], [0.0, 0.2, 0.0], [0.0, 0.0, 0.6]])
+    here = mujoco_c.target(robot, VALUES, threads=2).record(KEY, restless, COUNT, STEPS, command)
+    there = MjxTarget(robot=robot, params=VALUES)
+    return here, jax.jit(lambda key: there.record(key, restless, COUNT, STEPS, command))(KEY)
+
+
+def test_episodes_are_those_of_mjx(recorded):
+    (here, motion), (there, expected) = recorded
+    # MJX stops its solver after a few iterations, so they part slowly; a step alone agrees to 1e-6.
+    for steps, atol in ((1, 1e-6), (10, 1e-4)):
+        np.testing.assert_allclose(motion.qpos[:, :steps], expected.qpos[:, :steps], atol=atol)
+        np.testing.assert_allclose(here.obs[:, :steps], there.obs[:, :steps], atol=20 * atol)
+        np.testing.assert_allclose(here.action[:, :steps], there.action[:, :steps], atol=20 * atol)
+        np.testing.assert_allclose(here.score[:, :steps], there.score[:, :steps], atol=100 * atol)
+        np.testing.assert_allclose(motion.torque[:, :steps], expected.torque[:, :steps], atol=500 * atol)
+    np.testing.assert_array_equal(motion.command, expected.command)
+    np.testing.assert_allclose(motion.phase, expected.phase, atol=1e-6)
+
+
+def test_forces_of_the_floor_push_up_alike(recorded):
+    (_, motion), (_, expected) = recorded
+    # Up to a first bounce, whose moment is a matter of micrometres.
+    np.testing.assert_allclose(motion.foot_force[:, :3], expected.foot_force[:, :3], rtol=1e-2, atol=1.0)
+    assert motion.foot_force[..., 2].min() >= 0.0
+    assert motion.foot_force[..., 2].max() > 50.0
+
+
+def test_a_command_that_stays_is_seen_and_paid_for(recorded):
+    (here, motion), _ = recorded
+    np.testing.assert_allclose(here.obs[..., 3:6], motion.command * jnp.array([2.0, 2.0, 0.25]), atol=1e-6)
+    assert np.all(motion.command[:, 0] == motion.command[:, -1])
+
+
+def test_falls_are_masked_as_in_mjx(robot):
+    def collapse(obs, key):
+        return jnp.array([0.0, 0.0, 10.0] * 2), {}
+
+    steps = 150
+    here = mujoco_c.target(robot, VALUES, threads=1).episodes(KEY, collapse, COUNT, steps)
+    there = MjxTarget(robot=robot, params=VALUES)
+    expected = jax.jit(lambda key: there.episodes(key, collapse, COUNT, steps))(KEY)
+    assert here.fell.all()
+    np.testing.assert_allclose(here.alive.sum(axis=1), expected.alive.sum(axis=1), atol=2)
+    for row in range(COUNT):
+        assert np.all(np.diff(here.alive[row].astype(int)) <= 0)
+        assert np.all(here.score[row][~here.alive[row]] == 0.0)
+    assert not here.not_finite.any()
+
+
+def test_a_state_that_is_not_finite_ends_its_episode_alone(robot, monkeypatch):
+    target = mujoco_c.target(robot, VALUES, threads=1)
+    move, calls = target._engine.move, []
+
+    def breaking(state, drive):
+        calls.append(None)
+        motion = move(state, drive)
+        return motion.replace(qvel=motion.qvel.at[1, 3].set(jnp.nan)) if len(calls) == 5 else motion
+
+    monkeypatch.setattr(target._engine, "move", breaking)
+    trajectory = target.episodes(KEY, restless, COUNT, 10)
+    np.testing.assert_array_equal(trajectory.not_finite, [False, True, False])
+    np.testing.assert_array_equal(trajectory.alive[1], [True] * 4 + [False] * 6)
+    assert np.isfinite(trajectory.obs).all()
+
+
+def test_options_make_it_another_engine(robot):
+    plain = mujoco_c.target(robot, VALUES, threads=1).record(KEY, restless, COUNT, 20)[1]
+    finer = mujoco_c.target(robot, VALUES, threads=1, timestep=0.0005).record(KEY, restless, COUNT, 20)[1]
+    difference = np.abs(plain.qpos - finer.qpos).max()
+    assert 1e-5 < difference < 0.05
+
+
+def test_a_time_step_that_does_not_fit_is_named(robot):
+    with pytest.raises(ValueError, match=r"timestep: got 0.0007, which does not divide 0.001"):
+        mujoco_c.target(robot, VALUES, timestep=0.0007)
+
+
+def test_the_shipped_policy_walks_20_seconds():
+    from experiments.config import chosen, preset
+    from experiments.loop import Loop
+    from experiments.train import starting_policy
+
+    sizes = preset("cpu")
+    loop = Loop(dataclasses.replace(sizes, task=dataclasses.replace(sizes.task, physics="exact")), chosen("legs6"))
+    assert isinstance(loop.robot, Biteno)
+    act = loop.act(starting_policy("walk", loop))
+    steps = round(20.0 / constants.POLICY_DT_S)
+    trajectory = mujoco_c.target(loop.robot, {"foot_friction": 1.0}).episodes(KEY, act, 4, steps)
+    assert not trajectory.fell.any()
