@@ -50,6 +50,10 @@ WALKING = {**TABLE_ONE, "raibert": -5.0, "action_rate": -0.01}
 foot)."""
 
 
+SHAPING = ("clock_contact",)
+"""Names of the terms beside Table I."""
+
+
 def _mass(name: str, *bodies: str) -> Entry:
     # A heavier link of the same shape: inertia grows with mass.
     return Entry(name=name, kind="body", targets=bodies, fields=("body_mass", "body_inertia"), bounds=(0.2, 5.0))

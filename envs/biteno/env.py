@@ -48,6 +48,8 @@ class TaskConfig:
     """Width of the observation noise in units of `sensing.NOISE`."""
     weights: Mapping[str, float] = field(default_factory=lambda: dict(constants.WALKING))
     """Trained reward: weight of every term of Table I."""
+    shaping: Mapping[str, float] = field(default_factory=dict)
+    """Trained reward: weight of terms beside Table I (`rewards.shaping`)."""
     termination_cost: float = 1.0
     """Taken from the trained reward where an episode ends in a fall."""
     episode_s: float = 20.0
@@ -81,7 +83,7 @@ class State:
     done: jax.Array  # 1 where the robot fell or is not finite
     not_finite: jax.Array  # 1 where the simulation broke
     steps: jax.Array  # policy steps since the reset
-    terms: dict  # unweighted terms of Table I
+    terms: dict  # unweighted terms of Table I, and of the shaping that has a weight
     key: jax.Array
 
 
@@ -120,6 +122,8 @@ class Biteno:
     def __init__(self, config: TaskConfig, entries: Mapping[str, domain.Entry] = constants.ENTRIES):
         if set(config.weights) != set(constants.TABLE_ONE):
             raise ValueError(f"weights: got {sorted(config.weights)}, expected {sorted(constants.TABLE_ONE)}")
+        if not set(config.shaping) <= set(constants.SHAPING):
+            raise ValueError(f"shaping: got {sorted(config.shaping)}, expected some of {sorted(constants.SHAPING)}")
         for name, allowed in {"physics": _PHYSICS, "base": _BASES}.items():
             if getattr(config, name) not in allowed:
                 raise ValueError(f"{name}: got '{getattr(config, name)}', expected one of {', '.join(allowed)}")
@@ -173,7 +177,7 @@ class Biteno:
             done=jnp.zeros(()),
             not_finite=jnp.zeros(()),
             steps=jnp.zeros((), jnp.int32),
-            terms={name: jnp.zeros(()) for name in constants.TABLE_ONE},
+            terms={name: jnp.zeros(()) for name in (*constants.TABLE_ONE, *self.config.shaping)},
             key=key,
         )
         return state.replace(obs=self._observe(state, key_noise))
@@ -237,7 +241,11 @@ class Biteno:
             last_action=state.action,
             joint_reference=drive.reference,
         )
+        phase = gait.advance(state.phase)
+        shaped = rewards.shaping(foot_force=motion.foot_force, phase=phase)
+        values |= {name: shaped[name] for name in self.config.shaping}
         values = {name: jnp.where(finite, value, 0.0) for name, value in values.items()}
+        trained = rewards.weigh(values, self.config.weights) + rewards.weigh(values, self.config.shaping)
         fell = (readings["gravity"][2] > -_MAX_TILT_COS) | (qpos[2] < _MIN_HEIGHT_M)
         done = (fell | ~finite).astype(jnp.float32)
 
@@ -245,10 +253,10 @@ class Biteno:
         moved = moved.replace(
             qacc_warmstart=warmstart,
             command=jnp.where(redraw, self._draw_command(key_command), state.command),
-            phase=gait.advance(state.phase),
+            phase=phase,
             action=action,
             joint_error=target - readings["joint"],
-            reward=rewards.weigh(values, self.config.weights) - self.config.termination_cost * done,
+            reward=trained - self.config.termination_cost * done,
             score=rewards.weigh(values, constants.TABLE_ONE),
             done=done,
             not_finite=(~finite).astype(jnp.float32),

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from envs.biteno import constants
 
 _SHARPNESS = 4.0
+_FIRM_N = 30.0  # a fifth of the robot's weight
 
 
 def terms(
@@ -55,9 +56,23 @@ def terms(
     }
 
 
+def shaping(*, foot_force: jax.Array, phase: jax.Array) -> dict[str, jax.Array]:
+    """Terms beside Table I that shape learning and are never scored, each a scalar without weight or time step.
+
+    `clock_contact` is the share by which floor and clock disagree, summed over the feet: a foot that touches in its
+    swing, or hangs or bounces in its stance. Without it a walk that lands twice a step earns as much.
+
+    Args:
+      foot_force: [2, 3] N, of the floor on each foot.
+      phase: [2] cycles.
+    """
+    touches = jnp.clip(foot_force[:, 2] / _FIRM_N, 0.0, 1.0)
+    return {"clock_contact": jnp.sum(jnp.abs(touches - (phase < constants.DUTY)))}
+
+
 def weigh(values: Mapping[str, jax.Array], weights: Mapping[str, float]) -> jax.Array:
     """Weighted sum of the terms, times the policy's time step."""
-    return constants.POLICY_DT_S * sum(weights[name] * value for name, value in values.items())
+    return constants.POLICY_DT_S * sum(weight * values[name] for name, weight in weights.items())
 
 
 def _square(vector: jax.Array) -> jax.Array:

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 import toys
 
-from experiments import evaluate, sim2sim
+import envs.targets
+from experiments import evaluate, film, sim2sim
 from experiments.loop import Loop
 from jaxtune import tuner as tuners
 from jaxtune.types import Verdict
@@ -83,6 +84,7 @@ def test_a_target_of_the_same_engine_and_parameters_is_no_case():
 
 def test_pybullet_that_is_missing_is_named_with_its_extra(monkeypatch):
     monkeypatch.delitem(sys.modules, "envs.targets.bullet", raising=False)
+    monkeypatch.delattr(envs.targets, "bullet", raising=False)
     monkeypatch.setitem(sys.modules, "pybullet", None)
     with pytest.raises(ValueError, match=r"pip install 'jaxtune\[bullet\]'"):
         sim2sim.TARGETS["bullet"](None, {})
@@ -106,7 +108,12 @@ def test_bad_input_of_evaluate_is_named(field, value, named):
         evaluate.check(evaluate.Args(**{field: value}))
 
 
-def test_evaluate_writes_what_it_measured(tmp_path):
+def test_evaluate_writes_what_it_measured(tmp_path, monkeypatch, capsys):
+    def no_gl(*_):
+        raise film.NoPicture("no GL")
+
+    # Where there is no GL, MuJoCo's half-made context complains long after.
+    monkeypatch.setattr(film, "strip", no_gl)
     evaluate.main(evaluate.Args(target="mujoco_c", physics="fast", episodes=1, set=("torque_scale=0.9",), out=tmp_path))
     result = json.loads((tmp_path / "evaluation.json").read_text())
     assert result["rows"].keys() == {"grid", "none", "pushes"}
@@ -117,3 +124,4 @@ def test_evaluate_writes_what_it_measured(tmp_path):
     assert grid["clock_agreement"] > 0.7
     assert grid["swing_clearance_m"] > 0.02
     assert (tmp_path / "gait.png").stat().st_size > 5000
+    assert "no film: no GL" in capsys.readouterr().out

@@ -8,7 +8,7 @@ import pytest
 import reference
 from mujoco import mjx
 
-from envs.biteno import Biteno, BraxBiteno, TaskConfig, constants
+from envs.biteno import Biteno, BraxBiteno, Motion, TaskConfig, constants
 
 NOMINAL = reference.params()
 STILL = np.zeros(6, np.float32)
@@ -119,6 +119,48 @@ def test_an_action_that_is_a_step_late_is_the_one_before(start, step):
     held = (start.qpos[7:] - constants.STAND_RAD) / 0.25
     np.testing.assert_allclose(once.qpos, step(NOMINAL, start, held).qpos, atol=1e-6)
     assert np.abs(twice.qpos - step(NOMINAL, once, second).qpos).max() > 1e-3
+
+
+def still(robot, start):
+    """A drive and a motion that leave a robot where it is, on its left foot, and the drive's own robot."""
+    drive = robot.drive({}, start, jnp.zeros(6))
+    motion = Motion(
+        qpos=start.qpos,
+        qvel=start.qvel,
+        qacc_warmstart=jnp.zeros(12),
+        torque=jnp.zeros(6),
+        foot_force=jnp.array([[0.0, 0.0, 150.0], [0.0, 0.0, 0.0]]),
+    )
+    return drive, motion
+
+
+def test_a_push_comes_on_time_and_adds_its_speed(start):
+    robot = Biteno(TaskConfig(push_mps=0.5, push_s=4.0), {})
+    before = start.replace(steps=jnp.int32(398))
+    quiet = robot.settle(before, *still(robot, before))
+    np.testing.assert_array_equal(quiet.qvel, before.qvel)
+    pushed = robot.settle(quiet, *still(robot, quiet))
+    np.testing.assert_allclose(np.hypot(*(pushed.qvel - before.qvel)[:2]), 0.5, rtol=1e-5)
+    np.testing.assert_array_equal(pushed.qvel[2:], before.qvel[2:])
+    # It is felt at once.
+    assert np.abs(pushed.obs[:2] - quiet.obs[:2]).max() > 0.1
+
+
+def test_shaping_is_trained_and_logged_but_not_scored(start):
+    shaped, plain = (Biteno(TaskConfig(shaping=weights), {}) for weights in ({"clock_contact": -2.0}, {}))
+    phase = jnp.array([0.7, 0.2])  # on the wrong foot
+    before = start.replace(phase=phase)
+    one, other = (robot.settle(before, *still(robot, before)) for robot in (shaped, plain))
+    np.testing.assert_allclose(one.terms["clock_contact"], 2.0)
+    assert "clock_contact" not in other.terms
+    # 2 feet x -2 x 0.01 s.
+    np.testing.assert_allclose(one.reward - other.reward, -0.04, rtol=1e-4)
+    assert one.score == other.score
+
+
+def test_unknown_shaping_is_named():
+    with pytest.raises(ValueError, match=r"shaping: got \['grace'\], expected some of \['clock_contact'\]"):
+        Biteno(TaskConfig(shaping={"grace": 1.0}))
 
 
 def test_what_is_observed_of_the_trunk_is_mujocos_velocity_of_it(engines):

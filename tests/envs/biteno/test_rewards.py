@@ -116,3 +116,16 @@ def test_every_term_is_weighed_and_multiplied_by_the_policy_step():
 def test_the_most_an_episode_can_earn_is_seventy(weights):
     # (2.0 + 1.5) x 20 s.
     np.testing.assert_allclose(2000 * rewards.weigh(terms(), weights), 70.0, rtol=1e-5)
+
+
+def test_clock_contact_counts_feet_that_disagree_with_the_clock():
+    def disagree(left_n, right_n, phase):
+        force = jnp.array([[5.0, 0.0, left_n], [0.0, 9.0, right_n]])
+        return rewards.shaping(foot_force=force, phase=jnp.array(phase))["clock_contact"]
+
+    # The left foot should stand, the right one swing.
+    assert disagree(150.0, 0.0, [0.2, 0.7]) == 0.0
+    assert disagree(0.0, 150.0, [0.2, 0.7]) == 2.0
+    # 15 N are half of what counts as firm.
+    np.testing.assert_allclose(disagree(150.0, 15.0, [0.2, 0.7]), 0.5, rtol=1e-6)
+    np.testing.assert_allclose(disagree(15.0, 0.0, [0.2, 0.7]), 0.5, rtol=1e-6)
