@@ -111,9 +111,7 @@ class Collected:
 class GateInfo:
     """One call of the gate."""
 
-    novelty: (
-        jax.Array
-    )  # of the measured set: mean rank of its windows among those of all sets, 1/2 where it is like them
+    novelty: jax.Array  # mean rank of the measured windows among those of all sets; 1/2 where it is like them
     threshold: jax.Array
     p_value: jax.Array  # (1 + number of held-out sets at least as novel) / (sets + 1)
     uncovered: jax.Array  # share of measured windows without a simulated neighbour
