@@ -1,5 +1,6 @@
 """Every picture the experiments draw."""
 
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -107,7 +108,7 @@ def _errors(path: Path, results: dict[str, list[dict]], off: Sequence[str]) -> N
         values = np.array([[np.mean([line["param_error"][p] for p in off]) for line in run["lines"]] for run in runs])
         _spread(axis, np.arange(values.shape[1]), values, name)
     axis.set(xlabel="tunings", ylabel="mean of |estimate / truth - 1|", ylim=(0, None))
-    axis.set_title(f"over {', '.join(off)}", fontsize=7)
+    axis.set_title(textwrap.fill(f"over {', '.join(off)}", 100), fontsize=7)
     axis.legend()
     _save(figure, path)
 
