@@ -104,29 +104,28 @@ def apply(model: mjx.Model, params: Params, entries: Mapping[str, Entry]) -> mjx
       ValueError: a name is not in the table.
     """
     fields = {}
-    for name, entry in select(entries, tuple(params)).items():
-        value = params[name]
-        rows = entry.rows(model)
-        index = rows if entry.column is None else (rows, entry.column)
-        for field in entry.fields:
-            cell = fields.get(field, getattr(model, field)).at[index]
-            fields[field] = cell.multiply(value) if entry.log else cell.add(value)
+    for field, index, entry, value in _cells(model, params, entries):
+        cell = fields.get(field, getattr(model, field)).at[index]
+        fields[field] = cell.multiply(value) if entry.log else cell.add(value)
     return set_const(model.tree_replace(fields))
 
 
 def apply_mujoco(model: mujoco.MjModel, params: Params, entries: Mapping[str, Entry]) -> mujoco.MjModel:
     """`apply` for a model of MuJoCo C, which is copied."""
     model = copy.copy(model)
-    for name, entry in select(entries, tuple(params)).items():
-        value = float(params[name])
-        rows = entry.rows(model)
-        for field in entry.fields:
-            array = getattr(model, field)
-            cells = array[rows] if entry.column is None else array[rows, entry.column]
-            cells = cells * value if entry.log else cells + value
-            array[rows if entry.column is None else (rows, entry.column)] = cells
+    for field, index, entry, value in _cells(model, params, entries):
+        array = getattr(model, field)
+        array[index] = array[index] * float(value) if entry.log else array[index] + float(value)
     mujoco.mj_setConst(model, mujoco.MjData(model))
     return model
+
+
+def _cells(model, params, entries):
+    """Every field that a parameter enters, with the index of its cells there."""
+    for name, entry in select(entries, tuple(params)).items():
+        rows = entry.rows(model)
+        for field in entry.fields:
+            yield field, rows if entry.column is None else (rows, entry.column), entry, params[name]
 
 
 def set_const(model: mjx.Model) -> mjx.Model:

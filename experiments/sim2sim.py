@@ -232,7 +232,9 @@ class Runner:
             "estimate": {name: float(value) for name, value in centre.items()},
             "radii": {name: float(value) for name, value in dist.radius.items()},
             "param_error": {
-                name: abs(float(value) / truth[name] - 1) if self._loop.entries[name].log else abs(float(value))
+                name: abs(float(value) / truth[name] - 1)
+                if self._loop.entries[name].log
+                else abs(float(value) - truth[name])
                 for name, value in centre.items()
             },
         }

@@ -11,7 +11,8 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 
-from jaxtune.tuner import GateInfo, Info, Tuner, TunerState, no_gate_log, no_update, vote_update
+from jaxtune.rules import GateInfo, no_gate_log, no_update, vote_update
+from jaxtune.tuner import Info, Tuner, TunerState
 
 
 def open_gate(key, config, collected, measured, knobs) -> GateInfo:

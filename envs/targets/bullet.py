@@ -82,8 +82,7 @@ class Bullet:
         for name in _MISSING:
             if params.get(name, 1.0) != 1.0:
                 raise ValueError(f"params['{name}']: got {params[name]}, but PyBullet has no such thing")
-        fields = {name: value for name, value in params.items() if robot.entries[name].kind != "control"}
-        model = domain.apply_mujoco(robot.mj_model, fields, robot.entries)
+        model = domain.apply_mujoco(robot.mj_model, params, robot.entries)
         self._model = model
         self._dt = model.opt.timestep
         self._com = model.body("trunk").ipos.copy()

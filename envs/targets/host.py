@@ -34,10 +34,9 @@ class HostTarget:
     def __init__(self, robot: Biteno, params: Mapping[str, float], engine: Engine):
         self.params = params
         self._engine = engine
-        self._control = {name: value for name, value in params.items() if robot.entries[name].kind == "control"}
         self._reset = jax.jit(jax.vmap(lambda key: robot.reset({}, key)))
         self._ask = jax.jit(jax.vmap(robot.ask))
-        self._drive = jax.jit(jax.vmap(lambda state, action: robot.drive(self._control, state, action)))
+        self._drive = jax.jit(jax.vmap(lambda state, action: robot.drive(params, state, action)))
         self._settle = jax.jit(jax.vmap(robot.settle))
 
     def episodes(self, key: jax.Array, act: Act, count: int, steps: int) -> Trajectory:

@@ -38,8 +38,7 @@ class MujocoC:
         self._repeats = round(ratio)
         if self._repeats < 1 or abs(ratio - self._repeats) > 1e-6:
             raise ValueError(f"timestep: got {model.opt.timestep}, which does not divide {robot.mj_model.opt.timestep}")
-        fields = {name: value for name, value in params.items() if robot.entries[name].kind != "control"}
-        self._model = domain.apply_mujoco(model, fields, robot.entries)
+        self._model = domain.apply_mujoco(model, params, robot.entries)
         threads = os.cpu_count() if threads is None else threads
         self._data = [mujoco.MjData(self._model) for _ in range(threads)]
         self._pool = rollout.Rollout(nthread=threads)
