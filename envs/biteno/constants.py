@@ -50,7 +50,7 @@ WALKING = {**TABLE_ONE, "raibert": -5.0, "action_rate": -0.01}
 foot)."""
 
 
-SHAPING = ("clock_contact",)
+SHAPING = ("clock_contact", "speed_error")
 """Names of the terms beside Table I."""
 
 

@@ -240,7 +240,9 @@ class Biteno:
             joint_reference=drive.reference,
         )
         phase = gait.advance(state.phase)
-        shaped = rewards.shaping(foot_force=motion.foot_force, phase=phase)
+        shaped = rewards.shaping(
+            velocity=readings["velocity"], command=state.command, foot_force=motion.foot_force, phase=phase
+        )
         values |= {name: shaped[name] for name in self.config.shaping}
         values = {name: jnp.where(finite, value, 0.0) for name, value in values.items()}
         trained = rewards.weigh(values, self.config.weights) + rewards.weigh(values, self.config.shaping)
