@@ -71,7 +71,7 @@ def alarm(args: Args) -> dict:
     loop = Loop(sizes, chosen("legs6"))
     policy = starting_policy(args.policy, loop)
     dist = loop.dist(domain.nominal(loop.entries), args.radius)
-    machine = loop.tuner(None, sizes.policy_radius)
+    machine = loop.tuner(None)
 
     def masses(multiplier: float) -> dict:
         truth = {name: multiplier if name.endswith("_mass") else 1.0 for name in loop.entries}

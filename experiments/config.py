@@ -22,6 +22,8 @@ class Preset:
     task: TaskConfig = field(default_factory=lambda: TaskConfig(physics="fast", base="raibert"))
     ppo: PPOConfig = field(default_factory=PPOConfig)
     tuner: TunerConfig = field(default_factory=TunerConfig)
+    push_mps: float = 0.5
+    """Speed of the pushes that the policy trains with; nothing else has any."""
     policy_radius: float = 0.1
     """The policy trains within this radius of the centre, however wide the tuner's own is."""
     episode_steps: int = 250
@@ -51,7 +53,7 @@ class Preset:
     """Steps of an episode in a sweep."""
     sweep_tunings: int = 3
     """Tunings in a sweep."""
-    compiler_options: Mapping[str, int] = field(default_factory=dict)
+    compiler_options: Mapping[str, int | bool] = field(default_factory=dict)
     """Passed to `jax.jit`; a run of seconds is not worth minutes of optimisation."""
 
 
@@ -65,19 +67,19 @@ _TINY = TunerConfig(
 )
 
 _SMOKE = Preset(
-    task=TaskConfig(physics="fast", base="raibert", episode_s=1.0),
+    task=TaskConfig(physics="fast", base="raibert", episode_s=0.8),
     ppo=PPOConfig(num_envs=16, unroll_steps=8, epochs=1, minibatches=2),
     tuner=_TINY,
     episode_steps=80,
     epochs=2,
     tunings=2,
-    evaluation_episodes=4,
+    evaluation_episodes=_TINY.set_episodes,  # of equal length too: one program measures and evaluates
     scratch_updates=2,
     chunk=2,
     sweep=_TINY,
     sweep_steps=80,
     sweep_tunings=2,
-    compiler_options={"xla_backend_optimization_level": 0},
+    compiler_options={"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False},
 )
 
 _LARGE = TunerConfig(

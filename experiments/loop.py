@@ -1,6 +1,8 @@
 """BITeno's side of the tuner: how its policy is trained, its episodes simulated, its return measured."""
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
+from types import MappingProxyType
 
 import chex
 import jax
@@ -25,21 +27,37 @@ class Policy:
 
     learner: PPOState
     robots: State
+    radius: jax.Array  # its robots are drawn no wider than this around the centre, in search coordinates
+    hidden: dict  # physical values by name of what its robots have and nobody tunes
 
 
 class Loop:
-    """Pure functions over one robot and one preset, to be handed to a `Tuner` or jitted alone."""
+    """Pure functions over one robot and one preset, to be handed to a `Tuner` or jitted alone.
 
-    def __init__(self, preset: Preset, entries: Mapping[str, domain.Entry]):
+    Args:
+      preset: sizes.
+      entries: what is tuned.
+      hidden: what is not, but may be other than nominal where a policy trains.
+    """
+
+    def __init__(
+        self,
+        preset: Preset,
+        entries: Mapping[str, domain.Entry],
+        hidden: Mapping[str, domain.Entry] = MappingProxyType({}),
+    ):
         self.preset = preset
         self.entries = entries
-        self.robot = Biteno(preset.task, entries)
-        self._env = BraxBiteno(self.robot)
+        self._hidden = hidden
+        self.robot = Biteno(preset.task, {**entries, **hidden})
+        self._env = BraxBiteno(Biteno(replace(preset.task, push_mps=preset.push_mps), self.robot.entries))
         self._ppo = PPO(preset.ppo, self.robot.observation_size, self.robot.action_size)
+        # One program for all methods: what they differ in is an argument.
+        self._train = self.jit(lambda key, policy, dist: self.train(key, policy, dist, preset.epochs))
 
-    def jit(self, function: Callable) -> Callable:
-        """Compiles with the preset's options."""
-        return jax.jit(function, compiler_options=dict(self.preset.compiler_options))
+    def jit(self, function: Callable, **options) -> Callable:
+        """Compiles with the preset's compiler options."""
+        return jax.jit(function, compiler_options=dict(self.preset.compiler_options), **options)
 
     def dist(self, centre: Mapping[str, float], radius: float) -> ParamDist:
         """A distribution around physical values, in search coordinates, with the table's bounds."""
@@ -55,22 +73,26 @@ class Loop:
         key_learner, key_robots = jax.random.split(key)
         learner = self._ppo.init(key_learner) if learner is None else learner
         count = self.preset.ppo.num_envs
-        params = {name: jnp.full(count, value) for name, value in domain.nominal(self.entries).items()}
-        robots = self._env.start(params, jax.random.split(key_robots, count))
-        return Policy(learner=learner, robots=jax.tree.map(lambda leaf: jnp.asarray(leaf, leaf.dtype), robots))
+        robots = self._env.reset(jax.random.split(key_robots, count))
+        return Policy(
+            learner=learner,
+            robots=jax.tree.map(lambda leaf: jnp.asarray(leaf, leaf.dtype), robots),
+            radius=jnp.asarray(self.preset.policy_radius, jnp.float32),
+            hidden={name: jnp.asarray(value, jnp.float32) for name, value in domain.nominal(self._hidden).items()},
+        )
 
-    def train(
-        self, key: jax.Array, policy: Policy, dist: ParamDist, updates: int, radius: float = jnp.inf
-    ) -> tuple[Policy, dict]:
-        """PPO updates on robots drawn from the distribution, no wider than `radius` around its centre.
+    def train(self, key: jax.Array, policy: Policy, dist: ParamDist, updates: int) -> tuple[Policy, dict]:
+        """PPO updates on robots drawn from the distribution, no wider than the policy's radius.
 
         Returns:
           The policy, and metrics [updates] by name.
         """
         key_params, key_updates = jax.random.split(key)
-        dist = dist.replace(radius=jax.tree.map(lambda r: jnp.minimum(r, radius), dist.radius))
-        params = dists.sample(key_params, dist, self.preset.ppo.num_envs)
-        robots = self._env.with_params(policy.robots, domain.from_coordinates(self.entries, params))
+        count = self.preset.ppo.num_envs
+        dist = dist.replace(radius=jax.tree.map(lambda r: jnp.minimum(r, policy.radius), dist.radius))
+        params = domain.from_coordinates(self.entries, dists.sample(key_params, dist, count))
+        params |= {name: jnp.broadcast_to(value, count) for name, value in policy.hidden.items()}
+        robots = self._env.with_params(policy.robots, params)
 
         def update(carry, key):
             learner, robots, metrics = self._ppo.update(key, carry[0], self._env, carry[1])
@@ -79,44 +101,48 @@ class Loop:
         (learner, robots), metrics = jax.lax.scan(
             update, (policy.learner, robots), jax.random.split(key_updates, updates)
         )
-        return Policy(learner=learner, robots=robots), metrics
+        return policy.replace(learner=learner, robots=robots), metrics
 
     def simulate(self, key: jax.Array, policy: Policy, params: Mapping[str, jax.Array]) -> Trajectory:
         """One episode for each draw, [episodes] by name in search coordinates."""
         return simulate(self.robot, key, self.act(policy), params, self.preset.episode_steps)
 
-    def measure(self, key: jax.Array, policy: Policy, target: Target) -> Trajectory:
-        """One measured set of the target."""
-        count = self.preset.tuner.set_episodes
-        return target.episodes(key, self.act(policy), count, self.preset.episode_steps)
+    def play(self, target: Target) -> Callable[..., Trajectory]:
+        """Whole episodes in a target, `(key, policy, count, steps) -> Trajectory`, compiled where it is in JAX."""
 
-    def evaluate(self, key: jax.Array, policy: Policy, target: Target) -> tuple[jax.Array, jax.Array]:
-        """Mean return under the weights of Table I, and number of falls, over whole episodes in the target."""
+        def play(key, policy, count, steps):
+            return target.episodes(key, self.act(policy), count, steps)
+
+        return self.jit(play, static_argnums=(2, 3)) if isinstance(target, MjxTarget) else play
+
+    def evaluate(self, key: jax.Array, policy: Policy, play: Callable[..., Trajectory]) -> tuple[float, int]:
+        """Mean return under the weights of Table I, and number of falls, over episodes of the full time limit."""
         steps = round(self.preset.task.episode_s / constants.POLICY_DT_S)
-        trajectory = target.episodes(key, self.act(policy), self.preset.evaluation_episodes, steps)
-        return trajectory.score.sum(axis=-1).mean(), trajectory.fell.sum()
+        trajectory = play(key, policy, self.preset.evaluation_episodes, steps)
+        return float(trajectory.score.sum(axis=-1).mean()), int(trajectory.fell.sum())
 
-    def tuner(self, target: Target, policy_radius: float) -> Tuner:
-        """Algorithm 1 against a target; the policy trains within `policy_radius` of the centre."""
-        epochs = self.preset.epochs
+    def tuner(self, target: Target) -> Tuner:
+        """Algorithm 1 against a target, pure where the target is in JAX."""
+        count, steps = self.preset.tuner.set_episodes, self.preset.episode_steps
         return Tuner(
             config=self.preset.tuner,
-            train_policy=lambda key, policy, dist: self.train(key, policy, dist, epochs, policy_radius),
+            train_policy=lambda key, policy, dist: self.train(key, policy, dist, self.preset.epochs),
             simulate=self.simulate,
-            measure=lambda key, policy: self.measure(key, policy, target),
+            measure=lambda key, policy: target.episodes(key, self.act(policy), count, steps),
         )
 
-    def step(self, machine: Tuner | Untuned, target: Target) -> Callable:
-        """The compiled step of a tuner; what asks a target that is not JAX stays outside."""
-        if isinstance(machine, Untuned) or isinstance(target, MjxTarget):
-            return self.jit(machine.step)
-        tune, train = self.jit(machine.tune), self.jit(machine.train)
+    def step(self, machine: Tuner | Untuned, play: Callable[..., Trajectory]) -> Callable:
+        """The step of a tuner in parts that are compiled apart, so that several tuners share them."""
+        if isinstance(machine, Untuned):
+            return replace(machine, tuner=replace(machine.tuner, train_policy=self._train)).step
+        tune = self.jit(machine.tune)
+        count, steps = self.preset.tuner.set_episodes, self.preset.episode_steps
 
         def step(key, state):
             key_measure, key_tune, key_train = jax.random.split(key, 3)
-            state, info = tune(key_tune, state, machine.measure(key_measure, state.policy))
-            state, metrics = train(key_train, state)
-            return state, info.replace(train=metrics)
+            state, info = tune(key_tune, state, play(key_measure, state.policy, count, steps))
+            policy, metrics = self._train(key_train, state.policy, state.dist)
+            return state.replace(policy=policy), info.replace(train=metrics)
 
         return step
 

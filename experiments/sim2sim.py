@@ -6,7 +6,6 @@ is |estimate / truth - 1|, which is 0.5 at both of the paper's starts, 0.5X and 
 """
 
 import dataclasses
-import functools
 import json
 import time
 from collections.abc import Callable, Mapping
@@ -15,12 +14,12 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from rich.progress import Progress
 
 from envs import domain
-from envs.biteno import Biteno, constants
-from envs.targets.mjx import MjxTarget
+from envs.biteno import constants
 from envs.targets.protocol import Target
 from experiments import checkpoint, plots, report
 from experiments.checkpoint import as_json, write_json
@@ -97,6 +96,7 @@ class Method:
     """One row of the comparison."""
 
     tuner: Any
+    policy: Policy
     dist: ParamDist
     sets: int
     """Measured sets in a tuning."""
@@ -105,19 +105,23 @@ class Method:
 UPDATES = {"posterior": tuner.posterior_update, "vote": tuner.vote_update}
 
 
-def methods(args: Args, loop: Loop, target: Target) -> dict[str, Callable[[], Method]]:
+def methods(args: Args, loop: Loop, target: Target, policy: Policy) -> dict[str, Method]:
     """The four methods, each the same tuner with other functions or another distribution."""
     nominal = domain.nominal(loop.entries)
-    narrow, free = (loop.tuner(target, radius) for radius in (loop.preset.policy_radius, float("inf")))
-    untuned = baselines.Untuned(tuner=free)
-    ours = dataclasses.replace(narrow, update=UPDATES[args.update])
+    machine = loop.tuner(target)
+    untuned = baselines.Untuned(tuner=machine)
+    ours = dataclasses.replace(machine, update=UPDATES[args.update])
     start = loop.dist(nominal, args.radius)
     truth = {name: target.params[name] for name in nominal}
+    wide = policy.replace(radius=jnp.full_like(policy.radius, args.dr_radius))
+    knowing = policy.replace(
+        hidden={name: jnp.full_like(value, target.params[name]) for name, value in policy.hidden.items()}
+    )
     return {
-        "ours": lambda: Method(ours, start, 1),
-        "spm": lambda: Method(baselines.spm(narrow), start, 1),
-        "dr": lambda: Method(untuned, loop.dist(nominal, args.dr_radius), 0),
-        "oracle": lambda: Method(untuned, loop.dist(truth, loop.preset.policy_radius), 0),
+        "ours": Method(ours, policy, start, 1),
+        "spm": Method(baselines.spm(machine), policy, start, 1),
+        "dr": Method(untuned, wide, loop.dist(nominal, args.dr_radius), 0),
+        "oracle": Method(untuned, knowing, loop.dist(truth, loop.preset.policy_radius), 0),
     }
 
 
@@ -163,21 +167,18 @@ def engine(args) -> str:
 
 
 def make_target(args, loop: Loop) -> Target:
-    """The target of a case; its robot may differ in what is not tuned."""
-    params = true_params(args, loop)
-    return TARGETS[engine(args)](Biteno(loop.preset.task, domain.select(constants.ENTRIES, tuple(params))), params)
+    """The target of a case."""
+    return TARGETS[engine(args)](loop.robot, true_params(args, loop))
 
 
 class Runner:
     """Runs (method, seed) pairs, each into a file of its own."""
 
     def __init__(self, args: Args, loop: Loop, target: Target, policy: Policy, knobs: tuner.Knobs):
-        self._args, self._loop, self._policy, self._knobs = args, loop, policy, knobs
-        self._target = target
-        self._methods = methods(args, loop, target)
-        evaluate = functools.partial(loop.evaluate, target=target)
-        self._evaluate = loop.jit(evaluate) if isinstance(target, MjxTarget) else evaluate
-        self._steps = {}
+        self._args, self._loop, self._target, self._knobs = args, loop, target, knobs
+        self._play = loop.play(target)
+        self._methods = methods(args, loop, target, policy)
+        self._steps = {name: loop.step(method.tuner, self._play) for name, method in self._methods.items()}
 
     def __call__(self, name: str, seed: int, progress: Progress) -> dict:
         """Runs one pair, or reads what an earlier call left."""
@@ -193,28 +194,24 @@ class Runner:
                     log.write(json.dumps(line) + "\n")
                 note = f" return {line['return']:.1f} {' '.join(line.get('verdicts', ()))}"
                 progress.update(task, completed=line["tuning"], description=f"{name} seed {seed}{note}")
-            sets = self._methods[name]().sets * tunings
+            sets = self._methods[name].sets * tunings
             write_json(path, {"lines": lines, "measured_episodes": sets * self._loop.preset.tuner.set_episodes})
         progress.update(task, completed=tunings)
         return json.loads(path.read_text())
 
     def _tunings(self, name: str, seed: int):
-        method = self._methods[name]()
-        # dr and oracle are one program: the distribution is an argument.
-        if method.tuner not in self._steps:
-            self._steps[method.tuner] = self._loop.step(method.tuner, self._target)
-        step = self._steps[method.tuner]
+        method, step = self._methods[name], self._steps[name]
         key = jax.random.PRNGKey(seed)
         key_evaluate, key_steps = jax.random.split(key)
-        state = method.tuner.init(self._policy, method.dist, self._knobs)
+        state = method.tuner.init(method.policy, method.dist, self._knobs)
         begin = time.monotonic()
         info = None
         for index in range(self._loop.preset.tunings + 1):
             if index:
                 state, info = step(jax.random.fold_in(key_steps, index), state)
                 self._must_have_walked(info)
-            value, falls = self._evaluate(key_evaluate, state.policy)
-            line = {"method": name, "seed": seed, "tuning": index, "return": float(value), "falls": int(falls)}
+            value, falls = self._loop.evaluate(key_evaluate, state.policy, self._play)
+            line = {"method": name, "seed": seed, "tuning": index, "return": value, "falls": falls}
             line |= self._describe(state.dist) | (self._tell(info) if info is not None else {})
             yield as_json(line | {"seconds": time.monotonic() - begin})
 
@@ -267,7 +264,8 @@ def main(args: Args) -> None:
     for option in ("out", "methods", "seeds"):
         del identity[option]
     checkpoint.enable_compilation_cache()
-    loop = Loop(sizes, entries)
+    hidden = domain.select(constants.ENTRIES, tuple(CASES[args.case].hidden))
+    loop = Loop(sizes, entries, hidden)
     checkpoint.open_run(args.out, identity)
     target = make_target(args, loop)
     runner = Runner(args, loop, target, starting_policy(args.policy, loop, args.out), knobs)

@@ -88,7 +88,7 @@ def program(args: Args, loop: Loop, policy: Policy):
     """The sweep as one function of its lanes [lanes, 5]; returns state and info, [lanes, ...]."""
     target = MjxTarget(robot=loop.robot, params=true_params(args, loop))
     fixed = dataclasses.replace(
-        loop.tuner(target, loop.preset.policy_radius),
+        loop.tuner(target),
         train_policy=lambda key, policy, dist: (policy, {}),
         update=tuner.vote_update,
     )

@@ -3,6 +3,7 @@
 import dataclasses
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -15,12 +16,12 @@ from experiments.train import policy_config
 
 @pytest.fixture(scope="module")
 def loop():
-    return Loop(PRESETS["smoke"], chosen("foot_friction"))
+    return Loop(PRESETS["smoke"], chosen("foot_friction"), chosen("torque_scale"))
 
 
 @pytest.fixture(scope="module")
 def train(loop):
-    dist = loop.dist(domain.nominal(loop.entries), 0.1)
+    dist = loop.dist(domain.nominal(loop.entries), 0.3)
     return jax.jit(lambda key, policy: loop.train(key, policy, dist, 1))
 
 
@@ -35,6 +36,19 @@ def test_saved_policy_takes_the_same_next_step(loop, train, tmp_path):
     assert np.isfinite(metrics["loss"]).all()
     # What was loaded, and what a step returns, is as good an input as what was made: nothing is compiled twice.
     train(jax.random.PRNGKey(2), found)
+    assert train._cache_size() == 1
+
+
+def test_robots_train_within_the_policy_radius_and_with_hidden_parameters(loop, train):
+    policy = loop.init(jax.random.PRNGKey(0))
+    other = policy.replace(radius=jnp.float32(0.2), hidden={"torque_scale": jnp.float32(0.75)})
+    drawn, wider = (train(jax.random.PRNGKey(1), one)[0].robots.info["params"] for one in (policy, other))
+    np.testing.assert_array_equal(drawn["torque_scale"], 1.0)
+    np.testing.assert_array_equal(wider["torque_scale"], 0.75)
+    # The distribution's radius is 0.3.
+    for params, radius in ((drawn, loop.preset.policy_radius), (wider, 0.2)):
+        spread = np.abs(np.log(params["foot_friction"]))
+        assert 0.5 * radius < spread.max() <= radius + 1e-6
     assert train._cache_size() == 1
 
 

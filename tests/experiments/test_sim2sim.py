@@ -120,7 +120,7 @@ def test_finished_pairs_are_not_run_again(tmp_path, monkeypatch):
     runner = object.__new__(sim2sim.Runner)
     runner._args = sim2sim.Args(out=tmp_path)
     runner._loop = type("Loop", (), {"preset": PRESETS["smoke"]})
-    runner._methods = {"ours": lambda: sim2sim.Method(None, None, 1)}
+    runner._methods = {"ours": sim2sim.Method(None, None, None, 1)}
     calls = []
 
     def tunings(self, name, seed):

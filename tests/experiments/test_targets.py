@@ -1,6 +1,5 @@
 """Targets that are not JAX, in the loop and on the command line."""
 
-import dataclasses
 import json
 import sys
 import types
@@ -39,13 +38,15 @@ def test_a_step_with_a_foreign_target_is_that_of_the_tuner():
     state = machine.init(toys.policy(), toys.uniform(NAMES, 0.2), tuners.knobs())
     traces = []
 
-    def measure(key, policy):
+    def play(key, policy, count, steps):
         # It is asked with numbers, not traced.
         traces.append(isinstance(key, jax.core.Tracer))
+        assert (count, steps) == (sizes.tuner.set_episodes, sizes.episode_steps)
         return machine.measure(key, policy)
 
-    loop = types.SimpleNamespace(jit=toys.quick_jit)
-    step = Loop.step(loop, dataclasses.replace(machine, measure=measure), target=object())
+    sizes = sim2sim.preset("smoke")
+    loop = types.SimpleNamespace(jit=toys.quick_jit, preset=sizes, _train=toys.quick_jit(toys.train_policy))
+    step = Loop.step(loop, machine, play)
     got, expected = step(jax.random.key(0), state), toys.quick_jit(machine.step)(jax.random.key(0), state)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), got, expected)
     assert traces == [False]
