@@ -1,4 +1,4 @@
-"""Speeds, and how often the gate rings: `python -m experiments.bench speed`, `python -m experiments.bench alarm`.
+"""Speeds, and how often the gate rings: `python -m experiments.bench speed`, `... targets`, `... alarm`.
 
 Ratios come from one run on one machine; nothing here is a test.
 """
@@ -20,6 +20,7 @@ from envs import domain
 from experiments import checkpoint
 from experiments.config import chosen, preset
 from experiments.loop import Loop
+from experiments.targets import TARGETS
 from experiments.train import console, run, starting_policy
 from jaxtune import dist as dists
 from jaxtune import tuner
@@ -31,14 +32,15 @@ FIELDS = ("novelty", "threshold", "p_value")
 class Args:
     """Measures one thing and writes it as JSON."""
 
-    what: tyro.conf.Positional[Literal["speed", "alarm"]]
-    """speed: training steps a second with both physics presets. alarm: first gate calls over many seeds."""
+    what: tyro.conf.Positional[Literal["speed", "targets", "alarm"]]
+    """speed: training steps a second with both physics presets. targets: steps a second of every engine that is
+    installed. alarm: first gate calls over many seeds."""
     out: Path = Path("runs/bench")
     """Folder of the results."""
     preset: str = "cpu"
     """Sizes: smoke, cpu or gpu."""
     policy: str = "walk"
-    """Policy of the alarm: walk, or a folder of experiments.train."""
+    """Policy of targets and alarm: walk, or a folder of experiments.train."""
     seeds: int = 10
     """Gate calls for each target."""
     radius: float = 0.2
@@ -62,6 +64,30 @@ def speed(args: Args) -> dict:
             seconds.append(time.monotonic() - begin)
         steps = sizes.chunk * sizes.ppo.steps_per_update
         rows[physics] = {"first_call_s": seconds[0], "steps_per_second": steps / min(seconds[1:])}
+    return rows
+
+
+def targets(args: Args) -> dict:
+    """Steps a second of the shipped policy's episodes in every engine, at sub-steps of 1 ms, compilation apart."""
+    sizes = preset(args.preset)
+    sizes = dataclasses.replace(sizes, task=dataclasses.replace(sizes.task, physics="exact"))
+    loop = Loop(sizes, chosen("foot_friction"))
+    policy = starting_policy(args.policy, loop)
+    rows = {}
+    for name, make in TARGETS.items():
+        try:
+            play = loop.play(make(loop.robot, domain.nominal(loop.entries)))
+        except ValueError as error:
+            console.print(f"left out: {error}")
+            continue
+        seconds = []
+        for _ in range(2):
+            begin = time.monotonic()
+            jax.block_until_ready(play(jax.random.PRNGKey(0), policy, sizes.ppo.num_envs, sizes.episode_steps))
+            seconds.append(time.monotonic() - begin)
+        speed = sizes.ppo.num_envs * sizes.episode_steps / seconds[1]
+        physics = speed * loop.robot.substeps
+        rows[name] = {"first_call_s": seconds[0], "steps_per_second": speed, "physics_steps_per_second": physics}
     return rows
 
 
@@ -114,7 +140,7 @@ def main(args: Args) -> None:
     """Measures, prints and writes."""
     checkpoint.enable_compilation_cache()
     begin = time.monotonic()
-    rows = {"speed": speed, "alarm": alarm}[args.what](args)
+    rows = {"speed": speed, "targets": targets, "alarm": alarm}[args.what](args)
     table = Table(title=args.what)
     for column in ("", *next(iter(rows.values()))):
         table.add_column(column)

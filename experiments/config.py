@@ -34,7 +34,7 @@ class Preset:
     """Tunings in a run."""
     evaluation_episodes: int = 32
     """Episodes of the full time limit over which a return is the mean."""
-    scratch_updates: int = 1500
+    scratch_updates: int = 3000
     """PPO updates of a policy trained from scratch."""
     chunk: int = 10
     """PPO updates between two lines of progress."""

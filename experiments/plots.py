@@ -21,10 +21,14 @@ def training(path: Path, curve: Sequence[dict]) -> None:
     steps = np.array([line["steps"] for line in curve]) / 1e6
     panels = {
         "per second": {"trained reward": "reward", "Table I": "score"},
-        "share of the best": {"linear tracking": "linear_tracking", "angular tracking": "angular_tracking"},
+        "share": {
+            "linear tracking": "linear_tracking",
+            "angular tracking": "angular_tracking",
+            "feet against the clock": "clock_contact",
+        },
         "episode ends per 20 s": {"ends": "done"},
     }
-    scales = {"per second": 100.0, "share of the best": 1.0, "episode ends per 20 s": 2000.0}
+    scales = {"per second": 100.0, "share": 1.0, "episode ends per 20 s": 2000.0}
     figure, axes = plt.subplots(1, 3, figsize=(12, 3.2), layout="constrained")
     for axis, (label, series) in zip(axes, panels.items(), strict=True):
         for name, key in series.items():
@@ -63,6 +67,24 @@ def sweep(path: Path, grid: np.ndarray, rows: Sequence[str], columns: Sequence[s
             axis.text(column, row, f"{value:.2f}", ha="center", va="center", color="white" if dark else "black")
     axes[0, 0].set_ylabel(row_label)
     figure.colorbar(image, ax=axes, label="mean parameter error at the end")
+    _save(figure, path)
+
+
+def gaps(path: Path, rows: Sequence[dict], shown: dict[str, str], nominal: dict[str, float]) -> None:
+    """One column of panels for every sweep, one row for every quantity of `shown`; a line where nothing is off."""
+    figure, axes = plt.subplots(
+        len(shown), len(nominal), figsize=(9, 8), layout="constrained", sharex="col", sharey="row", squeeze=False
+    )
+    labels = {"friction": "friction of the feet", "mass": "mass, of nominal", "motor": "torque, of nominal"}
+    for column, (sweep, value) in zip(axes.T, nominal.items(), strict=True):
+        own = [row for row in rows if row["sweep"] == sweep]
+        for axis, (name, label) in zip(column, shown.items(), strict=True):
+            axis.plot([row["value"] for row in own], [row[name] for row in own], "o-", ms=3)
+            axis.axvline(value, color="tab:gray", lw=0.8, ls="--")
+            axis.grid(alpha=0.3)
+            if axis in axes[:, 0]:
+                axis.set_ylabel(label, fontsize=8)
+        column[-1].set_xlabel(labels[sweep])
     _save(figure, path)
 
 

@@ -49,9 +49,8 @@ WALKING = {**TABLE_ONE, "raibert": -5.0, "action_rate": -0.01}
 """Weights that make it walk. Under Table I alone this robot earns as much by buzzing (13 touchdowns a second and
 foot)."""
 
-
-SHAPING = ("clock_contact", "speed_error")
-"""Names of the terms beside Table I."""
+SHAPING = {"clock_contact": -1.0}
+"""Weights of terms beside Table I. Without them it walks, but lands one and a half times a step."""
 
 
 def _mass(name: str, *bodies: str) -> Entry:

@@ -46,7 +46,7 @@ class TaskConfig:
     """Width of the observation noise in units of `sensing.NOISE`."""
     weights: Mapping[str, float] = field(default_factory=lambda: dict(constants.WALKING))
     """Trained reward: weight of every term of Table I."""
-    shaping: Mapping[str, float] = field(default_factory=dict)
+    shaping: Mapping[str, float] = field(default_factory=lambda: dict(constants.SHAPING))
     """Trained reward: weight of terms beside Table I (`rewards.shaping`)."""
     termination_cost: float = 1.0
     """Taken from the trained reward where an episode ends in a fall."""
@@ -240,9 +240,7 @@ class Biteno:
             joint_reference=drive.reference,
         )
         phase = gait.advance(state.phase)
-        shaped = rewards.shaping(
-            velocity=readings["velocity"], command=state.command, foot_force=motion.foot_force, phase=phase
-        )
+        shaped = rewards.shaping(foot_force=motion.foot_force, phase=phase)
         values |= {name: shaped[name] for name in self.config.shaping}
         values = {name: jnp.where(finite, value, 0.0) for name, value in values.items()}
         trained = rewards.weigh(values, self.config.weights) + rewards.weigh(values, self.config.shaping)

@@ -56,26 +56,18 @@ def terms(
     }
 
 
-def shaping(
-    *, velocity: jax.Array, command: jax.Array, foot_force: jax.Array, phase: jax.Array
-) -> dict[str, jax.Array]:
+def shaping(*, foot_force: jax.Array, phase: jax.Array) -> dict[str, jax.Array]:
     """Terms beside Table I that shape learning and are never scored, each a scalar without weight or time step.
 
     `clock_contact` is the share by which floor and clock disagree, summed over the feet: a foot that touches in its
-    swing, or hangs or bounces in its stance. Without it a walk that lands twice a step earns as much. `speed_error` is
-    how far the walk is off its command, in m/s: Table I's tracking forgives the last 0.2 m/s.
+    swing, or hangs or bounces in its stance. Without it a walk that lands twice a step earns as much.
 
     Args:
-      velocity: [3] m/s, body frame.
-      command: [3] m/s, m/s, rad/s.
       foot_force: [2, 3] N, of the floor on each foot.
       phase: [2] cycles.
     """
     touches = jnp.clip(foot_force[:, 2] / _FIRM_N, 0.0, 1.0)
-    return {
-        "clock_contact": jnp.sum(jnp.abs(touches - (phase < constants.DUTY))),
-        "speed_error": jnp.sqrt(_square(command[:2] - velocity[:2])),
-    }
+    return {"clock_contact": jnp.sum(jnp.abs(touches - (phase < constants.DUTY)))}
 
 
 def weigh(values: Mapping[str, jax.Array], weights: Mapping[str, float]) -> jax.Array:

@@ -1,0 +1,102 @@
+"""What a gap costs a policy that knows nothing of it: `python -m experiments.gaps --out DIR`.
+
+A gap in which an untuned policy loses nothing is no transfer problem. Friction, mass and motor strength vary one at a
+time; the policy walks as it is under the task's own commands.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax
+import numpy as np
+from rich.table import Table
+
+from envs import domain
+from envs.biteno import constants
+from envs.targets.mjx import MjxTarget
+from experiments import checkpoint, plots
+from experiments.config import PRESETS, preset
+from experiments.evaluate import judge
+from experiments.loop import Loop
+from experiments.train import bars, console, run, starting_policy
+
+SWEEPS = {
+    "friction": (("foot_friction",), (0.1, 0.15, 0.2, 0.3, 0.4, 0.6, 0.9, 1.2)),
+    "mass": (("trunk_mass", "abductor_mass", "thigh_mass", "shank_mass"), (0.5, 0.67, 0.8, 1.0, 1.25, 1.5, 1.75, 2.0)),
+    "motor": (("torque_scale",), (0.4, 0.5, 0.6, 0.75, 0.9, 1.0, 1.2)),
+}
+"""Parameters that share one value, and its values: the coefficient of friction, multiples of mass and of torque."""
+
+SHOWN = {
+    "return": "return of 20 s (at most 70)",
+    "speed_error_mps": "speed error, m/s",
+    "slip_mps": "slip, m a second",
+    "falls_per_20s": "falls in 20 s",
+}
+"""Columns of the table and panels of the picture."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Args:
+    """Walks a policy through ranges of friction, mass and motor strength."""
+
+    out: Path = Path("runs/gaps")
+    """Folder of gaps.json and gaps.png."""
+    policy: str = "walk"
+    """Policy: walk (ships with the package), or a folder of experiments.train."""
+    preset: str = "cpu"
+    """Sizes: smoke, cpu or gpu."""
+    episodes: int = 32
+    """Episodes of the full time limit at every point."""
+    seed: int = 0
+    """Seed of commands and resets, the same at every point."""
+
+
+def points(friction: float) -> list[tuple[str, float, dict[str, float]]]:
+    """Every point as (sweep, value, parameters); `friction` is the nominal coefficient."""
+    return [
+        (sweep, value, dict.fromkeys(names, value / friction if sweep == "friction" else value))
+        for sweep, (names, values) in SWEEPS.items()
+        for value in values
+    ]
+
+
+def main(args: Args) -> None:
+    """Walks, prints and draws."""
+    if args.preset not in PRESETS:
+        raise ValueError(f"preset: got '{args.preset}', expected one of {', '.join(PRESETS)}")
+    if args.episodes < 1:
+        raise ValueError(f"episodes: got {args.episodes}, expected 1 or more")
+    sizes = preset(args.preset)
+    entries = domain.select(constants.ENTRIES, [name for names, _ in SWEEPS.values() for name in names])
+    checkpoint.enable_compilation_cache()
+    loop = Loop(sizes, entries)
+    policy = starting_policy(args.policy, loop)
+    nominal = domain.nominal(entries)
+    friction = float(loop.robot.mj_model.geom(constants.FEET[0]).friction[0])
+    rows = points(friction)
+    key, steps = jax.random.PRNGKey(args.seed), round(sizes.task.episode_s / constants.POLICY_DT_S)
+
+    @loop.jit
+    def walk(policy, params):
+        return MjxTarget(robot=loop.robot, params=params).record(key, loop.act(policy), args.episodes, steps)
+
+    results = []
+    with bars() as progress:
+        for sweep, value, params in progress.track(rows, description="walking"):
+            params = {name: np.float32(number) for name, number in (nominal | params).items()}
+            results.append({"sweep": sweep, "value": value, **judge(*jax.device_get(walk(policy, params)))})
+
+    table = Table(title=f"{args.policy}, untuned")
+    for column in ("", "value", *SHOWN):
+        table.add_column(column, justify="right")
+    for row in results:
+        table.add_row(row["sweep"], f"{row['value']:g}", *(f"{row[name]:.2f}" for name in SHOWN))
+    console.print(table)
+    args.out.mkdir(parents=True, exist_ok=True)
+    checkpoint.write_json(args.out / "gaps.json", {"args": args, "rows": results, "versions": checkpoint.versions()})
+    plots.gaps(args.out / "gaps.png", results, SHOWN, {"friction": friction, "mass": 1.0, "motor": 1.0})
+
+
+if __name__ == "__main__":
+    run(main, Args)
