@@ -1,7 +1,12 @@
 """What all tests share: single precision, silence of others' deprecations, and whatever takes long to compile."""
 
+import os
+
 import jax
 import pytest
+
+# What tests compile they run briefly, so it is compiled quickly rather than well; read when the first program is.
+os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false")
 
 # The precision that everything runs in, whatever the environment says.
 jax.config.update("jax_enable_x64", False)

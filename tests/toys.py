@@ -42,11 +42,8 @@ TINY = TunerConfig(
     spm=TINY_SPM, dvm=TINY_DVM,
 )  # fmt: skip
 
-quick_jit = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
-"""Compiles in half the time and runs several times slower: for what is run once on little data."""
-
 long_jit = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 1})
-"""Compiles a little faster and runs as fast: for what trains."""
+"""For what trains: compiled better than the rest of the tests (see conftest), and still faster than by default."""
 
 # One compilation for all tests of the same sizes.
 train_spm = long_jit(spm.train, static_argnums=1)

@@ -3,10 +3,15 @@
 import re
 from pathlib import Path
 
+import jax
+import toys
+
 README = (Path(__file__).parents[2] / "README.md").read_text()
 
 
-def test_embedding_example_finds_the_friction():
+def test_embedding_example_finds_the_friction(monkeypatch):
+    # The example learns for long enough to be compiled well.
+    monkeypatch.setattr(jax, "jit", toys.long_jit)
     (code,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
     assert sum(bool(line.strip()) for line in code.splitlines()) < 20
     scope = {}

@@ -45,9 +45,9 @@ def test_a_step_with_a_foreign_target_is_that_of_the_tuner():
         return machine.measure(key, policy)
 
     sizes = sim2sim.preset("smoke")
-    loop = types.SimpleNamespace(jit=toys.quick_jit, preset=sizes, _train=toys.quick_jit(toys.train_policy))
+    loop = types.SimpleNamespace(jit=jax.jit, preset=sizes, _train=jax.jit(toys.train_policy))
     step = Loop.step(loop, machine, play)
-    got, expected = step(jax.random.key(0), state), toys.quick_jit(machine.step)(jax.random.key(0), state)
+    got, expected = step(jax.random.key(0), state), jax.jit(machine.step)(jax.random.key(0), state)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), got, expected)
     assert traces == [False]
 

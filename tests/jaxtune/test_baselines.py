@@ -43,7 +43,7 @@ def unanimous(monkeypatch):
 
 def test_spm_accepts_what_a_gate_would_ring_for_and_keeps_its_radius(spm, unanimous):
     state = start(spm, threshold=1e-6)  # which no gate that looks at it lets pass
-    step = toys.quick_jit(spm.step)
+    step = jax.jit(spm.step)
     for seed in range(3):
         before = state.dist
         state, info = step(jax.random.key(seed), state)

@@ -45,7 +45,7 @@ def test_double_is_the_transpose_of_halve(time):
     rng = np.random.default_rng(time)
     x = rng.normal(size=(2, time, 3)).astype(np.float32)
     y = rng.normal(size=(2, math.ceil(time / 2), 12)).astype(np.float32)
-    halved, doubled = toys.quick_jit(lambda x, y: (dvm._halve(x), dvm._double(y, time)))(x, y)
+    halved, doubled = jax.jit(lambda x, y: (dvm._halve(x), dvm._double(y, time)))(x, y)
     assert halved.shape == y.shape
     assert doubled.shape == x.shape
     # <halve(x), y> = <x, double(y)> for every x and y.
@@ -76,7 +76,7 @@ def blank(config=CONFIG, channels=3, **params):
     return {"params": {**variables["params"], **params}}
 
 
-apply = toys.quick_jit(dvm._VAE(CONFIG, 3).apply)
+apply = jax.jit(dvm._VAE(CONFIG, 3).apply)
 
 
 def test_elbo_by_hand():
@@ -103,7 +103,7 @@ def test_noise_level_has_a_floor():
     np.testing.assert_array_equal(below, floor)
 
 
-novelty_of = functools.partial(toys.quick_jit, static_argnums=0)(dvm.novelty)
+novelty_of = functools.partial(jax.jit, static_argnums=0)(dvm.novelty)
 
 
 def placed(reach, neighbours=3):

@@ -153,7 +153,7 @@ def counted(endless):
     """A jitted update, and how often it was traced."""
     traces = []
 
-    @toys.quick_jit
+    @jax.jit
     def update(key, learner, state):
         traces.append(1)
         return LEARNER.update(key, learner, endless, state)
@@ -200,10 +200,10 @@ def test_scan_is_a_loop_of_updates(endless, counted, trained):
 def test_vmap_over_seeds_is_a_loop(endless, counted):
     update, _ = counted
     seeds = jnp.arange(3)
-    learners = toys.quick_jit(jax.vmap(lambda seed: LEARNER.init(jax.random.PRNGKey(seed))))(seeds)
+    learners = jax.jit(jax.vmap(lambda seed: LEARNER.init(jax.random.PRNGKey(seed))))(seeds)
     keys = jax.vmap(jax.random.PRNGKey)(seeds)
     state = begin(endless)
-    together, _, metrics = toys.quick_jit(
+    together, _, metrics = jax.jit(
         jax.vmap(lambda key, learner: LEARNER.update(key, learner, endless, state)),
     )(keys, learners)
     for index in range(3):

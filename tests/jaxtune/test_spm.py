@@ -38,7 +38,7 @@ def estimate(model):
 
 @pytest.fixture(scope="module")
 def logits(model):
-    return toys.quick_jit(lambda measured, guesses: spm.logits(CONFIG, model, measured, guesses))
+    return jax.jit(lambda measured, guesses: spm.logits(CONFIG, model, measured, guesses))
 
 
 @pytest.fixture(scope="module")

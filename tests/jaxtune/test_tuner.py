@@ -86,7 +86,7 @@ def play():
         verify=scripted_gate,
         update=half_step,
     )
-    tune = toys.quick_jit(tuner.tune)
+    tune = jax.jit(tuner.tune)
     blank = SLIDER.measure(TWO, 2)(jax.random.key(0), toys.policy())
 
     def run(*novelties, bound=1.2, **ends):
@@ -244,11 +244,11 @@ def start(tuner, centre=TWO, radius=0.2, **settings):
 
 @pytest.fixture(scope="module")
 def drawn_step(drawn):
-    return toys.quick_jit(drawn.step)
+    return jax.jit(drawn.step)
 
 
 def test_run_is_a_loop_of_steps(drawn, drawn_step):
-    state, infos = toys.quick_jit(lambda key, state: drawn.run(key, state, 4))(jax.random.key(0), start(drawn))
+    state, infos = jax.jit(lambda key, state: drawn.run(key, state, 4))(jax.random.key(0), start(drawn))
     looped = start(drawn)
     for index, key in enumerate(jax.random.split(jax.random.key(0), 4)):
         looped, info = drawn_step(key, looped)
@@ -272,7 +272,7 @@ def test_a_jitted_step_is_measuring_tuning_and_training_without_jit(drawn, drawn
 def test_distribution_and_knobs_change_without_a_new_trace(drawn):
     traces = []
 
-    @toys.quick_jit
+    @jax.jit
     def step(key, state):
         traces.append(1)
         return drawn.step(key, state)
@@ -293,7 +293,7 @@ def test_vmap_over_seeds_starts_and_knobs_is_a_loop(drawn, drawn_step):
         start(drawn, step_size=0.1),
         start(drawn, widen_factor=3.0),
     ]
-    together = toys.quick_jit(jax.vmap(drawn.step))(keys, jax.tree.map(lambda *leaves: jnp.stack(leaves), *starts))
+    together = jax.jit(jax.vmap(drawn.step))(keys, jax.tree.map(lambda *leaves: jnp.stack(leaves), *starts))
     alone = [drawn_step(key, state) for key, state in zip(keys, starts, strict=True)]
     close(together, jax.tree.map(lambda *leaves: jnp.stack(leaves), *alone), rtol=1e-4, atol=1e-5)
     # Lanes that ended after different calls and with different verdicts.

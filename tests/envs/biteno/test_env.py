@@ -285,8 +285,8 @@ def test_a_low_hip_ends_an_episode(start, step, height_m, done):
 def test_a_fall_costs_the_trained_reward_and_not_the_score(robot, start, step):
     state = step(NOMINAL, tilted(start, np.deg2rad(60)), STILL)
     earned = {
-        name: 0.01 * sum(weights[term] * float(value) for term, value in state.terms.items())
-        for name, weights in (("reward", constants.WALKING), ("score", constants.TABLE_ONE))
+        name: 0.01 * sum(weight * float(state.terms[term]) for term, weight in weights.items())
+        for name, weights in (("reward", constants.WALKING | constants.SHAPING), ("score", constants.TABLE_ONE))
     }
     # sin(60 degrees)^2 = 0.75 is the orientation's term, which the fall deserves in either.
     np.testing.assert_allclose(state.terms["orientation"], 0.75, atol=0.01)
@@ -474,6 +474,8 @@ def test_every_term_is_handed_what_it_is_of(start, monkeypatch):
         # The phase of this step: the right leg at the top of its swing is off by 0.277194 and 0.554388 rad, the left
         # one by 0.001929 and 0.003857: 0.384183 + 0.000019.
         "raibert": 0.384202,
+        # The left foot should stand, and nothing presses on it.
+        "clock_contact": 1.0,
     }
     assert state.terms.keys() == expected.keys()
     for name, value in expected.items():
@@ -510,3 +512,6 @@ def test_no_two_configs_share_their_weights():
     assert first.weights == constants.WALKING
     assert first.weights is not second.weights
     assert first.weights is not constants.WALKING
+    assert first.shaping == constants.SHAPING
+    assert first.shaping is not second.shaping
+    assert first.shaping is not constants.SHAPING
