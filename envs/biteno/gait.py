@@ -112,9 +112,9 @@ def quality(
     Returns:
       By name: touchdowns a second and foot; swing clearance in m, the mean over swings of the foot's highest point
       above the floor; share of time in which contact and clock agree; errors of the mean velocity in m/s and of the
-      mean turning rate in rad/s, over episodes after their first second; slip of the feet on the floor in m a second;
-      torque (root mean square, Nm); mechanical power in W, braking not regained; falls in 20 s; friction use, the 99th
-      percentile of tangential over normal force.
+      mean turning rate in rad/s, over episodes after their first second (nan where none lasts longer); slip of the feet
+      on the floor in m a second; torque (root mean square, Nm); mechanical power in W, braking not regained; falls in
+      20 s; friction use, the 99th percentile of tangential over normal force.
     """
     centre, velocity = (np.asarray(values) for values in _foot_motions(qpos, qvel))
     seconds = alive.sum() * constants.POLICY_DT_S
@@ -135,8 +135,8 @@ def quality(
         "touchdowns_per_s": landed.sum() / 2 / seconds,
         "swing_clearance_m": _clearance(height, contact, living),
         "clock_agreement": (contact == (phase < constants.DUTY))[alive].mean(),
-        "speed_error_mps": np.hypot(error[:, 0], error[:, 1]).mean(),
-        "turn_error_radps": np.abs(error[:, 2]).mean(),
+        "speed_error_mps": np.hypot(error[:, 0], error[:, 1]).mean() if len(error) else np.nan,
+        "turn_error_radps": np.abs(error[:, 2]).mean() if len(error) else np.nan,
         "slip_mps": (speed * (contact & living)).sum() * constants.POLICY_DT_S / seconds,
         "torque_nm": np.sqrt((torque[alive] ** 2).mean()),
         "power_w": np.maximum(torque * qvel[..., 6:], 0.0).sum(axis=-1)[alive].mean(),

@@ -198,6 +198,13 @@ def test_quality_tells_a_buzz_a_slide_and_a_fall():
     np.testing.assert_allclose(gait.quality(**fallen)["falls_per_20s"], 10.0)
 
 
+def test_no_episode_longer_than_a_second_has_no_speed_error():
+    values = gait.quality(**walk(steps=80))
+    assert np.isnan(values["speed_error_mps"])
+    assert np.isnan(values["turn_error_radps"])
+    assert np.isfinite(values["clock_agreement"])
+
+
 def test_clearance_is_the_mean_over_whole_swings():
     case = walk()
     lifted = case["qpos"].copy()
