@@ -138,7 +138,7 @@ def alarm(args: Args) -> dict:
 
 def main(args: Args) -> None:
     """Measures, prints and writes."""
-    checkpoint.enable_compilation_cache()
+    checkpoint.set_up_compiler(preset(args.preset).xla_flags)
     begin = time.monotonic()
     rows = {"speed": speed, "targets": targets, "alarm": alarm}[args.what](args)
     table = Table(title=args.what)

@@ -16,11 +16,13 @@ import orbax.checkpoint as ocp
 _PACKAGES = ("jaxtune", "jax", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "orbax-checkpoint", "numpy")
 
 
-def enable_compilation_cache() -> None:
-    """Keeps compiled programs in the user's cache folder, so that a second run starts quicker.
+def set_up_compiler(xla_flags: str) -> None:
+    """Adds a preset's flags to XLA_FLAGS, and keeps what is compiled, so that a second run starts quicker.
 
-    `JAX_COMPILATION_CACHE_DIR` chooses another folder.
+    To be called before JAX makes its first array, which is when it reads the flags. Programs are kept in the user's
+    cache folder, or where `JAX_COMPILATION_CACHE_DIR` says.
     """
+    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {xla_flags}"
     if os.environ.get("JAX_COMPILATION_CACHE_DIR"):
         return
     base = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))

@@ -1,6 +1,5 @@
 """Sizes of the experiments: what a preset buys, each number a field."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -13,6 +12,9 @@ from jaxtune.tuner import TunerConfig
 
 WALK = Path(__file__).parent / "policies" / "walk"
 """The policy that ships with the package."""
+
+QUICK_COMPILATION = "--xla_backend_optimization_level=0 --xla_backend_extra_options=xla_cpu_disable_new_fusion_emitters"
+"""Flags for runs of seconds, which are not worth minutes of optimisation."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,8 +55,8 @@ class Preset:
     """Steps of an episode in a sweep."""
     sweep_tunings: int = 3
     """Tunings in a sweep."""
-    compiler_options: Mapping[str, int | bool] = field(default_factory=dict)
-    """Passed to `jax.jit`; a run of seconds is not worth minutes of optimisation."""
+    xla_flags: str = ""
+    """Flags of the compiler."""
 
 
 _TINY = TunerConfig(
@@ -79,7 +81,7 @@ _SMOKE = Preset(
     sweep=_TINY,
     sweep_steps=80,
     sweep_tunings=2,
-    compiler_options={"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False},
+    xla_flags=QUICK_COMPILATION,
 )
 
 _LARGE = TunerConfig(

@@ -97,11 +97,11 @@ def judge(trajectory: Trajectory, recording: Recording) -> dict[str, float]:
 
 def main(args: Args) -> None:
     """Measures, prints and draws."""
+    checkpoint.set_up_compiler(preset(args.preset).xla_flags)
     params = check(args)
     sizes = preset(args.preset)
     entries = chosen(",".join(dict.fromkeys(("foot_friction", *params))))
     task = dataclasses.replace(sizes.task, physics=args.physics)
-    checkpoint.enable_compilation_cache()
     pushed = dataclasses.replace(task, push_mps=args.push)
     loops = {
         name: Loop(dataclasses.replace(sizes, task=task), entries)

@@ -15,7 +15,7 @@ from envs import domain
 from envs.biteno import constants
 from envs.targets.mjx import MjxTarget
 from experiments import checkpoint, plots
-from experiments.config import PRESETS, preset
+from experiments.config import preset
 from experiments.evaluate import judge
 from experiments.loop import Loop
 from experiments.train import bars, console, run, starting_policy
@@ -63,13 +63,11 @@ def points(friction: float) -> list[tuple[str, float, dict[str, float]]]:
 
 def main(args: Args) -> None:
     """Walks, prints and draws."""
-    if args.preset not in PRESETS:
-        raise ValueError(f"preset: got '{args.preset}', expected one of {', '.join(PRESETS)}")
+    checkpoint.set_up_compiler(preset(args.preset).xla_flags)
     if args.episodes < 1:
         raise ValueError(f"episodes: got {args.episodes}, expected 1 or more")
     sizes = preset(args.preset)
     entries = domain.select(constants.ENTRIES, [name for names, _ in SWEEPS.values() for name in names])
-    checkpoint.enable_compilation_cache()
     loop = Loop(sizes, entries)
     policy = starting_policy(args.policy, loop)
     nominal = domain.nominal(entries)
@@ -77,7 +75,7 @@ def main(args: Args) -> None:
     rows = points(friction)
     key, steps = jax.random.PRNGKey(args.seed), round(sizes.task.episode_s / constants.POLICY_DT_S)
 
-    @loop.jit
+    @jax.jit
     def walk(policy, params):
         return MjxTarget(robot=loop.robot, params=params).record(key, loop.act(policy), args.episodes, steps)
 

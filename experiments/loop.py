@@ -53,11 +53,7 @@ class Loop:
         self._env = BraxBiteno(Biteno(replace(preset.task, push_mps=preset.push_mps), self.robot.entries))
         self._ppo = PPO(preset.ppo, self.robot.observation_size, self.robot.action_size)
         # One program for all methods: what they differ in is an argument.
-        self._train = self.jit(lambda key, policy, dist: self.train(key, policy, dist, preset.epochs))
-
-    def jit(self, function: Callable, **options) -> Callable:
-        """Compiles with the preset's compiler options."""
-        return jax.jit(function, compiler_options=dict(self.preset.compiler_options), **options)
+        self._train = jax.jit(lambda key, policy, dist: self.train(key, policy, dist, preset.epochs))
 
     def dist(self, centre: Mapping[str, float], radius: float) -> ParamDist:
         """A distribution around physical values, in search coordinates, with the table's bounds."""
@@ -113,7 +109,7 @@ class Loop:
         def play(key, policy, count, steps):
             return target.episodes(key, self.act(policy), count, steps)
 
-        return self.jit(play, static_argnums=(2, 3)) if isinstance(target, MjxTarget) else play
+        return jax.jit(play, static_argnums=(2, 3)) if isinstance(target, MjxTarget) else play
 
     def evaluate(self, key: jax.Array, policy: Policy, play: Callable[..., Trajectory]) -> tuple[float, int]:
         """Mean return under the weights of Table I, and number of falls, over episodes of the full time limit."""
@@ -135,7 +131,7 @@ class Loop:
         """The step of a tuner in parts that are compiled apart, so that several tuners share them."""
         if isinstance(machine, Untuned):
             return replace(machine, tuner=replace(machine.tuner, train_policy=self._train)).step
-        tune = self.jit(machine.tune)
+        tune = jax.jit(machine.tune)
         count, steps = self.preset.tuner.set_episodes, self.preset.episode_steps
 
         def step(key, state):

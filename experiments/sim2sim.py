@@ -261,11 +261,11 @@ class Runner:
 
 def main(args: Args) -> None:
     """Runs what is not there yet, and writes metrics, summary and plots."""
+    checkpoint.set_up_compiler(preset(args.preset).xla_flags)
     sizes, entries, knobs = check(args)
     identity = {**dataclasses.asdict(args), "sizes": sizes}
     for option in ("out", "methods", "seeds"):
         del identity[option]
-    checkpoint.enable_compilation_cache()
     hidden = domain.select(constants.ENTRIES, tuple(CASES[args.case].hidden))
     loop = Loop(sizes, entries, hidden)
     checkpoint.open_run(args.out, identity)

@@ -102,7 +102,7 @@ def program(args: Args, loop: Loop, policy: Policy):
         # Policy and episodes are the same or of no use in every lane.
         return state.dist, info
 
-    return loop.jit(lambda columns: jax.vmap(one)(*columns.T))
+    return jax.jit(lambda columns: jax.vmap(one)(*columns.T))
 
 
 def errors(loop: Loop, truth: dict, centre: dict, off: Sequence[str]) -> np.ndarray:
@@ -113,10 +113,10 @@ def errors(loop: Loop, truth: dict, centre: dict, off: Sequence[str]) -> np.ndar
 
 def main(args: Args) -> None:
     """Runs the sweep; prints a table; writes summary.json and heat_map.png."""
+    checkpoint.set_up_compiler(preset(args.preset).xla_flags)
     one = check(args)
     sizes, entries = preset(args.preset), chosen(args.parameters)
     sizes = dataclasses.replace(sizes, tuner=sizes.sweep, episode_steps=sizes.sweep_steps)
-    checkpoint.enable_compilation_cache()
     loop = Loop(sizes, entries)
     checkpoint.open_run(args.out, {**dataclasses.asdict(args), "out": None, "sizes": sizes})
     policy = starting_policy(one.policy, loop, args.out)

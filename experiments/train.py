@@ -51,7 +51,7 @@ def walk(key: jax.Array, loop: Loop, updates: int, progress: Progress | None = N
     policy = loop.init(key_init)
     dist = loop.dist(domain.nominal(loop.entries), loop.preset.policy_radius)
     chunk = min(loop.preset.chunk, updates)
-    train = loop.jit(lambda key, policy: loop.train(key, policy, dist, chunk))
+    train = jax.jit(lambda key, policy: loop.train(key, policy, dist, chunk))
     task = progress.add_task("training", total=updates * loop.preset.ppo.steps_per_update) if progress else None
     curve, start = [], time.monotonic()
     for index in range(-(-updates // chunk)):
@@ -87,11 +87,11 @@ def bars() -> Progress:
 
 def main(args: Args) -> None:
     """Trains, saves and draws the curve."""
+    checkpoint.set_up_compiler(preset(args.preset).xla_flags)
     sizes, entries = preset(args.preset), chosen(args.parameters)
     updates = sizes.scratch_updates if args.updates is None else args.updates
     if updates < 1:
         raise ValueError(f"updates: got {updates}, expected 1 or more")
-    checkpoint.enable_compilation_cache()
     loop = Loop(sizes, entries)
     with bars() as progress:
         policy, curve = walk(jax.random.PRNGKey(args.seed), loop, updates, progress)

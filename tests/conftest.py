@@ -1,12 +1,10 @@
 """What all tests share: single precision, silence of others' deprecations, and whatever takes long to compile."""
 
 import os
+import warnings
 
 import jax
 import pytest
-
-# What tests compile they run briefly, so it is compiled quickly rather than well; read when the first program is.
-os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false")
 
 # The precision that everything runs in, whatever the environment says.
 jax.config.update("jax_enable_x64", False)
@@ -15,6 +13,10 @@ jax.config.update("jax_enable_x64", False)
 def pytest_configure(config):
     # Brax imports JAXopt wherever its environments are imported.
     config.addinivalue_line("filterwarnings", "ignore:JAXopt is no longer maintained:DeprecationWarning")
+    # What tests compile they run briefly. Flags are read when JAX makes its first array.
+    with warnings.catch_warnings(action="ignore"):
+        from experiments.config import QUICK_COMPILATION
+    os.environ.setdefault("XLA_FLAGS", QUICK_COMPILATION)
 
 
 # The fixtures import for themselves, since the line above rules only after this file has been read.
