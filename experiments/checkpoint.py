@@ -22,7 +22,8 @@ def set_up_compiler(xla_flags: str) -> None:
     To be called before JAX makes its first array, which is when it reads the flags. Programs are kept in the user's
     cache folder, or where `JAX_COMPILATION_CACHE_DIR` says.
     """
-    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {xla_flags}"
+    if xla_flags:
+        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {xla_flags}".strip()
     if os.environ.get("JAX_COMPILATION_CACHE_DIR"):
         return
     base = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
