@@ -49,7 +49,7 @@ CASES = {
     "mass": Case(off=lambda name: name.endswith("_mass")),
     "bullet": Case(target="bullet"),
     "weak_motor": Case(hidden={"torque_scale": 0.75}, target="bullet"),
-    "weaker_motor": Case(hidden={"torque_scale": 0.5}, target="bullet"),
+    "weaker_motor": Case(hidden={"torque_scale": 0.6}, target="bullet"),
 }
 """The paper's four gaps, Figs. 3.1 to 3.4, and a harder one."""
 
@@ -61,7 +61,7 @@ class Args:
     out: Path = Path("runs/sim2sim")
     """Folder of the run; the same command with the same folder goes on after the last finished (method, seed)."""
     case: str = "mass"
-    """What is off: friction, mass, bullet (another engine), weak_motor or weaker_motor (0.75 and 0.5 of the torque, in
+    """What is off: friction, mass, bullet (another engine), weak_motor or weaker_motor (0.75 and 0.6 of the torque, in
     bullet)."""
     start: float = 0.5
     """Where the simulator starts, as a multiple of the target; friction and mass alone."""
