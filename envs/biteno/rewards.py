@@ -1,9 +1,15 @@
-"""Table I of the paper, term by term, unweighted.
+"""Table I of the paper, term by term, unweighted, and what shapes learning beside it.
 
 Two slips in print are mended: orientation is the horizontal part of projected gravity (|g|^2 is always one, and a
-  policy that pays for it learns to fall), and joint acceleration is squared (the square is missing). As in
-  legged_gym, whose form this is, acceleration is a finite difference over a policy step and every term is multiplied
-  by that step's length.
+policy that pays for it learns to fall), and joint acceleration is squared (the square is missing). As in legged_gym,
+whose form this is, acceleration is a finite difference over a policy step and every term is multiplied by that step's
+length.
+
+Table I's weights score a walk; they do not make one. What is trained differs in four things, each with a weight or a
+size of its own: Raibert's term weighs more and the action rate less (`constants.WALKING`), actions are added to
+Raibert's reference (`TaskConfig.base`), feet that leave the clock cost (`shaping`, `constants.SHAPING`), and the robot
+is pushed (`TaskConfig.push_mps`). With the clock's term a walk lands once a step, where without it it lands one and a
+half times; what is trained with pushes does not fall under them.
 """
 
 from collections.abc import Mapping
