@@ -155,14 +155,14 @@ def _gate(path: Path, results: dict[str, list[dict]]) -> None:
     figure, (above, below) = plt.subplots(2, 1, figsize=(8, 5.5), layout="constrained", sharex=True)
     used = set()
     for name, runs in results.items():
+        if any(line.get("verdicts") for run in runs for line in run["lines"]):
+            above.plot([], [], color=_COLOURS[name], label=name)
         for run in runs:
             calls = [
                 (line["tuning"] + place / (len(line["verdicts"]) + 1), line, place)
                 for line in run["lines"]
                 for place in range(len(line.get("verdicts", ())))
             ]
-            if not calls:
-                continue
             when = [call[0] for call in calls]
             above.plot(when, [line["radius"][i] for _, line, i in calls], color=_COLOURS[name], alpha=0.6)
             gated = [(t, line, i) for t, line, i in calls if line["p_value"][i] is not None]
@@ -183,8 +183,6 @@ def _gate(path: Path, results: dict[str, list[dict]]) -> None:
                 above.plot(moment, line["radius"][place], _MARKS[verdict], color=_COLOURS[name], label=label)
                 if line["p_value"][place] is not None:
                     below.plot(moment, line["novelty"][place], _MARKS[verdict], color=_COLOURS[name])
-    for name in results:
-        above.plot([], [], color=_COLOURS[name], label=name)
     below.plot([], [], color="tab:red", lw=0.8, label="threshold")
     above.set(ylabel="largest radius, log space", ylim=(0, None))
     above.legend(fontsize=8)
