@@ -1,0 +1,183 @@
+"""Logs in and out."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pyarrow
+import pyarrow.csv
+import yaml
+
+from envs.logs.format import (
+    JOINT_SIGNALS,
+    SCALAR_SIGNALS,
+    VECTOR_SIGNALS,
+    Controller,
+    Log,
+    Run,
+    column_names,
+)
+from envs.logs.meta import Meta
+from envs.logs.tables import READERS
+
+_UNIT_NORM = 0.05  # how far a unit vector may be from one
+_RATE_RATIO = 2.0  # between nominal and recorded rate
+
+
+def read(folder: Path, robots: Sequence[str] = ("biteno", "pendulum")) -> Log:
+    """Reads a log.
+
+    Args:
+      folder: of meta.yaml and the runs.
+      robots: names of built-in models; any other is the path of an MJCF file, relative to the folder.
+
+    Raises:
+      ValueError: names the file, the row (of data, from 1) or the key, what was found and what was expected.
+    """
+    folder = Path(folder)
+    meta = Meta(folder, robots)
+    paths = sorted(path for path in folder.glob("run_*") if path.suffix in READERS)
+    stems = [path.stem for path in paths]
+    if not paths:
+        raise ValueError(f"{folder}: no runs; expected run_*.csv or run_*.npz")
+    for stem in stems:
+        if stems.count(stem) > 1:
+            raise ValueError(f"{folder}: run '{stem}' is there twice, as {' and '.join(READERS)}")
+    for name in meta.runs:
+        if name not in stems:
+            raise ValueError(f"{meta.path}: runs.{name}: there is no such run; found {', '.join(stems)}")
+    return Log(
+        robot=meta.robot,
+        base=meta.base,
+        rate_hz=meta.rate_hz,
+        joints=meta.joints,
+        policy=meta.policy,
+        runs=tuple(_run(path, meta) for path in paths),
+    )
+
+
+def write(log: Log, folder: Path, suffix: str = ".csv") -> None:
+    """Writes a log in our units and names; `read` gives it back.
+
+    Raises:
+      ValueError: the folder holds something already, or the suffix is none of ours.
+    """
+    folder = Path(folder)
+    if suffix not in READERS:
+        raise ValueError(f"suffix: got '{suffix}', expected one of {', '.join(READERS)}")
+    if folder.exists() and any(folder.iterdir()):
+        raise ValueError(f"{folder}: expected an empty folder")
+    folder.mkdir(parents=True, exist_ok=True)
+    meta = {
+        "robot": log.robot,
+        "base": log.base,
+        "rate_hz": log.rate_hz,
+        "joints": list(log.joints),
+        "controller": _as_meta(log.runs[0].controller),
+        "runs": {},
+    }
+    if log.policy is not None:
+        meta["policy"] = dict(log.policy)
+    for run in log.runs:
+        entry = {"condition": run.condition, "controller": _as_meta(run.controller)}
+        meta["runs"][run.name] = entry | ({"split": run.split} if run.split else {})
+        columns = {"t": run.time} | dict(run.other)
+        for signal, values in run.signals.items():
+            names = column_names(signal, log.joints)
+            columns |= dict(zip(names, values.reshape(len(run.time), -1).T, strict=True))
+        if suffix == ".npz":
+            np.savez(folder / f"{run.name}.npz", **columns)
+        else:
+            pyarrow.csv.write_csv(pyarrow.table(columns), folder / f"{run.name}.csv")
+    (folder / "meta.yaml").write_text(yaml.safe_dump(meta, sort_keys=False))
+
+
+def _as_meta(controller: Controller) -> dict:
+    gains = {name: values.tolist() for name, values in controller.gains.items() if np.isfinite(values).all()}
+    return {"type": controller.kind, "rate_hz": controller.rate_hz, **gains}
+
+
+def _run(path: Path, meta: Meta) -> Run:
+    columns = _rename(path, READERS[path.suffix](path), meta)
+    time = columns.pop("t")
+    if len(time) < 2:
+        raise ValueError(f"{path}: got {len(time)} row(s), expected 2 or more")
+    for name, values in {"t": time, **columns}.items():
+        _first(path, name, values, ~np.isfinite(values), "a finite number")
+    late = np.append(False, np.diff(time) <= 0)
+    _first(path, "t", time, late, lambda row: f"more than {time[row - 1]!r} in the row before")
+    rate = 1.0 / np.median(np.diff(time))
+    if not 1 / _RATE_RATIO <= rate / meta.rate_hz <= _RATE_RATIO:
+        raise ValueError(f"{path}, column 't': got {rate:.6g} rows a second, expected rate_hz, {meta.rate_hz:g}")
+    signals = {}
+    for signal in (*JOINT_SIGNALS, *VECTOR_SIGNALS, *SCALAR_SIGNALS):
+        names = column_names(signal, meta.joints)
+        there = [name for name in names if name in columns]
+        if not there:
+            continue
+        for name in names:
+            if name not in columns:
+                raise ValueError(f"{path}, column '{name}': is missing, where '{there[0]}' is there")
+        values = [columns.pop(name) for name in names]
+        for name, one in zip(names, values, strict=True):
+            _check_values(path, signal, name, one)
+        signals[signal] = np.stack(values, axis=1) if len(names) > 1 or "." in names[0] else values[0]
+    if "q" not in signals:
+        raise ValueError(f"{path}, column '{column_names('q', meta.joints)[0]}': is missing")
+    if not {"target", "tau"} & set(signals):
+        raise ValueError(f"{path}: there is neither '{column_names('target', meta.joints)[0]}' nor 'tau'")
+    for signal in ("gravity", "quat"):
+        if signal in signals:
+            norm = np.linalg.norm(signals[signal], axis=1)
+            _first(path, f"{signal}.*", norm, abs(norm - 1) > _UNIT_NORM, "a vector of length one")
+    sign = np.array([meta.signs[joint] for joint in meta.joints])
+    for signal, factor in {"q": meta.angle, "dq": meta.angle, "target": meta.angle, "tau": meta.torque}.items():
+        if signal in signals:
+            signals[signal] = signals[signal] * factor * sign
+    said = meta.runs.get(path.stem, {"controller": meta.controller})
+    return Run(
+        name=path.stem,
+        condition=said.get("condition", path.stem),
+        split=said.get("split"),
+        controller=said["controller"],
+        time=time,
+        signals=signals,
+        other=columns,
+    )
+
+
+def _rename(path: Path, columns: dict[str, np.ndarray], meta: Meta) -> dict[str, np.ndarray]:
+    """Foreign names to ours."""
+    for ours, theirs in meta.columns.items():
+        if theirs not in columns:
+            raise ValueError(f"{path}, column '{theirs}': is missing, and {meta.path} calls it '{ours}'")
+        if ours in columns and ours != theirs:
+            raise ValueError(f"{path}, column '{ours}': is there, and {meta.path} calls '{theirs}' so")
+    foreign = {theirs: ours for ours, theirs in meta.columns.items()}
+    columns = {foreign.get(name, name): values for name, values in columns.items()}
+    if "t" not in columns:
+        raise ValueError(f"{path}, column 't': is missing")
+    for name in columns:
+        prefix = name.partition(".")[0]
+        ours = prefix in (*JOINT_SIGNALS, *VECTOR_SIGNALS) and "." in name
+        if ours and name not in meta.known:
+            expected = ", ".join(column_names(prefix, meta.joints))
+            raise ValueError(f"{path}, column '{name}': is not known; expected {expected}")
+    return columns
+
+
+def _check_values(path: Path, signal: str, name: str, values: np.ndarray) -> None:
+    if signal in ("enabled", "contact"):
+        _first(path, name, values, (values != 0) & (values != 1), "0 or 1")
+    elif signal == "phase":
+        _first(path, name, values, (values < 0) | (values > 1), "0 to 1 cycle")
+    elif signal == "volts":
+        _first(path, name, values, values < 0, "a number that is not negative")
+
+
+def _first(path: Path, name: str, values: np.ndarray, bad: np.ndarray, expected) -> None:
+    """Refuses the first row that is bad."""
+    if bad.any():
+        row = int(np.argmax(bad))
+        wanted = expected(row) if callable(expected) else expected
+        raise ValueError(f"{path}, row {row + 1}, column '{name}': got {float(values[row])!r}, expected {wanted}")

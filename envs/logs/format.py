@@ -1,0 +1,100 @@
+"""What a log is: names of signals and controllers, runs, splits."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+JOINT_SIGNALS = ("q", "dq", "target", "tau", "action")
+"""Signals with a column for every joint."""
+
+VECTOR_SIGNALS = {
+    "phase": ("left", "right"),
+    "gyro": ("x", "y", "z"),
+    "acc": ("x", "y", "z"),
+    "gravity": ("x", "y", "z"),
+    "vel": ("x", "y", "z"),
+    "cmd": ("x", "y", "yaw"),
+    "contact": ("left", "right"),
+    "pos": ("x", "y", "z"),
+    "quat": ("w", "x", "y", "z"),
+}
+"""Signals with a column for every component."""
+
+SCALAR_SIGNALS = ("enabled", "volts")
+SPLITS = ("train", "select", "sealed")
+GAINS = {"pd": ("kp", "kd", "torque_limit_nm"), "servo": ("gain", "kt", "resistance_ohm")}
+"""Numbers of a controller by type, each one for all joints or one per joint."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Controller:
+    """What turns targets into torques."""
+
+    kind: str
+    """pd: torque = kp (target - q) - kd dq, limited. servo: duty = gain (target - q), limited to +-1, feeds a motor."""
+    rate_hz: float
+    gains: Mapping[str, np.ndarray]
+    """[joints] by name, the names of `GAINS`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Run:
+    """One continuous recording."""
+
+    name: str
+    condition: str
+    """What it has in common with other runs; its own name where nothing was said."""
+    split: str | None
+    """train, select or sealed, where the log says so."""
+    controller: Controller
+    time: np.ndarray
+    """[rows] s, strictly increasing."""
+    signals: Mapping[str, np.ndarray]
+    """[rows], [rows, joints] or [rows, components] by the name of the signal; those that were recorded."""
+    other: Mapping[str, np.ndarray] = field(default_factory=dict)
+    """Columns that the format does not know, [rows] by name, as they are."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Log:
+    """Runs of one robot."""
+
+    robot: str
+    """A built-in model, or the path of an MJCF file."""
+    base: str
+    """fixed or free."""
+    rate_hz: float
+    joints: tuple[str, ...]
+    policy: Mapping[str, Any] | None
+    runs: tuple[Run, ...]
+
+
+def splits(log: Log) -> dict[str, tuple[Run, ...]]:
+    """Runs by split. Runs without one go by condition, about a quarter each to `select` and `sealed`.
+
+    Raises:
+      ValueError: a split would be empty.
+    """
+    said = {run.condition: run.split for run in log.runs if run.split is not None}
+    open_conditions = sorted({run.condition for run in log.runs} - set(said))
+    held = max(1, round(len(open_conditions) / 4))
+    # Evenly spread over the sorted conditions, which often are steps of one quantity.
+    for index, condition in enumerate(open_conditions):
+        turn = index % max(len(open_conditions) // held, 1)
+        said[condition] = {1: "select", 2: "sealed"}.get(turn, "train")
+    chosen = {split: tuple(run for run in log.runs if (run.split or said[run.condition]) == split) for split in SPLITS}
+    for split, runs in chosen.items():
+        if not runs:
+            raise ValueError(
+                f"runs: no run is left for '{split}'; got {len(log.runs)} run(s) of conditions "
+                f"{', '.join(sorted({run.condition for run in log.runs}))}, expected three conditions or more"
+            )
+    return chosen
+
+
+def column_names(signal: str, joints: Sequence[str]) -> list[str]:
+    """Columns of a signal, in the order of its last axis."""
+    parts = joints if signal in JOINT_SIGNALS else VECTOR_SIGNALS.get(signal)
+    return [signal] if parts is None else [f"{signal}.{part}" for part in parts]

@@ -1,0 +1,170 @@
+"""`meta.yaml`, checked key by key."""
+
+import difflib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from envs.logs.format import (
+    GAINS,
+    JOINT_SIGNALS,
+    SCALAR_SIGNALS,
+    SPLITS,
+    VECTOR_SIGNALS,
+    Controller,
+    column_names,
+)
+
+_ANGLE = {"rad": 1.0, "deg": np.pi / 180.0}
+_TORQUE = {"Nm": 1.0, "mNm": 1e-3}
+_META = {
+    "robot": True,
+    "base": True,
+    "rate_hz": True,
+    "joints": True,
+    "controller": True,
+    "units": False,
+    "sign": False,
+    "columns": False,
+    "policy": False,
+    "runs": False,
+}  # key: whether it must be there
+
+
+class _Loader(yaml.SafeLoader):
+    """YAML in which no key comes twice; the safe loader keeps the last one in silence."""
+
+    def construct_mapping(self, node, deep=False):
+        keys = [self.construct_object(key, deep=True) for key, _ in node.value]
+        for key in keys:
+            if keys.count(key) > 1:
+                raise yaml.constructor.ConstructorError(None, None, f"key '{key}' is there twice", node.start_mark)
+        return super().construct_mapping(node, deep)
+
+
+class Meta:
+    """What `meta.yaml` of a folder says."""
+
+    def __init__(self, folder: Path, robots: Sequence[str]):
+        self.path = folder / "meta.yaml"
+        if not self.path.is_file():
+            raise ValueError(f"{self.path}: there is no such file")
+        try:
+            meta = yaml.load(self.path.read_text(encoding="utf-8"), _Loader)
+        except (yaml.YAMLError, UnicodeDecodeError, TypeError, RecursionError) as error:
+            raise ValueError(f"{self.path}: {error}") from error
+        meta = self._mapping("", meta, _META)
+        self.robot = self._robot(folder, self._text("robot", meta["robot"]), robots)
+        self.base = self._one_of("base", meta["base"], ("fixed", "free"))
+        self.rate_hz = self._number("rate_hz", meta["rate_hz"], positive=True)
+        self.joints = self._names("joints", meta["joints"])
+        self.signs = dict.fromkeys(self.joints, 1.0)
+        for joint, sign in self._mapping("sign", meta.get("sign"), dict.fromkeys(self.joints)).items():
+            self.signs[joint] = float(self._one_of(f"sign.{joint}", sign, (1, -1)))
+        units = self._mapping("units", meta.get("units"), {"angle": False, "torque": False})
+        self.angle = _ANGLE[self._one_of("units.angle", units.get("angle", "rad"), _ANGLE)]
+        self.torque = _TORQUE[self._one_of("units.torque", units.get("torque", "Nm"), _TORQUE)]
+        self.known = {"t": None, **dict.fromkeys(self._all_columns())}
+        self.columns = {
+            ours: self._text(f"columns.{ours}", theirs)
+            for ours, theirs in self._mapping("columns", meta.get("columns"), self.known).items()
+        }
+        if len(set(self.columns.values())) < len(self.columns):
+            self._refuse("columns", self.columns, "theirs that differ")
+        policy = {"rate_hz": False, "action_scale": False, "base": False}
+        self.policy = self._mapping("policy", meta["policy"], policy) if meta.get("policy") is not None else None
+        self._controller = meta["controller"]
+        self.controller = self._read_controller("controller", self._controller)
+        runs = meta.get("runs")
+        names = dict.fromkeys(runs if isinstance(runs, dict) else ())
+        self.runs = {name: self._read_run(name, entry) for name, entry in self._mapping("runs", runs, names).items()}
+
+    def _all_columns(self) -> list[str]:
+        signals = (*JOINT_SIGNALS, *VECTOR_SIGNALS, *SCALAR_SIGNALS)
+        return [name for signal in signals for name in column_names(signal, self.joints)]
+
+    def _read_run(self, name: str, entry: Any) -> dict:
+        where = f"runs.{name}"
+        entry = self._mapping(where, entry, {"condition": False, "split": False, "controller": False})
+        read = {"controller": self.controller}
+        if "condition" in entry:
+            read["condition"] = self._text(f"{where}.condition", entry["condition"])
+        if "split" in entry:
+            read["split"] = self._one_of(f"{where}.split", entry["split"], SPLITS)
+        if "controller" in entry:
+            override = self._mapping(f"{where}.controller", entry["controller"], None)
+            read["controller"] = self._read_controller(f"{where}.controller", {**self._controller, **override})
+        return read
+
+    def _read_controller(self, where: str, entry: Any) -> Controller:
+        entry = self._mapping(where, entry, None)
+        kind = self._one_of(f"{where}.type", entry.get("type"), GAINS)
+        self._mapping(where, entry, {"type": True, "rate_hz": True} | {n: n != "torque_limit_nm" for n in GAINS[kind]})
+        gains = {name: self._gain(f"{where}.{name}", entry.get(name, np.inf), name) for name in GAINS[kind]}
+        rate = self._number(f"{where}.rate_hz", entry["rate_hz"], positive=True)
+        return Controller(kind=kind, rate_hz=rate, gains=gains)
+
+    def _gain(self, where: str, value: Any, name: str) -> np.ndarray:
+        if name == "torque_limit_nm" and value is np.inf:
+            return np.full(len(self.joints), np.inf)
+        values = value if isinstance(value, list) else [value] * len(self.joints)
+        if len(values) != len(self.joints):
+            self._refuse(where, value, f"one number or {len(self.joints)}, one per joint")
+        positive = name not in ("kp", "kd")
+        return np.array([self._number(where, one, positive=positive, negative=False) for one in values])
+
+    def _robot(self, folder: Path, name: str, robots: Sequence[str]) -> str:
+        if name in robots:
+            return name
+        path = folder / name
+        if not path.is_file():
+            self._refuse("robot", name, f"{', '.join(robots)}, or the path of an MJCF file, relative to {folder}")
+        return str(path.resolve())
+
+    def _names(self, where: str, value: Any) -> tuple[str, ...]:
+        if not isinstance(value, list) or not value:
+            self._refuse(where, value, "a list of names")
+        names = tuple(self._text(where, name) for name in value)
+        if len(set(names)) != len(names):
+            self._refuse(where, value, "names that differ")
+        return names
+
+    def _mapping(self, where: str, value: Any, keys: Mapping[str, bool | None] | None) -> dict:
+        """A mapping with these keys and no others; those that are True must be there."""
+        value = {} if value is None and where else value
+        if not isinstance(value, dict):
+            self._refuse(where or "the file", value, "a mapping")
+        if keys is not None:
+            for key in value:
+                if key not in keys:
+                    near = difflib.get_close_matches(str(key), keys, n=1)
+                    hint = f"; did you mean '{near[0]}'?" if near else f"; expected some of {', '.join(keys)}"
+                    raise ValueError(f"{self.path}: {where + '.' if where else ''}{key}: there is no such key{hint}")
+            for key, needed in keys.items():
+                if needed and value.get(key) is None:
+                    raise ValueError(f"{self.path}: {where + '.' if where else ''}{key}: is missing")
+        return value
+
+    def _text(self, where: str, value: Any) -> str:
+        if not isinstance(value, str) or not value:
+            self._refuse(where, value, "a text")
+        return value
+
+    def _number(self, where: str, value: Any, *, positive: bool = False, negative: bool = True) -> float:
+        wanted = "a positive number" if positive else "a number" if negative else "a number that is not negative"
+        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < float("inf"):
+            self._refuse(where, value, wanted)
+        if (positive and value <= 0) or (not negative and value < 0):
+            self._refuse(where, value, wanted)
+        return float(value)
+
+    def _one_of(self, where: str, value: Any, allowed) -> Any:
+        if isinstance(value, list | dict | bool) or value not in allowed:
+            self._refuse(where, value, f"one of {', '.join(map(str, allowed))}")
+        return value
+
+    def _refuse(self, where: str, value: Any, wanted: str):
+        raise ValueError(f"{self.path}: {where}: got {value!r}, expected {wanted}")

@@ -1,0 +1,78 @@
+"""Columns of numbers from files: every cell a number, or its file, row and column in the error."""
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pyarrow
+import pyarrow.csv
+
+
+def _read_csv(path: Path) -> dict[str, np.ndarray]:
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            names = next(csv.reader(file, strict=True), [])
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise ValueError(f"{path}: {error}") from error
+    for name in names:
+        if not name or names.count(name) > 1:
+            raise ValueError(f"{path}, column '{name}': expected a name that is there once")
+    if not names:
+        raise ValueError(f"{path}: is empty")
+    options = pyarrow.csv.ConvertOptions(
+        column_types=dict.fromkeys(names, pyarrow.float64()), null_values=[], strings_can_be_null=False
+    )
+    try:
+        table = pyarrow.csv.read_csv(path, convert_options=options)
+    except pyarrow.ArrowInvalid as error:
+        return _read_csv_by_row(path, names, error)
+    return {name: table[name].to_numpy() for name in names}
+
+
+def _read_csv_by_row(path: Path, names: list[str], error: Exception) -> dict[str, np.ndarray]:
+    """Slower, and knows the row and column of what is wrong."""
+    rows = []
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            reader = csv.reader(file, strict=True)
+            next(reader)
+            for cells in filter(None, reader):
+                if len(cells) != len(names):
+                    raise ValueError(
+                        f"{path}, row {len(rows) + 1}: got {len(cells)} cells, expected {len(names)}"
+                    ) from error
+                rows.append([_cell(path, len(rows) + 1, *pair) for pair in zip(names, cells, strict=True)])
+    except (UnicodeDecodeError, csv.Error) as worse:
+        raise ValueError(f"{path}, row {len(rows) + 1}: {worse}") from worse
+    table = np.array(rows, float).reshape(len(rows), len(names))
+    return dict(zip(names, table.T, strict=True))
+
+
+def _cell(path: Path, row: int, name: str, text: str) -> float:
+    try:
+        if "_" in text:  # Python's own thousands separator
+            raise ValueError
+        return float(text)
+    except ValueError:
+        raise ValueError(f"{path}, row {row}, column '{name}': got '{text}', expected a number") from None
+
+
+def _read_npz(path: Path) -> dict[str, np.ndarray]:
+    try:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+            columns = {name: arrays[name] for name in arrays.files}
+    except Exception as error:  # a damaged archive fails in many ways
+        raise ValueError(f"{path}: {type(error).__name__}: {error}") from error
+    for name, values in columns.items():
+        if values.ndim != 1 or values.dtype.kind not in "fiub":
+            raise ValueError(
+                f"{path}, column '{name}': got shape {values.shape} of {values.dtype}, expected one row of numbers"
+            )
+        expected = len(next(iter(columns.values())))
+        if len(values) != expected:
+            raise ValueError(f"{path}, column '{name}': got {len(values)} rows, expected {expected}")
+    return {name: values.astype(float) for name, values in columns.items()}
+
+
+READERS = {".csv": _read_csv, ".npz": _read_npz}
+"""Readers by suffix: path to columns [rows] by name."""

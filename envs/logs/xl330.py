@@ -1,0 +1,89 @@
+"""Runs of a Dynamixel XL330 that turns a pendulum, as github.com/Rhoban/bam records them."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from envs.logs.format import Controller, Log, Run
+
+KT, RESISTANCE_OHM = 0.38, 3.6  # Nm/A, Ohm: the published Coulomb-viscous fit
+SPLIT_OF_GAIN = {100: "train", 800: "train", 200: "select", 400: "sealed"}
+"""By the firmware's gain: sealed lies within what was trained on."""
+
+_MASS_KG, _LENGTH_M = 0.49, 0.1
+_COUNTS_PER_RAD = 4096 / (2 * np.pi)
+_FIRMWARE_GAIN = 1 / (256 * 885)  # duty per count and unit of gain
+_RATE_HZ = 200.0  # 185 to 250 rows a second
+_FIRMWARE_HZ = 1000.0
+_SIGNALS = {
+    "q": "position",
+    "dq": "speed",
+    "target": "goal_position",
+    "enabled": "torque_enable",
+    "volts": "input_volts",
+}
+_OTHER = ("load", "temp")
+
+
+def read_xl330(folder: Path) -> Log:
+    """Reads a folder of these JSON files as a log of the `pendulum`; a firmware gain is a condition.
+
+    Raises:
+      ValueError: names the file, the row and the key that is missing, no number, or other than expected.
+    """
+    paths = sorted(Path(folder).glob("*.json"))
+    if not paths:
+        raise ValueError(f"{folder}: no *.json files")
+    return Log(
+        robot="pendulum",
+        base="fixed",
+        rate_hz=_RATE_HZ,
+        joints=("hinge",),
+        policy=None,
+        runs=tuple(map(_run, paths)),
+    )
+
+
+def _run(path: Path) -> Run:
+    try:
+        recording = json.loads(path.read_text(encoding="utf-8"))
+        gain, trajectory, entries = (recording[key] for key in ("kp", "trajectory", "entries"))
+        for key, expected in {"mass": _MASS_KG, "length": _LENGTH_M}.items():
+            if recording[key] != expected:
+                raise ValueError(f"{path}: {key}: got {recording[key]!r}, expected {expected}")
+    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError) as error:
+        raise ValueError(f"{path}: {type(error).__name__}: {error}") from error
+    columns = {key: _column(path, entries, key) for key in ("timestamp", *_SIGNALS.values(), *_OTHER)}
+    late = np.flatnonzero(np.diff(columns["timestamp"]) <= 0)
+    if len(late):
+        raise ValueError(f"{path}, row {late[0] + 2}, key 'timestamp': expected more than in the row before")
+    per_joint = ("q", "dq", "target")
+    return Run(
+        name=f"run_kp{gain}_{trajectory}",
+        condition=f"kp{gain}",
+        split=SPLIT_OF_GAIN.get(gain),
+        controller=Controller(
+            kind="servo",
+            rate_hz=_FIRMWARE_HZ,
+            gains={
+                "gain": np.array([_COUNTS_PER_RAD * _FIRMWARE_GAIN * gain]),
+                "kt": np.array([KT]),
+                "resistance_ohm": np.array([RESISTANCE_OHM]),
+            },
+        ),
+        time=columns["timestamp"],
+        signals={
+            ours: columns[theirs][:, None] if ours in per_joint else columns[theirs]
+            for ours, theirs in _SIGNALS.items()
+        },
+        other={key: columns[key] for key in _OTHER},
+    )
+
+
+def _column(path: Path, entries: list, key: str) -> np.ndarray:
+    for row, entry in enumerate(entries, start=1):
+        value = entry.get(key)
+        if not isinstance(value, int | float) or not np.isfinite(value):
+            raise ValueError(f"{path}, row {row}, key '{key}': got {value!r}, expected a finite number")
+    return np.array([entry[key] for entry in entries], float)
