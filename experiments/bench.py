@@ -92,7 +92,7 @@ def targets(args: Args) -> dict:
 
 
 def alarm(args: Args) -> dict:
-    """First gate calls with the target outside the radius, at its edge and drawn within it."""
+    """First gate calls with the target outside the radius, at its centre and drawn within it."""
     sizes = preset(args.preset)
     loop = Loop(sizes, chosen("legs6"))
     policy = starting_policy(args.policy, loop)

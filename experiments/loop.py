@@ -144,4 +144,8 @@ class Loop:
 
     def act(self, policy: Policy) -> Act:
         """What the policy does, without noise."""
-        return self._ppo.act(policy.learner)
+        # A pytree: who compiles a program that asks it need not do so again for the next learner.
+        return jax.tree_util.Partial(self._act, policy.learner)
+
+    def _act(self, learner: PPOState, obs: jax.Array, key: jax.Array):
+        return self._ppo.act(learner)(obs, key)

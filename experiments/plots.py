@@ -24,7 +24,7 @@ def training(path: Path, curve: Sequence[dict]) -> None:
         "share": {
             "linear tracking": "linear_tracking",
             "angular tracking": "angular_tracking",
-            "feet against the clock": "clock_contact",
+            "feet against the clock (of 2)": "clock_contact",
         },
         "episode ends per 20 s": {"ends": "done"},
     }

@@ -36,17 +36,17 @@ from jaxtune.types import ParamDist, Verdict
 class Case:
     """How the target differs from the simulator."""
 
-    off: Callable[[str], bool] = lambda name: False
+    scaled: Callable[[str], bool] = lambda name: False
     """Which of the tuned parameters the target has otherwise: the nominal ones divided by `start`."""
     hidden: Mapping[str, float] = field(default_factory=dict)
-    """What else it has otherwise, and nobody tunes."""
+    """What else it has otherwise; nobody tunes it but who asks for it."""
     target: str = "mjx"
     """Its engine."""
 
 
 CASES = {
-    "friction": Case(off=lambda name: name == "foot_friction"),
-    "mass": Case(off=lambda name: name.endswith("_mass")),
+    "friction": Case(scaled=lambda name: name == "foot_friction"),
+    "mass": Case(scaled=lambda name: name.endswith("_mass")),
     "bullet": Case(target="bullet"),
     "weak_motor": Case(hidden={"torque_scale": 0.75}, target="bullet"),
     "weaker_motor": Case(hidden={"torque_scale": 0.6}, target="bullet"),
@@ -140,14 +140,17 @@ def check(args: Args) -> tuple[Preset, dict[str, domain.Entry], tuner.Knobs]:
         for value in asked if isinstance(asked, tuple) else (asked,):
             if value is not None and value not in values:
                 raise ValueError(f"{option}: got '{value}', expected one of {', '.join(values)}")
+    if not args.methods:
+        raise ValueError(f"methods: got none, expected some of {', '.join(allowed['methods'])}")
     case = CASES[args.case]
-    if not case.hidden and engine(args) == "mjx" and not any(map(case.off, entries)):
+    about_parameters = case.target == "mjx" or (engine(args) == "mjx" and not case.hidden)
+    if about_parameters and not off(args, entries):
         raise ValueError(f"parameters: got '{args.parameters}', but case '{args.case}' needs one that it is about")
     for option in ("start", "radius", "dr_radius", "seeds"):
         value = getattr(args, option)
         if not 0 < value < float("inf"):
             raise ValueError(f"{option}: got {value}, expected a positive, finite number")
-    for name in filter(case.off, entries):
+    for name in filter(case.scaled, entries):
         low, high = entries[name].bounds
         if not low <= 1.0 / args.start <= high:
             raise ValueError(f"start: got {args.start}, expected {1 / high:g} to {1 / low:g} ({name}'s bounds)")
@@ -157,10 +160,16 @@ def check(args: Args) -> tuple[Preset, dict[str, domain.Entry], tuner.Knobs]:
     return sizes, entries, knobs
 
 
-def true_params(args, loop: Loop) -> dict[str, float]:
+def true_params(args, entries: Mapping[str, domain.Entry]) -> dict[str, float]:
     """What the target has."""
-    case, nominal = CASES[args.case], domain.nominal(loop.entries)
-    return {name: value / args.start if case.off(name) else value for name, value in nominal.items()} | case.hidden
+    case, nominal = CASES[args.case], domain.nominal(entries)
+    return {name: value / args.start if case.scaled(name) else value for name, value in nominal.items()} | case.hidden
+
+
+def off(args, entries: Mapping[str, domain.Entry]) -> tuple[str, ...]:
+    """Which of the tuned parameters the target has otherwise."""
+    case = CASES[args.case]
+    return tuple(name for name in entries if case.scaled(name) or name in case.hidden)
 
 
 def engine(args) -> str:
@@ -170,7 +179,7 @@ def engine(args) -> str:
 
 def make_target(args, loop: Loop) -> Target:
     """The target of a case."""
-    return TARGETS[engine(args)](loop.robot, true_params(args, loop))
+    return TARGETS[engine(args)](loop.robot, true_params(args, loop.entries))
 
 
 class Runner:
@@ -266,19 +275,19 @@ def main(args: Args) -> None:
     identity = {**dataclasses.asdict(args), "sizes": sizes}
     for option in ("out", "methods", "seeds"):
         del identity[option]
-    hidden = domain.select(constants.ENTRIES, tuple(CASES[args.case].hidden))
+    hidden = domain.select(constants.ENTRIES, [name for name in CASES[args.case].hidden if name not in entries])
     loop = Loop(sizes, entries, hidden)
     checkpoint.open_run(args.out, identity)
     target = make_target(args, loop)
     runner = Runner(args, loop, target, starting_policy(args.policy, loop, args.out), knobs)
     with bars() as progress:
         results = {name: [runner(name, seed, progress) for seed in range(args.seeds)] for name in args.methods}
-    summary = report.sim2sim(args, results, tuple(filter(CASES[args.case].off, entries)))
+    summary = report.sim2sim(args, results, off(args, entries))
     write_json(args.out / "summary.json", summary | {"versions": checkpoint.versions()})
     # What was logged as it came may hold lines of a run that was cut and started again.
     lines = [line for runs in results.values() for result in runs for line in result["lines"]]
     (args.out / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
-    plots.sim2sim(args.out, results, tuple(filter(CASES[args.case].off, entries)), sizes.epochs)
+    plots.sim2sim(args.out, results, off(args, entries), sizes.epochs)
     report.print_sim2sim(console, summary, results)
 
 

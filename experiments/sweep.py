@@ -22,9 +22,9 @@ from envs.targets.mjx import MjxTarget
 from experiments import checkpoint, plots
 from experiments.config import chosen, preset
 from experiments.loop import Loop, Policy
-from experiments.sim2sim import CASES, engine, true_params
 from experiments.sim2sim import Args as TuningArgs
 from experiments.sim2sim import check as check_tuning
+from experiments.sim2sim import engine, off, true_params
 from experiments.train import console, run, starting_policy
 from jaxtune import dist as dists
 from jaxtune import tuner
@@ -86,7 +86,7 @@ def lanes(args: Args) -> np.ndarray:
 
 def program(args: Args, loop: Loop, policy: Policy):
     """The sweep as one function of its lanes [lanes, 5]; returns state and info, [lanes, ...]."""
-    target = MjxTarget(robot=loop.robot, params=true_params(args, loop))
+    target = MjxTarget(robot=loop.robot, params=true_params(args, loop.entries))
     fixed = dataclasses.replace(
         loop.tuner(target),
         train_policy=lambda key, policy, dist: (policy, {}),
@@ -126,8 +126,8 @@ def main(args: Args) -> None:
     dist, info = jax.block_until_ready(sweep(jnp.asarray(grid.reshape(-1, grid.shape[-1]))))
     seconds = time.monotonic() - begin
 
-    off = tuple(filter(CASES[args.case].off, entries))
-    final = errors(loop, true_params(args, loop), dist.centre, off).reshape(grid.shape[:-1])
+    astray = off(args, entries)
+    final = errors(loop, true_params(args, loop.entries), dist.centre, astray).reshape(grid.shape[:-1])
     calls = np.asarray(info.calls).sum(axis=-1).reshape(grid.shape[:-1])
     names = ("step_size", "widen_factor", "radius", "level")
     rows = [
@@ -144,7 +144,7 @@ def main(args: Args) -> None:
             "case": args.case,
             "start": args.start,
             "preset": args.preset,
-            "off": off,
+            "off": astray,
             "lanes": grid[..., 0].size,
             "rows": rows,
             "params": dists.names(dist),

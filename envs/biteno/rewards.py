@@ -9,7 +9,7 @@ Table I's weights score a walk; they do not make one. What is trained differs in
 size of its own: Raibert's term weighs more and the action rate less (`constants.WALKING`), actions are added to
 Raibert's reference (`TaskConfig.base`), feet that leave the clock cost (`shaping`, `constants.SHAPING`), and the robot
 is pushed (`TaskConfig.push_mps`). With the clock's term a walk lands once a step, where without it it lands one and a
-half times; what is trained with pushes does not fall under them.
+half times; what is trained with pushes hardly falls under them.
 """
 
 from collections.abc import Mapping
@@ -66,7 +66,7 @@ def shaping(*, foot_force: jax.Array, phase: jax.Array) -> dict[str, jax.Array]:
     """Terms beside Table I that shape learning and are never scored, each a scalar without weight or time step.
 
     `clock_contact` is the share by which floor and clock disagree, summed over the feet: a foot that touches in its
-    swing, or hangs or bounces in its stance. Without it a walk that lands twice a step earns as much.
+    swing, or hangs or bounces in its stance. Without it a walk that bounces when it lands earns as much.
 
     Args:
       foot_force: [2, 3] N, of the floor on each foot.

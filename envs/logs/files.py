@@ -1,6 +1,5 @@
 """Logs in and out."""
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +7,7 @@ import pyarrow
 import pyarrow.csv
 import yaml
 
+from envs.biteno.constants import JOINTS
 from envs.logs.format import (
     JOINT_SIGNALS,
     SCALAR_SIGNALS,
@@ -18,25 +18,30 @@ from envs.logs.format import (
     column_names,
 )
 from envs.logs.meta import Meta
-from envs.logs.tables import READERS
+from envs.logs.tables import READERS, check_time, check_values, refuse_first
+
+ROBOTS = {"biteno": JOINTS, "pendulum": ("hinge",)}
+"""Joints of the built-in models; any other robot is the path of an MJCF file, relative to the folder."""
 
 _UNIT_NORM = 0.05  # how far a unit vector may be from one
 _RATE_RATIO = 2.0  # between nominal and recorded rate
 
 
-def read(folder: Path, robots: Sequence[str] = ("biteno", "pendulum")) -> Log:
+def read(folder: Path) -> Log:
     """Reads a log.
 
     Args:
       folder: of meta.yaml and the runs.
-      robots: names of built-in models; any other is the path of an MJCF file, relative to the folder.
 
     Raises:
       ValueError: names the file, the row (of data, from 1) or the key, what was found and what was expected.
     """
     folder = Path(folder)
-    meta = Meta(folder, robots)
-    paths = sorted(path for path in folder.glob("run_*") if path.suffix in READERS)
+    meta = Meta(folder, ROBOTS)
+    paths = sorted(folder.glob("run_*"))
+    for path in paths:
+        if path.suffix not in READERS or not path.is_file():
+            raise ValueError(f"{path}: expected a file that ends in one of {', '.join(READERS)}")
     stems = [path.stem for path in paths]
     if not paths:
         raise ValueError(f"{folder}: no runs; expected run_*.csv or run_*.npz")
@@ -60,11 +65,15 @@ def write(log: Log, folder: Path, suffix: str = ".csv") -> None:
     """Writes a log in our units and names; `read` gives it back.
 
     Raises:
-      ValueError: the folder holds something already, or the suffix is none of ours.
+      ValueError: the folder holds something already, the suffix is none of ours, or a run's name does not begin with
+        `run_`.
     """
     folder = Path(folder)
     if suffix not in READERS:
         raise ValueError(f"suffix: got '{suffix}', expected one of {', '.join(READERS)}")
+    for run in log.runs:
+        if not run.name.startswith("run_"):
+            raise ValueError(f"runs: got '{run.name}', expected a name that begins with 'run_'")
     if folder.exists() and any(folder.iterdir()):
         raise ValueError(f"{folder}: expected an empty folder")
     folder.mkdir(parents=True, exist_ok=True)
@@ -98,42 +107,18 @@ def _as_meta(controller: Controller) -> dict:
 
 
 def _run(path: Path, meta: Meta) -> Run:
-    columns = _rename(path, READERS[path.suffix](path), meta)
+    columns = READERS[path.suffix](path)
+    for name, values in columns.items():
+        refuse_first(path, name, values, ~np.isfinite(values), "a finite number")
+    columns = _rename(path, columns, meta)
     time = columns.pop("t")
     if len(time) < 2:
         raise ValueError(f"{path}: got {len(time)} row(s), expected 2 or more")
-    for name, values in {"t": time, **columns}.items():
-        _first(path, name, values, ~np.isfinite(values), "a finite number")
-    late = np.append(False, np.diff(time) <= 0)
-    _first(path, "t", time, late, lambda row: f"more than {time[row - 1]!r} in the row before")
+    check_time(path, meta.columns.get("t", "t"), time)
     rate = 1.0 / np.median(np.diff(time))
     if not 1 / _RATE_RATIO <= rate / meta.rate_hz <= _RATE_RATIO:
         raise ValueError(f"{path}, column 't': got {rate:.6g} rows a second, expected rate_hz, {meta.rate_hz:g}")
-    signals = {}
-    for signal in (*JOINT_SIGNALS, *VECTOR_SIGNALS, *SCALAR_SIGNALS):
-        names = column_names(signal, meta.joints)
-        there = [name for name in names if name in columns]
-        if not there:
-            continue
-        for name in names:
-            if name not in columns:
-                raise ValueError(f"{path}, column '{name}': is missing, where '{there[0]}' is there")
-        values = [columns.pop(name) for name in names]
-        for name, one in zip(names, values, strict=True):
-            _check_values(path, signal, name, one)
-        signals[signal] = np.stack(values, axis=1) if len(names) > 1 or "." in names[0] else values[0]
-    if "q" not in signals:
-        raise ValueError(f"{path}, column '{column_names('q', meta.joints)[0]}': is missing")
-    if not {"target", "tau"} & set(signals):
-        raise ValueError(f"{path}: there is neither '{column_names('target', meta.joints)[0]}' nor 'tau'")
-    for signal in ("gravity", "quat"):
-        if signal in signals:
-            norm = np.linalg.norm(signals[signal], axis=1)
-            _first(path, f"{signal}.*", norm, abs(norm - 1) > _UNIT_NORM, "a vector of length one")
-    sign = np.array([meta.signs[joint] for joint in meta.joints])
-    for signal, factor in {"q": meta.angle, "dq": meta.angle, "target": meta.angle, "tau": meta.torque}.items():
-        if signal in signals:
-            signals[signal] = signals[signal] * factor * sign
+    signals = _signals(path, columns, meta)
     said = meta.runs.get(path.stem, {"controller": meta.controller})
     return Run(
         name=path.stem,
@@ -146,12 +131,42 @@ def _run(path: Path, meta: Meta) -> Run:
     )
 
 
+def _signals(path: Path, columns: dict[str, np.ndarray], meta: Meta) -> dict[str, np.ndarray]:
+    """Takes the signals out of the columns, in our units."""
+    signals = {}
+    for signal in (*JOINT_SIGNALS, *VECTOR_SIGNALS, *SCALAR_SIGNALS):
+        names = column_names(signal, meta.joints)
+        there = [name for name in names if name in columns]
+        if not there:
+            continue
+        for name in names:
+            if name not in columns:
+                raise ValueError(f"{path}, column '{name}': is missing, where '{there[0]}' is there")
+        values = [columns.pop(name) for name in names]
+        for name, one in zip(names, values, strict=True):
+            check_values(path, signal, meta.columns.get(name, name), one)
+        signals[signal] = np.stack(values, axis=1) if len(names) > 1 or "." in names[0] else values[0]
+    if "q" not in signals:
+        raise ValueError(f"{path}, column '{column_names('q', meta.joints)[0]}': is missing")
+    if not {"target", "tau"} & set(signals):
+        raise ValueError(f"{path}: there is neither '{column_names('target', meta.joints)[0]}' nor 'tau'")
+    for signal in ("gravity", "quat"):
+        if signal in signals:
+            norm = np.linalg.norm(signals[signal], axis=1)
+            refuse_first(path, f"{signal}.*", norm, abs(norm - 1) > _UNIT_NORM, "a vector of length one")
+    sign = np.array([meta.signs[joint] for joint in meta.joints])
+    for signal, factor in {"q": meta.angle, "dq": meta.angle, "target": meta.angle, "tau": meta.torque}.items():
+        if signal in signals:
+            signals[signal] = signals[signal] * factor * sign
+    return signals
+
+
 def _rename(path: Path, columns: dict[str, np.ndarray], meta: Meta) -> dict[str, np.ndarray]:
     """Foreign names to ours."""
     for ours, theirs in meta.columns.items():
         if theirs not in columns:
             raise ValueError(f"{path}, column '{theirs}': is missing, and {meta.path} calls it '{ours}'")
-        if ours in columns and ours != theirs:
+        if ours in columns and ours not in meta.columns.values():
             raise ValueError(f"{path}, column '{ours}': is there, and {meta.path} calls '{theirs}' so")
     foreign = {theirs: ours for ours, theirs in meta.columns.items()}
     columns = {foreign.get(name, name): values for name, values in columns.items()}
@@ -164,20 +179,3 @@ def _rename(path: Path, columns: dict[str, np.ndarray], meta: Meta) -> dict[str,
             expected = ", ".join(column_names(prefix, meta.joints))
             raise ValueError(f"{path}, column '{name}': is not known; expected {expected}")
     return columns
-
-
-def _check_values(path: Path, signal: str, name: str, values: np.ndarray) -> None:
-    if signal in ("enabled", "contact"):
-        _first(path, name, values, (values != 0) & (values != 1), "0 or 1")
-    elif signal == "phase":
-        _first(path, name, values, (values < 0) | (values > 1), "0 to 1 cycle")
-    elif signal == "volts":
-        _first(path, name, values, values < 0, "a number that is not negative")
-
-
-def _first(path: Path, name: str, values: np.ndarray, bad: np.ndarray, expected) -> None:
-    """Refuses the first row that is bad."""
-    if bad.any():
-        row = int(np.argmax(bad))
-        wanted = expected(row) if callable(expected) else expected
-        raise ValueError(f"{path}, row {row + 1}, column '{name}': got {float(values[row])!r}, expected {wanted}")

@@ -24,6 +24,7 @@ VECTOR_SIGNALS = {
 
 SCALAR_SIGNALS = ("enabled", "volts")
 SPLITS = ("train", "select", "sealed")
+_SHARES = dict(zip(SPLITS, (2, 1, 1), strict=True))
 GAINS = {"pd": ("kp", "kd", "torque_limit_nm"), "servo": ("gain", "kt", "resistance_ohm")}
 """Numbers of a controller by type, each one for all joints or one per joint."""
 
@@ -72,24 +73,24 @@ class Log:
 
 
 def splits(log: Log) -> dict[str, tuple[Run, ...]]:
-    """Runs by split. Runs without one go by condition, about a quarter each to `select` and `sealed`.
+    """Runs by split. Conditions without one fill up train, select and sealed, in shares of 2 to 1 to 1.
 
     Raises:
-      ValueError: a split would be empty.
+      ValueError: a split would be empty, or a condition is in two.
     """
-    said = {run.condition: run.split for run in log.runs if run.split is not None}
-    open_conditions = sorted({run.condition for run in log.runs} - set(said))
-    held = max(1, round(len(open_conditions) / 4))
-    # Evenly spread over the sorted conditions, which often are steps of one quantity.
-    for index, condition in enumerate(open_conditions):
-        turn = index % max(len(open_conditions) // held, 1)
-        said[condition] = {1: "select", 2: "sealed"}.get(turn, "train")
-    chosen = {split: tuple(run for run in log.runs if (run.split or said[run.condition]) == split) for split in SPLITS}
+    said = {}
+    for run in log.runs:
+        if run.split is not None and said.setdefault(run.condition, run.split) != run.split:
+            raise ValueError(f"runs: condition '{run.condition}' is in '{said[run.condition]}' and in '{run.split}'")
+    for condition in sorted({run.condition for run in log.runs} - set(said)):
+        counts = list(said.values())
+        said[condition] = min(_SHARES, key=lambda split: counts.count(split) / _SHARES[split])
+    chosen = {split: tuple(run for run in log.runs if said[run.condition] == split) for split in SPLITS}
     for split, runs in chosen.items():
         if not runs:
             raise ValueError(
                 f"runs: no run is left for '{split}'; got {len(log.runs)} run(s) of conditions "
-                f"{', '.join(sorted({run.condition for run in log.runs}))}, expected three conditions or more"
+                f"{', '.join(sorted(said))}, expected three conditions that differ in split or leave it open"
             )
     return chosen
 

@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 import yaml
 
@@ -19,6 +20,7 @@ from envs.logs.format import (
 )
 
 _ANGLE = {"rad": 1.0, "deg": np.pi / 180.0}
+_LARGEST = 1e300  # an integer may be too large for a float
 _TORQUE = {"Nm": 1.0, "mNm": 1e-3}
 _META = {
     "robot": True,
@@ -48,19 +50,22 @@ class _Loader(yaml.SafeLoader):
 class Meta:
     """What `meta.yaml` of a folder says."""
 
-    def __init__(self, folder: Path, robots: Sequence[str]):
+    def __init__(self, folder: Path, robots: Mapping[str, Sequence[str]]):
         self.path = folder / "meta.yaml"
         if not self.path.is_file():
             raise ValueError(f"{self.path}: there is no such file")
         try:
             meta = yaml.load(self.path.read_text(encoding="utf-8"), _Loader)
-        except (yaml.YAMLError, UnicodeDecodeError, TypeError, RecursionError) as error:
+        except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
             raise ValueError(f"{self.path}: {error}") from error
         meta = self._mapping("", meta, _META)
-        self.robot = self._robot(folder, self._text("robot", meta["robot"]), robots)
+        self.robot, movable = self._robot(folder, self._text("robot", meta["robot"]), robots)
         self.base = self._one_of("base", meta["base"], ("fixed", "free"))
         self.rate_hz = self._number("rate_hz", meta["rate_hz"], positive=True)
         self.joints = self._names("joints", meta["joints"])
+        for joint in self.joints:
+            if joint not in movable:
+                raise ValueError(f"{self.path}: joints: '{self.robot}' has no '{joint}'; expected {', '.join(movable)}")
         self.signs = dict.fromkeys(self.joints, 1.0)
         for joint, sign in self._mapping("sign", meta.get("sign"), dict.fromkeys(self.joints)).items():
             self.signs[joint] = float(self._one_of(f"sign.{joint}", sign, (1, -1)))
@@ -75,7 +80,14 @@ class Meta:
         if len(set(self.columns.values())) < len(self.columns):
             self._refuse("columns", self.columns, "theirs that differ")
         policy = {"rate_hz": False, "action_scale": False, "base": False}
-        self.policy = self._mapping("policy", meta["policy"], policy) if meta.get("policy") is not None else None
+        self.policy = None
+        if meta.get("policy") is not None:
+            self.policy = self._mapping("policy", meta["policy"], policy)
+            for name, value in self.policy.items():
+                if name == "base":
+                    self._text("policy.base", value)
+                else:
+                    self._number(f"policy.{name}", value, positive=True)
         self._controller = meta["controller"]
         self.controller = self._read_controller("controller", self._controller)
         runs = meta.get("runs")
@@ -96,7 +108,9 @@ class Meta:
             read["split"] = self._one_of(f"{where}.split", entry["split"], SPLITS)
         if "controller" in entry:
             override = self._mapping(f"{where}.controller", entry["controller"], None)
-            read["controller"] = self._read_controller(f"{where}.controller", {**self._controller, **override})
+            # Another type of controller has other numbers: nothing of the log's own is left.
+            base = {} if "type" in override else self._controller
+            read["controller"] = self._read_controller(f"{where}.controller", {**base, **override})
         return read
 
     def _read_controller(self, where: str, entry: Any) -> Controller:
@@ -116,13 +130,19 @@ class Meta:
         positive = name not in ("kp", "kd")
         return np.array([self._number(where, one, positive=positive, negative=False) for one in values])
 
-    def _robot(self, folder: Path, name: str, robots: Sequence[str]) -> str:
+    def _robot(self, folder: Path, name: str, robots: Mapping[str, Sequence[str]]) -> tuple[str, Sequence[str]]:
+        """Name or path, and the joints that may be logged."""
         if name in robots:
-            return name
+            return name, robots[name]
         path = folder / name
         if not path.is_file():
             self._refuse("robot", name, f"{', '.join(robots)}, or the path of an MJCF file, relative to {folder}")
-        return str(path.resolve())
+        try:
+            model = mujoco.MjModel.from_xml_path(str(path))
+        except ValueError as error:
+            raise ValueError(f"{self.path}: robot: {path}: {error}") from error
+        kinds = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+        return str(path.resolve()), [model.joint(i).name for i in range(model.njnt) if model.jnt_type[i] in kinds]
 
     def _names(self, where: str, value: Any) -> tuple[str, ...]:
         if not isinstance(value, list) or not value:
@@ -155,14 +175,14 @@ class Meta:
 
     def _number(self, where: str, value: Any, *, positive: bool = False, negative: bool = True) -> float:
         wanted = "a positive number" if positive else "a number" if negative else "a number that is not negative"
-        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < float("inf"):
+        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < _LARGEST:
             self._refuse(where, value, wanted)
         if (positive and value <= 0) or (not negative and value < 0):
             self._refuse(where, value, wanted)
         return float(value)
 
     def _one_of(self, where: str, value: Any, allowed) -> Any:
-        if isinstance(value, list | dict | bool) or value not in allowed:
+        if isinstance(value, bool) or not isinstance(value, str | int) or value not in allowed:
             self._refuse(where, value, f"one of {', '.join(map(str, allowed))}")
         return value
 

@@ -1,4 +1,4 @@
-"""Columns of numbers from files: every cell a number, or its file, row and column in the error."""
+"""Columns of numbers from files: every cell what it may be, or its file, row and column in the error."""
 
 import csv
 from pathlib import Path
@@ -6,6 +6,30 @@ from pathlib import Path
 import numpy as np
 import pyarrow
 import pyarrow.csv
+
+
+def check_time(path: Path, name: str, time: np.ndarray) -> None:
+    """Refuses time stamps [rows] that do not increase."""
+    late = np.append(False, np.diff(time) <= 0)
+    refuse_first(path, name, time, late, lambda row: f"more than {float(time[row - 1])!r} in the row before")
+
+
+def check_values(path: Path, signal: str, name: str, values: np.ndarray) -> None:
+    """Refuses values [rows] that a signal cannot have."""
+    if signal in ("enabled", "contact"):
+        refuse_first(path, name, values, (values != 0) & (values != 1), "0 or 1")
+    elif signal == "phase":
+        refuse_first(path, name, values, (values < 0) | (values > 1), "0 to 1 cycle")
+    elif signal == "volts":
+        refuse_first(path, name, values, values < 0, "a number that is not negative")
+
+
+def refuse_first(path: Path, name: str, values: np.ndarray, bad: np.ndarray, expected) -> None:
+    """Refuses the first row that is bad."""
+    if bad.any():
+        row = int(np.argmax(bad))
+        wanted = expected(row) if callable(expected) else expected
+        raise ValueError(f"{path}, row {row + 1}, column '{name}': got {float(values[row])!r}, expected {wanted}")
 
 
 def _read_csv(path: Path) -> dict[str, np.ndarray]:
@@ -23,7 +47,9 @@ def _read_csv(path: Path) -> dict[str, np.ndarray]:
         column_types=dict.fromkeys(names, pyarrow.float64()), null_values=[], strings_can_be_null=False
     )
     try:
-        table = pyarrow.csv.read_csv(path, convert_options=options)
+        # An empty line is a row without cells.
+        parse = pyarrow.csv.ParseOptions(ignore_empty_lines=False)
+        table = pyarrow.csv.read_csv(path, convert_options=options, parse_options=parse)
     except pyarrow.ArrowInvalid as error:
         return _read_csv_by_row(path, names, error)
     return {name: table[name].to_numpy() for name in names}
@@ -36,7 +62,7 @@ def _read_csv_by_row(path: Path, names: list[str], error: Exception) -> dict[str
         with path.open(encoding="utf-8-sig", newline="") as file:
             reader = csv.reader(file, strict=True)
             next(reader)
-            for cells in filter(None, reader):
+            for cells in reader:
                 if len(cells) != len(names):
                     raise ValueError(
                         f"{path}, row {len(rows) + 1}: got {len(cells)} cells, expected {len(names)}"

@@ -5,7 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from envs.logs.format import Controller, Log, Run
+from envs.logs.format import JOINT_SIGNALS, Controller, Log, Run
+from envs.logs.tables import check_time, check_values
 
 KT, RESISTANCE_OHM = 0.38, 3.6  # Nm/A, Ohm: the published Coulomb-viscous fit
 SPLIT_OF_GAIN = {100: "train", 800: "train", 200: "select", 400: "sealed"}
@@ -35,13 +36,18 @@ def read_xl330(folder: Path) -> Log:
     paths = sorted(Path(folder).glob("*.json"))
     if not paths:
         raise ValueError(f"{folder}: no *.json files")
+    runs = tuple(map(_run, paths))
+    names = [run.name for run in runs]
+    for path, name in zip(paths, names, strict=True):
+        if names.count(name) > 1:
+            raise ValueError(f"{path}: '{name}' is there twice")
     return Log(
         robot="pendulum",
         base="fixed",
         rate_hz=_RATE_HZ,
         joints=("hinge",),
         policy=None,
-        runs=tuple(map(_run, paths)),
+        runs=runs,
     )
 
 
@@ -51,14 +57,18 @@ def _run(path: Path) -> Run:
         gain, trajectory, entries = (recording[key] for key in ("kp", "trajectory", "entries"))
         for key, expected in {"mass": _MASS_KG, "length": _LENGTH_M}.items():
             if recording[key] != expected:
-                raise ValueError(f"{path}: {key}: got {recording[key]!r}, expected {expected}")
-    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError) as error:
+                raise ValueError(f"{key}: got {recording[key]!r}, expected {expected}")
+        for key, kind in {"kp": int, "trajectory": str, "entries": list}.items():
+            if type(recording[key]) is not kind:
+                raise ValueError(f"{key}: got {recording[key]!r:.40}, expected {kind.__name__}")
+        if len(entries) < 2:
+            raise ValueError(f"entries: got {len(entries)}, expected 2 or more")
+    except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{path}: {type(error).__name__}: {error}") from error
     columns = {key: _column(path, entries, key) for key in ("timestamp", *_SIGNALS.values(), *_OTHER)}
-    late = np.flatnonzero(np.diff(columns["timestamp"]) <= 0)
-    if len(late):
-        raise ValueError(f"{path}, row {late[0] + 2}, key 'timestamp': expected more than in the row before")
-    per_joint = ("q", "dq", "target")
+    check_time(path, "timestamp", columns["timestamp"])
+    for ours, theirs in _SIGNALS.items():
+        check_values(path, ours, theirs, columns[theirs])
     return Run(
         name=f"run_kp{gain}_{trajectory}",
         condition=f"kp{gain}",
@@ -74,7 +84,7 @@ def _run(path: Path) -> Run:
         ),
         time=columns["timestamp"],
         signals={
-            ours: columns[theirs][:, None] if ours in per_joint else columns[theirs]
+            ours: columns[theirs][:, None] if ours in JOINT_SIGNALS else columns[theirs]
             for ours, theirs in _SIGNALS.items()
         },
         other={key: columns[key] for key in _OTHER},
@@ -83,7 +93,7 @@ def _run(path: Path) -> Run:
 
 def _column(path: Path, entries: list, key: str) -> np.ndarray:
     for row, entry in enumerate(entries, start=1):
-        value = entry.get(key)
+        value = entry.get(key) if isinstance(entry, dict) else None
         if not isinstance(value, int | float) or not np.isfinite(value):
             raise ValueError(f"{path}, row {row}, key '{key}': got {value!r}, expected a finite number")
     return np.array([entry[key] for entry in entries], float)

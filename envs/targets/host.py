@@ -37,6 +37,7 @@ class HostTarget:
         self._reset = jax.jit(jax.vmap(lambda key: robot.reset({}, key)))
         self._ask = jax.jit(jax.vmap(robot.ask))
         self._drive = jax.jit(jax.vmap(lambda state, action: robot.drive(params, state, action)))
+        self._choose = jax.jit(lambda act, obs, keys: jax.vmap(lambda *one: act(*one)[0])(obs, keys))
         self._settle = jax.jit(jax.vmap(robot.settle))
 
     def episodes(self, key: jax.Array, act: Act, count: int, steps: int) -> Trajectory:
@@ -47,7 +48,7 @@ class HostTarget:
         self, key: jax.Array, act: Act, count: int, steps: int, command: jax.Array | None = None
     ) -> tuple[Trajectory, Recording]:
         """The same with the motion behind it, each episode under a command [episodes, 3] that stays, if given."""
-        choose = jax.jit(jax.vmap(lambda obs, key: act(obs, key)[0]))
+        act = act if isinstance(act, jax.tree_util.Partial) else jax.tree_util.Partial(act)
         keys = jax.vmap(jax.random.split)(jax.random.split(key, count))
         step_keys = np.asarray(jax.vmap(lambda key: jax.random.split(key, steps))(keys[:, 1]))
         state = self._reset(keys[:, 0])
@@ -57,7 +58,7 @@ class HostTarget:
         records = []
         for index in range(steps):
             state = state if command is None else self._ask(state, command)
-            action = choose(state.obs, step_keys[:, index])
+            action = self._choose(act, state.obs, step_keys[:, index])
             drive = self._drive(state, action)
             motion = self._engine.move(state, drive)
             following = self._settle(state, drive, motion)

@@ -7,8 +7,8 @@ from envs.biteno import constants
 from experiments import gaps
 
 
-def test_every_point_lies_within_the_bounds_of_its_parameters():
-    rows = gaps.points(0.6)
+def test_every_point_lies_within_the_bounds_of_its_parameters(robot):
+    rows = gaps.points(robot.mj_model.geom(constants.FEET[0]).friction[0])
     assert {row[0] for row in rows} == set(gaps.SWEEPS)
     for _, _, params in rows:
         for name, value in params.items():

@@ -16,6 +16,7 @@ from experiments.config import PRESETS
     [
         ("case", "wind", "friction, mass"),
         ("methods", ("ours", "magic"), "ours, spm, dr, oracle"),
+        ("methods", (), "methods: got none"),
         ("preset", "huge", "smoke, cpu, gpu"),
         ("parameters", "left_arm_mass", "foot_friction"),
         ("parameters", "foot_friction", "case 'mass'"),
@@ -55,10 +56,12 @@ def test_target_is_nominal_over_start():
     class Stub:
         entries = sim2sim.chosen("legs6")
 
-    truth = sim2sim.true_params(sim2sim.Args(case="mass", start=0.5), Stub)
+    truth = sim2sim.true_params(sim2sim.Args(case="mass", start=0.5), Stub.entries)
     assert truth["left_thigh_mass"] == 2.0
     assert truth["foot_friction"] == 1.0
-    assert sim2sim.true_params(sim2sim.Args(case="friction", start=1.5), Stub)["foot_friction"] == pytest.approx(2 / 3)
+    assert sim2sim.true_params(sim2sim.Args(case="friction", start=1.5), Stub.entries)[
+        "foot_friction"
+    ] == pytest.approx(2 / 3)
 
 
 def test_folder_of_another_config_is_refused(tmp_path):

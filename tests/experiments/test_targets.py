@@ -45,7 +45,7 @@ def test_a_step_with_a_foreign_target_is_that_of_the_tuner():
         return machine.measure(key, policy)
 
     sizes = sim2sim.preset("smoke")
-    loop = types.SimpleNamespace(jit=jax.jit, preset=sizes, _train=jax.jit(toys.train_policy))
+    loop = types.SimpleNamespace(preset=sizes, _train=jax.jit(toys.train_policy))
     step = Loop.step(loop, machine, play)
     got, expected = step(jax.random.key(0), state), jax.jit(machine.step)(jax.random.key(0), state)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), got, expected)
@@ -70,12 +70,26 @@ def test_cases_have_the_target_of_their_figure():
         entries = sim2sim.chosen("whole_body")
 
     weak = sim2sim.Args(case="weak_motor", parameters="whole_body")
-    truth = sim2sim.true_params(weak, Stub)
+    truth = sim2sim.true_params(weak, Stub.entries)
     assert truth["torque_scale"] == 0.75
     assert all(value == 1.0 for name, value in truth.items() if name != "torque_scale")
     assert sim2sim.engine(weak) == "bullet"
     assert sim2sim.engine(sim2sim.Args(case="weak_motor", target="mujoco_c")) == "mujoco_c"
     assert sim2sim.engine(sim2sim.Args(case="mass")) == "mjx"
+
+
+def test_a_hidden_parameter_that_is_tuned_is_off_and_hidden_no_more():
+    entries = sim2sim.chosen("foot_friction,torque_scale")
+    assert sim2sim.off(sim2sim.Args(case="weak_motor"), entries) == ("torque_scale",)
+    assert sim2sim.off(sim2sim.Args(case="mass"), entries) == ()
+    assert sim2sim.off(sim2sim.Args(case="friction"), entries) == ("foot_friction",)
+    # In the same engine that makes a case of it.
+    sim2sim.check(sim2sim.Args(case="weak_motor", target="mjx", parameters="foot_friction,torque_scale"))
+
+
+def test_a_case_without_its_parameters_is_no_case():
+    with pytest.raises(ValueError, match="case 'mass' needs"):
+        sim2sim.check(sim2sim.Args(case="mass", target="mujoco_c", parameters="foot_friction"))
 
 
 def test_a_target_of_the_same_engine_and_parameters_is_no_case():

@@ -8,7 +8,7 @@ import yaml
 
 from envs import logs
 
-JOINTS = ["hip", "knee"]
+JOINTS = ["left_hip", "left_knee"]
 META = {
     "robot": "biteno",
     "base": "fixed",
@@ -47,7 +47,7 @@ def test_a_log_is_read_as_it_is(tmp_path, name):
     log = logs.read(put(tmp_path / "log", name=name))
     (run,) = log.runs
     table = columns()
-    assert (log.robot, log.base, log.rate_hz, log.joints) == ("biteno", "fixed", 100.0, ("hip", "knee"))
+    assert (log.robot, log.base, log.rate_hz, log.joints) == ("biteno", "fixed", 100.0, ("left_hip", "left_knee"))
     assert (run.name, run.condition, run.split) == ("run_000", "run_000", None)
     np.testing.assert_array_equal(run.time, table["t"])
     assert run.signals.keys() == {"q", "dq", "target", "tau"}
@@ -59,12 +59,37 @@ def test_a_log_is_read_as_it_is(tmp_path, name):
 
 def test_units_signs_and_names_become_the_models(tmp_path):
     table = {("seconds" if name == "t" else name): values for name, values in columns().items()}
-    meta = {"units": {"angle": "deg", "torque": "mNm"}, "sign": {"knee": -1}, "columns": {"t": "seconds"}}
+    meta = {"units": {"angle": "deg", "torque": "mNm"}, "sign": {"left_knee": -1}, "columns": {"t": "seconds"}}
     (run,) = logs.read(put(tmp_path / "log", table, meta)).runs
     plain = columns()
     for signal, factor in {"q": np.pi / 180, "dq": np.pi / 180, "target": np.pi / 180, "tau": 1e-3}.items():
-        expected = factor * np.stack([plain[f"{signal}.hip"], -plain[f"{signal}.knee"]], axis=1)
+        expected = factor * np.stack([plain[f"{signal}.left_hip"], -plain[f"{signal}.left_knee"]], axis=1)
         np.testing.assert_allclose(run.signals[signal], expected, rtol=1e-12)
+
+
+def test_swapped_columns_are_swapped_back(tmp_path):
+    meta = {"columns": {"q.left_hip": "q.left_knee", "q.left_knee": "q.left_hip"}}
+    (run,) = logs.read(put(tmp_path / "log", meta=meta)).runs
+    np.testing.assert_array_equal(run.signals["q"][:, 0], columns()["q.left_knee"])
+    np.testing.assert_array_equal(run.signals["q"][:, 1], columns()["q.left_hip"])
+
+
+def test_an_error_names_the_column_as_the_file_does(tmp_path):
+    table = columns() | {"time": columns()["t"][::-1]}
+    del table["t"]
+    with pytest.raises(ValueError, match=r"column 'time': got 0\.03, expected more than 0\.04"):
+        logs.read(put(tmp_path / "log", table, {"columns": {"t": "time"}}))
+
+
+def test_a_robot_may_be_any_mjcf_with_hinges_or_slides(tmp_path):
+    arm = """<mujoco><worldbody><body><freejoint name="free"/><geom size=".1"/>
+      <body><joint name="left_hip"/><geom size=".1"/><body><joint name="left_knee" type="slide"/><geom size=".1"/>
+      </body></body></body></worldbody></mujoco>"""
+    (tmp_path / "arm.xml").write_text(arm)
+    log = logs.read(put(tmp_path / "log", meta={"robot": "../arm.xml"}))
+    assert log.robot == str(tmp_path / "arm.xml")
+    with pytest.raises(ValueError, match="has no 'free'; expected left_hip, left_knee"):
+        logs.read(put(tmp_path / "log", meta={"robot": "../arm.xml", "joints": ["left_hip", "free"]}))
 
 
 def test_a_run_may_have_its_own_condition_split_and_gains(tmp_path):
@@ -89,11 +114,22 @@ def test_what_was_written_is_read(tmp_path, suffix):
     extra |= {"phase.left": np.linspace(0, 0.9, ROWS), "phase.right": np.linspace(0, 0.9, ROWS)[::-1]}
     extra |= {"enabled": np.array([1.0, 1, 0, 0, 1]), "noise": np.array([1e-17, 1 / 3, 2.0**0.5, -1e30, 0.1])}
     meta = {"policy": {"rate_hz": 100, "action_scale": 0.25, "base": "stand"}, "runs": {"run_000": {"split": "train"}}}
+    put(tmp_path / "log", name="run_001.csv")
+    put(tmp_path / "log", name="run_002.csv")
+    # The second is limited otherwise, the third another kind.
+    gains = {"type": "servo", "gain": 1.15, "kt": 0.38, "resistance_ohm": [3.6, 3.5], "rate_hz": 500}
+    meta["runs"] |= {
+        "run_001": {"controller": {"type": "pd", "kp": 1.0, "kd": 0.0, "rate_hz": 200}},
+        "run_002": {"controller": gains, "condition": "servo"},
+    }
     log = logs.read(put(tmp_path / "log", columns() | extra, meta))
+    assert [run.controller.kind for run in log.runs] == ["pd", "pd", "servo"]
+    assert np.isinf(log.runs[1].controller.gains["torque_limit_nm"]).all()
     logs.write(log, tmp_path / "again", suffix)
     again = logs.read(tmp_path / "again")
     assert dataclasses.replace(again, runs=()) == dataclasses.replace(log, runs=())
     for one, other in zip(log.runs, again.runs, strict=True):
+        assert (one.controller.kind, one.controller.rate_hz) == (other.controller.kind, other.controller.rate_hz)
         assert (one.name, one.condition, one.split) == (other.name, other.condition, other.split)
         np.testing.assert_array_equal(one.time, other.time)
         for mine, theirs in ((one.signals, other.signals), (one.other, other.other)):
@@ -121,20 +157,30 @@ def test_a_folder_in_use_is_not_written_to(tmp_path):
         ({"rate_hz": float("nan")}, "rate_hz: got nan"),
         ({"rate_hz": 1000}, "column 't': got 100 rows a second, expected rate_hz, 1000"),
         ({"joints": []}, "joints: got \\[\\]"),
-        ({"joints": ["hip", "hip"]}, "joints: .*names that differ"),
-        ({"joints": ["hip", 3]}, "joints: got 3, expected a text"),
+        ({"joints": ["left_hip", "left_hip"]}, "joints: .*names that differ"),
+        ({"joints": ["left_hip", 3]}, "joints: got 3, expected a text"),
+        ({"joints": ["left_hip", "left_elbow"]}, "joints: 'biteno' has no 'left_elbow'; expected left_abad, left_hip"),
+        ({"robot": "meta.yaml"}, "robot: .*meta.yaml"),
+        ({"rate_hz": 10**400}, "rate_hz: got 1000"),
+        ({"units": {"angle": ["rad"]}}, r"units.angle: got \['rad'\]"),
+        ({"policy": {"rate_hz": "fast"}}, "policy.rate_hz: got 'fast', expected a positive number"),
+        ({"policy": {"action_scale": float("-inf")}}, "policy.action_scale: got -inf"),
+        ({"policy": {"base": 3}}, "policy.base: got 3, expected a text"),
         ({"controller": {"type": "pid"}}, "controller.type: got 'pid', expected one of pd, servo"),
         ({"controller": {"type": ["pd"]}}, r"controller.type: got \['pd'\]"),
         ({"controller": {"type": "pd", "kp": 1, "rate_hz": 100}}, "controller.kd: is missing"),
         ({"controller": {"type": "pd", "kp": -1, "kd": 0, "rate_hz": 100}}, "controller.kp: got -1"),
         ({"controller": {"type": "pd", "kp": [1], "kd": 0, "rate_hz": 100}}, r"controller.kp: got \[1\], .* or 2"),
         ({"controller": {"type": "pd", "kp": 1, "kd": 0, "ki": 0, "rate_hz": 100}}, "controller.ki: .*kp"),
-        ({"sign": {"hip": 2}}, "sign.hip: got 2, expected one of 1, -1"),
-        ({"sign": {"hipp": -1}}, "sign.hipp: there is no such key; did you mean 'hip'"),
+        ({"sign": {"left_hip": 2}}, "sign.left_hip: got 2, expected one of 1, -1"),
+        ({"sign": {"left_hipp": -1}}, "sign.left_hipp: there is no such key; did you mean 'left_hip'"),
         ({"units": {"angle": "grad"}}, "units.angle: got 'grad', expected one of rad, deg"),
-        ({"columns": {"q.hip": "theta"}}, "column 'theta': is missing"),
-        ({"columns": {"q.elbow": "theta"}}, r"columns.q.elbow: there is no such key"),
-        ({"columns": {"q.hip": "q.knee", "q.knee": "q.knee"}}, "columns: got .*expected theirs that differ"),
+        ({"columns": {"q.left_hip": "theta"}}, "column 'theta': is missing"),
+        ({"columns": {"q.left_elbow": "theta"}}, r"columns.q.left_elbow: there is no such key"),
+        (
+            {"columns": {"q.left_hip": "q.left_knee", "q.left_knee": "q.left_knee"}},
+            "columns: got .*expected theirs that differ",
+        ),
         ({"rate": 5}, "rate: there is no such key; did you mean 'rate_hz'"),
         ({"runs": {"run_007": {}}}, "runs.run_007: there is no such run; found run_000"),
         ({"runs": {"run_000": {"split": "test"}}}, "runs.run_000.split: got 'test', expected one of train"),
@@ -153,6 +199,7 @@ def test_bad_meta_is_named(tmp_path, meta, named):
         ("robot: [", "meta.yaml"),
         ("- robot", "the file: got"),
         ("robot: biteno\nrobot: biteno\n", "'robot' is there twice"),
+        ("robot: biteno\nrate_hz: !!int x\n", r"meta\.yaml: invalid literal"),
         ("robot: !!python/object/apply:os.getcwd []\n", "could not determine a constructor"),
     ],
 )
@@ -172,18 +219,24 @@ def cell(name, row, value):
 @pytest.mark.parametrize(
     ("table", "named"),
     [
-        (cell("q.knee", 3, "abc"), "run_000.csv, row 3, column 'q.knee': got 'abc', expected a number"),
-        (cell("q.knee", 3, ""), "row 3, column 'q.knee': got ''"),
-        (cell("q.knee", 3, "1_0"), "row 3, column 'q.knee': got '1_0'"),
-        (cell("q.hip", 5, "nan"), "row 5, column 'q.hip': got nan, expected a finite"),
-        (cell("tau.hip", 1, "inf"), "row 1, column 'tau.hip': got inf"),
-        (cell("t", 4, 0.02), "row 4, column 't': got 0.02, expected more than .*0.02"),
+        (cell("q.left_knee", 3, "abc"), "run_000.csv, row 3, column 'q.left_knee': got 'abc', expected a number"),
+        (cell("q.left_knee", 3, ""), "row 3, column 'q.left_knee': got ''"),
+        (cell("q.left_knee", 3, "1_0"), "row 3, column 'q.left_knee': got '1_0'"),
+        (cell("q.left_hip", 5, "nan"), "row 5, column 'q.left_hip': got nan, expected a finite"),
+        (cell("tau.left_hip", 1, "inf"), "row 1, column 'tau.left_hip': got inf"),
+        (cell("t", 4, 0.02), "row 4, column 't': got 0.02, expected more than 0.02 in"),
         (cell("t", 2, -1.0), "row 2, column 't': got -1.0"),
         ({k: v for k, v in columns().items() if k != "t"}, "column 't': is missing"),
-        ({k: v for k, v in columns().items() if not k.startswith("q.")}, "column 'q.hip': is missing"),
-        ({k: v for k, v in columns().items() if k != "dq.knee"}, "column 'dq.knee': is missing, where 'dq.hip'"),
-        ({k: v for k, v in columns().items() if k[:2] != "ta"}, "neither 'target.hip' nor 'tau'"),
-        (columns() | {"q.elbow": np.zeros(ROWS)}, "column 'q.elbow': is not known; expected q.hip, q.knee"),
+        ({k: v for k, v in columns().items() if not k.startswith("q.")}, "column 'q.left_hip': is missing"),
+        (
+            {k: v for k, v in columns().items() if k != "dq.left_knee"},
+            "column 'dq.left_knee': is missing, where 'dq.left_hip'",
+        ),
+        ({k: v for k, v in columns().items() if k[:2] != "ta"}, "neither 'target.left_hip' nor 'tau'"),
+        (
+            columns() | {"q.left_elbow": np.zeros(ROWS)},
+            "column 'q.left_elbow': is not known; expected q.left_hip, q.left_knee",
+        ),
         (columns() | {"enabled": np.array([1, 1, 0, 2, 1])}, "row 4, column 'enabled': got 2.0, expected 0 or 1"),
         (columns() | {"volts": np.array([7.0, 7, 7, 7, -7])}, "row 5, column 'volts'"),
         (columns() | {"phase.left": np.full(ROWS, 1.5), "phase.right": np.zeros(ROWS)}, "column 'phase.left': got 1.5"),
@@ -200,11 +253,12 @@ def test_bad_rows_are_named(tmp_path, table, named):
     ("text", "named"),
     [
         ("", "is empty"),
-        ("t,q.hip,q.hip\n0,1,2\n", "column 'q.hip': expected a name that is there once"),
-        ("t,q.hip,\n0,1,2\n", "column ''"),
-        ("t,q.hip\n0,1\n0.01,2,3\n", "row 2: got 3 cells, expected 2"),
-        ("t,q.hip\n0,1\n0.01\n", "row 2: got 1 cells, expected 2"),
-        ('t,q.hip\n0,"1\n', "row 1: unexpected end of data"),
+        ("t,q.left_hip,q.left_hip\n0,1,2\n", "column 'q.left_hip': expected a name that is there once"),
+        ("t,q.left_hip,\n0,1,2\n", "column ''"),
+        ("t,q.left_hip\n0,1\n0.01,2,3\n", "row 2: got 3 cells, expected 2"),
+        ("t,q.left_hip\n0,1\n\n0.02,2\n", "row 2: got 0 cells, expected 2"),
+        ("t,q.left_hip\n0,1\n0.01\n", "row 2: got 1 cells, expected 2"),
+        ('t,q.left_hip\n0,"1\n', "row 1: unexpected end of data"),
     ],
 )
 def test_a_damaged_csv_is_named(tmp_path, text, named):
@@ -219,10 +273,10 @@ def test_a_damaged_npz_is_named(tmp_path):
     path.write_bytes(path.read_bytes()[:100])
     with pytest.raises(ValueError, match=r"run_000\.npz"):
         logs.read(tmp_path / "log")
-    np.savez(path, **columns() | {"q.hip": np.zeros(3)})
-    with pytest.raises(ValueError, match=r"column 'q\.hip': got 3 rows, expected 5"):
+    np.savez(path, **columns() | {"q.left_hip": np.zeros(3)})
+    with pytest.raises(ValueError, match=r"column 'q\.left_hip': got 3 rows, expected 5"):
         logs.read(tmp_path / "log")
-    np.savez(path, **columns() | {"q.hip": np.array([object()] * ROWS)})
+    np.savez(path, **columns() | {"q.left_hip": np.array([object()] * ROWS)})
     with pytest.raises(ValueError, match="allow_pickle"):
         logs.read(tmp_path / "log")
 
@@ -237,6 +291,9 @@ def test_what_is_no_log_is_named(tmp_path):
     put(tmp_path / "log", name="run_000.npz")
     with pytest.raises(ValueError, match="'run_000' is there twice"):
         logs.read(tmp_path / "log")
+    (tmp_path / "log" / "run_000.npz").rename(tmp_path / "log" / "run_001.NPZ")
+    with pytest.raises(ValueError, match=r"run_001\.NPZ: expected a file that ends in one of \.csv"):
+        logs.read(tmp_path / "log")
 
 
 def many(tmp_path, said):
@@ -245,23 +302,28 @@ def many(tmp_path, said):
     return logs.read(put(tmp_path / "log", meta={"runs": {f"run_{i:03d}": entry for i, entry in enumerate(said)}}))
 
 
-def test_splits_keep_conditions_together(tmp_path):
-    log = many(tmp_path, [{"condition": name} for name in "aabbccdd"])
-    chosen = logs.splits(log)
-    held = [{run.condition for run in runs} for runs in chosen.values()]
-    assert set.union(*held) == set("abcd")
-    assert sum(map(len, held)) == 4
-    assert sum(map(len, chosen.values())) == 8
-    assert len(held[0]) == 2
+@pytest.mark.parametrize(("count", "sizes"), [(3, (1, 1, 1)), (4, (2, 1, 1)), (7, (3, 2, 2)), (8, (4, 2, 2))])
+def test_splits_keep_conditions_together(tmp_path, count, sizes):
+    log = many(tmp_path, [{"condition": name} for name in 2 * "abcdefgh"[:count]])
+    held = [{run.condition for run in runs} for runs in logs.splits(log).values()]
+    assert set.union(*held) == set("abcdefgh"[:count])
+    assert tuple(map(len, held)) == sizes
+    assert sum(map(len, logs.splits(log).values())) == 2 * count
+
+
+def test_a_condition_in_two_splits_is_named(tmp_path):
+    said = [{"condition": "a", "split": "train"}, {"condition": "a", "split": "sealed"}, {"condition": "b"}]
+    with pytest.raises(ValueError, match="condition 'a' is in 'train' and in 'sealed'"):
+        logs.splits(many(tmp_path, said))
 
 
 def test_splits_are_what_the_log_says_where_it_does(tmp_path):
     said = [{"condition": "a", "split": "sealed"}, {"condition": "b", "split": "train"}, {"condition": "c"}]
-    with pytest.raises(ValueError, match="no run is left for 'select'"):
-        logs.splits(many(tmp_path, said))
-    said[2]["split"] = "select"
     chosen = logs.splits(many(tmp_path, said))
     assert {split: runs[0].condition for split, runs in chosen.items()} == {"train": "b", "select": "c", "sealed": "a"}
+    said[2]["split"] = "train"
+    with pytest.raises(ValueError, match="no run is left for 'select'"):
+        logs.splits(many(tmp_path, said))
 
 
 def test_too_few_conditions_to_split_are_named(tmp_path):

@@ -59,13 +59,28 @@ def test_a_written_recording_is_a_log(tmp_path):
         ("[]", "a.json: TypeError"),
         (recording(mass=0.6), "mass: got 0.6, expected 0.49"),
         ({"mass": 0.49}, "KeyError: 'kp'"),
-        (recording(entries=[{"timestamp": 0.0}]), "row 1, key 'position': got None"),
-        (recording(entries=recording()["entries"][::-1]), "row 2, key 'timestamp'"),
+        (recording(entries=[{"timestamp": 0.0}] * 2), "row 1, key 'position': got None"),
+        (
+            recording(entries=recording()["entries"][::-1]),
+            "row 2, column 'timestamp': got 0.01, expected more than 0.015",
+        ),
+        (recording(entries=[]), "entries: got 0"),
+        (recording(entries=5), "entries: got 5, expected list"),
+        (recording(entries=[1, 2]), "row 1, key 'timestamp': got None"),
+        (recording(kp="400"), "kp: got '400', expected int"),
+        (recording(kp=None), "kp: got None"),
+        (recording(trajectory=3), "trajectory: got 3, expected str"),
     ],
 )
 def test_bad_recordings_are_named(tmp_path, content, named):
     with pytest.raises(ValueError, match=named):
         read_xl330(put(tmp_path, content))
+
+
+def test_two_recordings_of_one_name_are_named(tmp_path):
+    (put(tmp_path, recording()) / "b.json").write_text(json.dumps(recording()))
+    with pytest.raises(ValueError, match="'run_kp400_sin_sin' is there twice"):
+        read_xl330(tmp_path)
 
 
 def test_an_empty_folder_is_named(tmp_path):
