@@ -61,7 +61,7 @@ class Meta:
         meta = self._mapping("", meta, _META)
         self.robot, movable = self._robot(folder, self._text("robot", meta["robot"]), robots)
         self.base = self._one_of("base", meta["base"], ("fixed", "free"))
-        self.rate_hz = self._number("rate_hz", meta["rate_hz"], positive=True)
+        self.rate_hz = self._number("rate_hz", meta["rate_hz"])
         self.joints = self._names("joints", meta["joints"])
         for joint in self.joints:
             if joint not in movable:
@@ -87,7 +87,7 @@ class Meta:
                 if name == "base":
                     self._text("policy.base", value)
                 else:
-                    self._number(f"policy.{name}", value, positive=True)
+                    self._number(f"policy.{name}", value)
         self._controller = meta["controller"]
         self.controller = self._read_controller("controller", self._controller)
         runs = meta.get("runs")
@@ -118,7 +118,7 @@ class Meta:
         kind = self._one_of(f"{where}.type", entry.get("type"), GAINS)
         self._mapping(where, entry, {"type": True, "rate_hz": True} | {n: n != "torque_limit_nm" for n in GAINS[kind]})
         gains = {name: self._gain(f"{where}.{name}", entry.get(name, np.inf), name) for name in GAINS[kind]}
-        rate = self._number(f"{where}.rate_hz", entry["rate_hz"], positive=True)
+        rate = self._number(f"{where}.rate_hz", entry["rate_hz"])
         return Controller(kind=kind, rate_hz=rate, gains=gains)
 
     def _gain(self, where: str, value: Any, name: str) -> np.ndarray:
@@ -127,8 +127,7 @@ class Meta:
         values = value if isinstance(value, list) else [value] * len(self.joints)
         if len(values) != len(self.joints):
             self._refuse(where, value, f"one number or {len(self.joints)}, one per joint")
-        positive = name not in ("kp", "kd")
-        return np.array([self._number(where, one, positive=positive, negative=False) for one in values])
+        return np.array([self._number(where, one, zero=name in ("kp", "kd")) for one in values])
 
     def _robot(self, folder: Path, name: str, robots: Mapping[str, Sequence[str]]) -> tuple[str, Sequence[str]]:
         """Name or path, and the joints that may be logged."""
@@ -173,12 +172,15 @@ class Meta:
             self._refuse(where, value, "a text")
         return value
 
-    def _number(self, where: str, value: Any, *, positive: bool = False, negative: bool = True) -> float:
-        wanted = "a positive number" if positive else "a number" if negative else "a number that is not negative"
-        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < _LARGEST:
-            self._refuse(where, value, wanted)
-        if (positive and value <= 0) or (not negative and value < 0):
-            self._refuse(where, value, wanted)
+    def _number(self, where: str, value: Any, *, zero: bool = False) -> float:
+        """A finite number, positive or, where it may be, zero."""
+        if (
+            isinstance(value, bool)
+            or not isinstance(value, int | float)
+            or not 0 <= value < _LARGEST
+            or (value == 0 and not zero)
+        ):
+            self._refuse(where, value, "a number that is not negative" if zero else "a positive number")
         return float(value)
 
     def _one_of(self, where: str, value: Any, allowed) -> Any:
