@@ -94,7 +94,7 @@ def apply(model: mjx.Model, params: Params, entries: Mapping[str, Entry]) -> mjx
 
     Args:
       model: the nominal model.
-      params: physical values by name, each a scalar; those that are left out stay nominal.
+      params: physical values by name, each a scalar or one per target; those that are left out stay nominal.
       entries: the table the names stand in.
 
     Returns:
@@ -105,7 +105,9 @@ def apply(model: mjx.Model, params: Params, entries: Mapping[str, Entry]) -> mjx
     """
     fields = {}
     for field, index, entry, value in _cells(model, params, entries):
-        cell = fields.get(field, getattr(model, field)).at[index]
+        array = fields.get(field, getattr(model, field))
+        columns = (1,) * (array.ndim - 1 if entry.column is None else 0)
+        cell, value = array.at[index], jnp.reshape(value, (*jnp.shape(value), *columns))
         fields[field] = cell.multiply(value) if entry.log else cell.add(value)
     return set_const(model.tree_replace(fields))
 

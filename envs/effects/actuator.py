@@ -1,0 +1,141 @@
+"""Between the target and the torque of the motor."""
+
+import jax.numpy as jnp
+
+from envs.effects.memory import delayed, delay_line, lagged
+from jaxtune.types import Effect, Parameter
+
+_ACTUATOR = {"family": "actuator", "on": "joint"}
+
+
+def _torque_scale(values, torque, now, memory):
+    del now
+    return torque * jnp.exp(values["ratio"]), memory
+
+
+def _torque_limit(values, torque, now, memory):
+    del now
+    limit = 1.0 / jnp.maximum(values["torque_nm"], 1e-9)
+    return jnp.clip(torque, -limit, limit), memory
+
+
+def _torque_speed(values, torque, now, memory):
+    """A motor's line: what it can give falls with speed by its back-EMF."""
+    drop = values["nm_s_per_rad"] * now.speed
+    low, high = -now.limit - drop, now.limit - drop
+    return jnp.where(values["nm_s_per_rad"] > 0, jnp.clip(torque, low, high), torque), memory
+
+
+def _command_delay(values, target, now, memory):
+    return delayed(memory, target, values["seconds"], now.dt)
+
+
+def _target_slew(values, target, now, memory):
+    step = now.dt / jnp.maximum(values["rad_per_s"], 1e-9)
+    memory = memory + jnp.clip(target - memory, -step, step)
+    return memory, memory
+
+
+def _deadband(values, error, now, memory):
+    del now
+    return jnp.sign(error) * jnp.maximum(jnp.abs(error) - 0.5 * values["rad"], 0.0), memory
+
+
+def _gain_error(values, error, now, memory):
+    del now
+    return error * jnp.exp(values["ratio"]), memory
+
+
+def _torque_lag(values, torque, now, memory):
+    return lagged(memory, torque, values["seconds"], now.dt)
+
+
+_SECONDS = Parameter(name="seconds", bounds=(0.0, 0.04), prior=0.01)
+
+ROWS = (
+    Effect(
+        name="command_delay",
+        enters="command",
+        parameters=(_SECONDS,),
+        sizes=(0.001, 0.008),
+        act=_command_delay,
+        start=delay_line,
+        sentence="Targets act later than they were sent.",
+        excited_by="steps and a chirp to 10 Hz at two controller gains",
+        **_ACTUATOR,
+    ),
+    Effect(
+        name="target_slew",
+        enters="command",
+        parameters=(
+            Parameter(name="rad_per_s", form="reciprocal", scale="speed", bounds=(0.0, 3.0), prior=0.5),
+        ),
+        sizes=(0.2, 0.6),
+        act=_target_slew,
+        start=lambda target, dt: target,
+        sentence="The controller follows its target no faster than at a certain speed.",
+        excited_by="steps of two sizes",
+        **_ACTUATOR,
+    ),
+    Effect(
+        name="gain_error",
+        enters="error",
+        parameters=(Parameter(name="ratio", form="ratio", bounds=(-1.0, 1.0), prior=0.1),),
+        sizes=(0.05,),
+        act=_gain_error,
+        sentence="The controller's proportional gain is not the one that was set.",
+        excited_by="postures of low and of high gravity torque at two controller gains",
+        **_ACTUATOR,
+    ),
+    Effect(
+        name="deadband",
+        enters="error",
+        parameters=(Parameter(name="rad", bounds=(0.0, 0.2), prior=0.02),),
+        sizes=(0.003, 0.02),
+        act=_deadband,
+        sentence="The controller ignores small errors.",
+        excited_by="slow triangular reversals at two controller gains",
+        **_ACTUATOR,
+    ),
+    Effect(
+        name="torque_speed",
+        enters="torque",
+        parameters=(Parameter(name="nm_s_per_rad", scale="motor", bounds=(0.0, 1.0), prior=0.2),),
+        sizes=(0.1, 0.3),
+        act=_torque_speed,
+        sentence="The faster the motor turns, the less torque it can give.",
+        excited_by="saturating steps",
+        **_ACTUATOR,
+    ),
+    Effect(
+        name="torque_limit",
+        enters="torque",
+        parameters=(Parameter(name="torque_nm", form="reciprocal", scale="torque", bounds=(0.0, 3.0), prior=0.3),),
+        sizes=(0.25, 0.6),
+        act=_torque_limit,
+        sentence="The motor gives no more than a certain torque.",
+        excited_by="saturating steps",
+        **_ACTUATOR,
+    ),
+    Effect(
+        name="torque_lag",
+        enters="torque",
+        parameters=(_SECONDS,),
+        sizes=(0.001, 0.008),
+        act=_torque_lag,
+        start=lambda torque, dt: torque,
+        sentence="The motor's torque follows what the controller asks with a lag.",
+        excited_by="a chirp to 10 Hz at two controller gains",
+        **_ACTUATOR,
+    ),
+    Effect(
+        name="torque_scale",
+        enters="torque",
+        parameters=(Parameter(name="ratio", form="ratio", bounds=(-1.0, 1.0), prior=0.1),),
+        sizes=(0.05,),
+        act=_torque_scale,
+        sentence="The motor gives a share of the torque that it is asked for.",
+        excited_by="a motor-off swing beside driven motion, which tells torque from mass",
+        **_ACTUATOR,
+    ),
+)

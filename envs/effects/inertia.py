@@ -1,0 +1,39 @@
+"""Masses, and where they are."""
+
+from jaxtune.types import Effect, Parameter
+
+_INERTIA = {"family": "inertia", "on": "body", "enters": "model"}
+
+ROWS = (
+    Effect(
+        name="link_mass",
+        parameters=(
+            Parameter(
+                name="ratio", form="ratio", bounds=(-1.6, 1.6), prior=0.1, fields=("body_mass", "body_inertia")
+            ),
+        ),
+        sizes=(0.05,),
+        sentence="The link is heavier or lighter than the model says, its shape the same.",
+        excited_by="a motor-off swing, and postures of high gravity torque",
+        **_INERTIA,
+    ),
+    Effect(
+        name="com_offset",
+        parameters=tuple(
+            Parameter(name=f"{axis}_m", bounds=(-0.1, 0.1), prior=0.01, fields=("body_ipos",), column=column)
+            for column, axis in enumerate("xyz")
+        ),
+        sizes=(0.005,),
+        sentence="The link's centre of mass is elsewhere.",
+        excited_by="slow motion through postures on both sides of the vertical",
+        **_INERTIA,
+    ),
+    Effect(
+        name="payload",
+        parameters=(Parameter(name="kg", scale="mass", bounds=(0.0, 4.0), prior=0.3, fields=("body_mass",)),),
+        sizes=(0.05,),
+        sentence="Something heavy and small hangs at the link's centre.",
+        excited_by="a motor-off swing, and postures of high gravity torque",
+        **_INERTIA,
+    ),
+)

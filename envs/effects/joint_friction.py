@@ -1,0 +1,76 @@
+"""Friction in the joints.
+
+Dry friction is a bound on a torque: the stage hands the bound [joints] in Nm from effect to effect, and the engine
+solves for the torque within it that brings the joint to rest.
+"""
+
+import jax.numpy as jnp
+
+from jaxtune.types import Effect, Parameter
+
+_JOINT_FRICTION = {"family": "joint_friction", "on": "joint"}
+
+
+def _coulomb(values, bound, now, memory):
+    del now
+    return bound + values["torque_nm"], memory
+
+
+def _stribeck(values, bound, now, memory):
+    """Extra friction that decays with speed, exp(-|v| / v_s)."""
+    return bound + values["torque_nm"] * jnp.exp(-jnp.abs(now.speed) / values["speed_rad_s"]), memory
+
+
+def _load_friction(values, bound, now, memory):
+    """In proportion to the torque that the gears pass on."""
+    return bound + values["ratio"] * now.load, memory
+
+
+ROWS = (
+    Effect(
+        name="coulomb",
+        enters="friction",
+        parameters=(Parameter(name="torque_nm", scale="torque", bounds=(0.0, 5.0), prior=0.3),),
+        sizes=(0.03, 0.3),
+        act=_coulomb,
+        sentence="The joint needs a fixed torque to get going and loses the same torque while it moves.",
+        excited_by="slow triangular reversals",
+        **_JOINT_FRICTION,
+    ),
+    Effect(
+        name="viscous",
+        enters="model",
+        parameters=(
+            Parameter(
+                name="nm_s_per_rad", scale="damping", bounds=(-0.5, 5.0), prior=0.3, fields=("dof_damping",)
+            ),
+        ),
+        sizes=(0.03,),
+        sentence="The joint loses a torque in proportion to its speed.",
+        excited_by="a motor-off swing, or chirps at two amplitudes",
+        **_JOINT_FRICTION,
+    ),
+    Effect(
+        name="stribeck",
+        enters="friction",
+        parameters=(
+            Parameter(name="torque_nm", scale="torque", bounds=(0.0, 5.0), prior=0.3),
+            Parameter(name="speed_rad_s", form="ratio", scale="slow", bounds=(-2.0, 2.0), shape=True),
+        ),
+        sizes=(0.05, 0.3),
+        act=_stribeck,
+        sentence="The joint sticks harder than it slides: friction falls as it starts to move.",
+        excited_by="slow triangular reversals at several speeds",
+        **_JOINT_FRICTION,
+    ),
+    Effect(
+        name="load_friction",
+        enters="friction",
+        parameters=(Parameter(name="ratio", bounds=(0.0, 0.9), prior=0.2),),
+        sizes=(0.03, 0.2),
+        act=_load_friction,
+        sentence="The gears rub more the more torque they pass on.",
+        excited_by="the same reversals in postures of low and of high gravity torque",
+        **_JOINT_FRICTION,
+    ),
+)

@@ -1,0 +1,97 @@
+"""What a log would look like if nothing were missing: the nominal model in another engine, with the log's own noise.
+
+Something always mimics an engine's step, its integrator or the moment at which a controller looks. So the nominal
+model is moved by MuJoCo C with half the step, another integrator and a controller whose ticks wander, its masses,
+armatures and dampings drawn as the prior has them, and read with the noise and the rounding found in the log.
+"""
+
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+
+from envs import domain
+from envs.logs import Log, Run
+from envs.rig import hung
+from envs.segments import noise, quantum_of, smoothed
+
+_STEP_S = 0.0005
+_SPREAD = 0.1
+
+
+def healthy(log: Log, spec: mujoco.MjSpec, seed: int) -> Log:
+    """Draws a log without a missing effect, its targets and conditions those of a measured one."""
+    rng = np.random.default_rng(seed)
+    model = _drawn(spec, rng)
+    return replace(log, runs=tuple(replay(run, model, log.joints, rng) for run in log.runs))
+
+
+def _drawn(spec: mujoco.MjSpec, rng: np.random.Generator) -> mujoco.MjModel:
+    """The nominal model, every parameter off as the prior has it."""
+    model = hung(spec)
+    model.opt.timestep = _STEP_S
+    model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    model.opt.iterations, model.opt.ls_iterations = 100, 50
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION
+    bodies = {
+        f"mass {i}": domain.Entry(
+            name=f"mass {i}", kind="body", targets=(model.body(i).name,), fields=("body_mass", "body_inertia"), bounds=(0, 9)
+        )
+        for i in range(1, model.nbody)
+        if model.body_mass[i] > 0
+    }
+    draw = lambda size=None: np.exp(_SPREAD * rng.standard_normal(size).clip(-2, 2))
+    model = domain.apply_mujoco(model, {name: float(draw(1)[0]) for name in bodies}, bodies)
+    for name in ("dof_armature", "dof_damping", "dof_frictionloss"):
+        getattr(model, name)[:] *= draw(model.nv)
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    return model
+
+
+def replay(run: Run, model: mujoco.MjModel, joints, rng: np.random.Generator) -> Run:
+    """Plays a run's targets through a controller whose ticks wander by up to a step of the physics."""
+    data = mujoco.MjData(model)
+    qpos = np.array([model.joint(name).qposadr[0] for name in joints])
+    dof = np.array([model.joint(name).dofadr[0] for name in joints])
+    damping = model.dof_damping[dof].copy()
+    data.qpos[qpos], data.qvel[dof] = smoothed(run)[0]
+    gains, driven = run.controller.gains, "target" in run.signals
+    on = run.signals.get("enabled", np.ones(len(run.time)))
+    steps = max(1, round(1.0 / run.controller.rate_hz / model.opt.timestep))
+    count = int(np.ceil((run.time[-1] - run.time[0]) * run.controller.rate_hz)) + 2
+    # An early look one time is a late one the next.
+    looks = np.cumsum(np.append(rng.integers(0, steps), steps + np.diff(rng.integers(0, 2, count))))
+    times = run.time[0] + model.opt.timestep * looks
+    last = np.clip(np.searchsorted(run.time, times + 1e-9, side="right") - 1, 0, len(run.time) - 1)
+    states, torques = np.empty((len(looks), 2, len(joints))), np.empty((len(looks), len(joints)))
+    mujoco.mj_step(model, data, looks[0]) if looks[0] else None
+    for look, row in enumerate(last):
+        q, dq = data.qpos[qpos], data.qvel[dof]
+        if not driven:
+            torque = run.signals["tau"][row]
+        elif run.controller.kind == "servo":
+            stall = on[row] * run.signals["volts"][row] * gains["kt"] / gains["resistance_ohm"]
+            torque = stall * np.clip(gains["gain"] * (run.signals["target"][row] - q), -1, 1)
+            model.dof_damping[dof] = damping + on[row] * gains["kt"] ** 2 / gains["resistance_ohm"]
+        else:
+            limit = gains["torque_limit_nm"]
+            torque = on[row] * np.clip(gains["kp"] * (run.signals["target"][row] - q) - gains["kd"] * dq, -limit, limit)
+        states[look, 0], states[look, 1], torques[look] = q, dq, torque
+        data.qfrc_applied[dof] = torque
+        if look + 1 < len(looks):
+            mujoco.mj_step(model, data, int(looks[look + 1] - looks[look]))
+    model.dof_damping[dof] = damping
+    signals = dict(run.signals)
+    for name, values in {"q": states[:, 0], "dq": states[:, 1], "tau": torques}.items():
+        if name in signals and (driven or name != "tau"):
+            read = np.stack([np.interp(run.time, times, column) for column in values.T], axis=1)
+            signals[name] = as_read(read, run.signals[name], rng)
+    return replace(run, signals=signals)
+
+
+def as_read(values: np.ndarray, like: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Values with the noise and the rounding of others."""
+    quantum = quantum_of(like)
+    extra = max(noise(like) ** 2 - quantum**2 / 12.0, 0.0) ** 0.5
+    values = values + extra * rng.standard_normal(values.shape)
+    return np.round(values / quantum) * quantum if quantum else values

@@ -1,0 +1,164 @@
+"""From a log and a model to the question that discovery is asked."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import mujoco
+import numpy as np
+
+from envs import regimes, segments
+from envs.healthy import healthy
+from envs.logs import Log, splits
+from envs.rig import Rig
+from jaxtune.discovery.problem import Hypothesis, Problem, Segments
+
+HORIZONS_S = (0.05, 0.15, 0.45)
+_BIN_S = 0.01
+_LATE_S = 0.004  # a velocity that lags its position by more is a filter's, not a measurement
+
+
+@dataclass(frozen=True)
+class Question:
+    """A problem, and what its numbers are about."""
+
+    problem: Problem
+    rig: Rig
+    push: Mapping[str, int]
+    """Axis of a constant torque, by joint."""
+    notes: tuple[str, ...]
+    """What the gate left out, and why."""
+
+
+def ask(
+    log: Log, spec: mujoco.MjSpec, horizons: Sequence[float] = HORIZONS_S, healthy_logs: int = 20, seed: int = 0
+) -> Question:
+    """Builds the question.
+
+    Raises:
+      ValueError: the runs cannot be split, or are too short for a horizon.
+    """
+    log, notes = gate(log)
+    rate = log.runs[0].controller.rate_hz
+    plain = Rig(spec, log.joints, rate)
+    rig = Rig(spec, log.joints, rate, measure_scales(plain, log))
+    signals = tuple(name for name in ("dq", "q") if all(name in run.signals for run in log.runs))
+    nominal = rig.nominal()
+    index = {(axis.effect, axis.place): number for number, axis in enumerate(rig.axes)}
+
+    def simulate(vector, inputs):
+        read = rig.simulate(rig.tree(vector), inputs)
+        return {name: read[name] for name in signals}
+
+    problem = Problem(
+        simulate=simulate,
+        axes=len(rig.axes),
+        hypotheses=hypotheses(rig),
+        prior=np.array([nominal.get(axis, 0.0) for axis in rig.axes]),
+        data=_cut(log, rig, signals, horizons),
+        healthy=[
+            _cut(healthy(log, spec, seed + number), rig, signals, horizons, ("train", "select"))
+            for number in range(healthy_logs)
+        ],
+        bin_rows=segments.rows_together(1.0 / log.rate_hz, _BIN_S),
+        regimes=regimes.REGIMES,
+        components=dict.fromkeys(signals, rig.joints),
+    )
+    return Question(problem, rig, {joint: index["constant_push", joint] for joint in rig.joints}, notes)
+
+
+def gate(log: Log) -> tuple[Log, tuple[str, ...]]:
+    """Takes out what is no measurement, and says so."""
+    notes = []
+    late = [segments.velocity_lag(run) for run in log.runs if "dq" in run.signals]
+    if late and np.median(late) > _LATE_S:
+        notes.append(f"dq lags q by {1e3 * np.median(late):.0f} ms: it is filtered, and not used")
+        runs = [replace(run, signals={k: v for k, v in run.signals.items() if k != "dq"}) for run in log.runs]
+        log = replace(log, runs=tuple(runs))
+    # The recorded rate; time stamps win.
+    rate = 1.0 / float(np.median([np.median(np.diff(run.time)) for run in log.runs]))
+    return replace(log, rate_hz=rate), tuple(notes)
+
+
+def measure_scales(rig: Rig, log: Log) -> dict[str, np.ndarray]:
+    """What one unit of a coordinate stands for at every place: what the robot did in this log."""
+    torque, speed, limit, pose = [], [], [], []
+    for run in log.runs:
+        position, velocity = np.moveaxis(segments.smoothed(run), 1, 0)
+        asked, most = regimes.control_torque(run, position, velocity)
+        torque.append(asked)
+        speed.append(velocity)
+        limit.append(np.where(np.isfinite(most), most, 0.0))
+        pose.append(position)
+    rms = lambda values: np.sqrt((np.concatenate(values) ** 2).mean(axis=0)) + 1e-6
+    mass, inertia = rig.inertias(np.concatenate(pose).mean(axis=0))
+    return {
+        "torque": rms(torque),
+        "damping": rms(torque) / rms(speed),
+        "stiffness": rms(torque) / 0.02,
+        "inertia": inertia,
+        "mass": mass,
+        "drag": mass * 9.81,  # N s/m that weigh as much as the link at 1 m/s
+        "speed": rms(speed),
+        "slow": 0.1 * rms(speed),
+        "motor": np.maximum(np.concatenate(limit).max(axis=0), 1e-6) / rms(speed),
+    }
+
+
+def hypotheses(rig: Rig) -> tuple[Hypothesis, ...]:
+    """Every effect at every place alone, at left/right pairs, and at all of them."""
+    index = {(axis.effect, axis.parameter, axis.place): number for number, axis in enumerate(rig.axes)}
+    found = []
+    for name, row in rig.effects.items():
+        free = [number for number, parameter in enumerate(row.parameters) if not parameter.shape]
+        sizes = np.zeros((len(free) if len(free) > 1 else len(row.sizes), len(row.parameters)))
+        if len(free) > 1:
+            sizes[np.arange(len(free)), free] = row.sizes[0]
+        else:
+            sizes[:, free[0]] = row.sizes
+        for places in place_sets(rig.places[row.on]):
+            directions = np.zeros((len(row.parameters), len(rig.axes)))
+            for number, parameter in enumerate(row.parameters):
+                directions[number, [index[name, parameter.name, place] for place in places]] = 1.0
+            found.append(
+                Hypothesis(
+                    name=name,
+                    family=row.family,
+                    places=places,
+                    directions=directions,
+                    probes=sizes,
+                    bounds=np.array([parameter.bounds for parameter in row.parameters]),
+                    joints=tuple(sorted({joint for place in places for joint in rig.moves(row.on, place)})),
+                )
+            )
+    return tuple(found)
+
+
+def place_sets(places: Sequence[str]) -> list[tuple[str, ...]]:
+    """Each alone, left and right together, all."""
+    pairs = [(one, one.replace("left", "right")) for one in places if "left" in one]
+    sets = [(place,) for place in places] + [pair for pair in pairs if pair[1] in places]
+    return sets if len(places) < 2 or tuple(places) in sets else [*sets, tuple(places)]
+
+
+def _cut(log: Log, rig: Rig, signals, horizons, wanted=("train", "select", "sealed")) -> dict[str, dict[float, Any]]:
+    parts = splits(log)
+    names = {split: {run.name for run in parts[split]} for split in wanted}
+    labels = [regimes.regimes(run) for run in log.runs]
+    data: dict[str, dict[float, Any]] = {split: {} for split in wanted}
+    for horizon in horizons:
+        # All runs at once: segments of equal shape compile once.
+        cut = segments.cut(log.runs, horizon, rig.dt, _BIN_S)
+        label = np.stack([labels[run][rows] for run, rows in zip(cut.run, cut.row, strict=True)])
+        for split in wanted:
+            mine = np.array([log.runs[run].name in names[split] for run in cut.run])
+            if not mine.any():
+                raise ValueError(f"runs: none of '{split}' is long enough for a segment of {horizon:g} s")
+            data[split][horizon] = Segments(
+                inputs=jax.tree.map(lambda leaf, mine=mine: leaf[mine], cut.segments),
+                signals={name: cut.signals[name][mine] for name in signals},
+                run=cut.run[mine],
+                regimes=label[mine],
+            )
+    return data

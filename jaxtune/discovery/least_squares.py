@@ -1,0 +1,56 @@
+"""Least squares with priors, on residuals in floor units.
+
+Coordinates `u` are those that may move from a point: r(u) = r + J u, and the loss is weight |r|^2 + |(offset + u) / sd|^2
+with `sd` infinite where nothing is known before.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Linear:
+    """Residuals near a point."""
+
+    residual: np.ndarray
+    """[features]"""
+    jacobian: np.ndarray
+    """[features, coordinates]"""
+    offset: np.ndarray
+    """[coordinates] where the point is, seen from the prior's centre."""
+    sd: np.ndarray
+    """[coordinates] the prior's standard deviation."""
+    weight: float
+    """Share of the features that count as independent."""
+
+    @property
+    def loss(self) -> float:
+        """Loss at the point."""
+        return float(self.weight * self.residual @ self.residual + ((self.offset / self.sd) ** 2).sum())
+
+    def rows(self, features: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Value [n] and slope [n, coordinates] of what is squared, the prior's rows last."""
+        root = np.sqrt(self.weight) * (1.0 if features is None else np.sqrt(features))
+        value = np.concatenate([root * self.residual, self.offset / self.sd])
+        slope = np.concatenate([(root * self.jacobian.T).T, np.diag(1.0 / self.sd)])
+        return value, slope
+
+    def step(self, damping: float = 0.0, features: np.ndarray | None = None) -> np.ndarray:
+        """The step [coordinates] to the least loss, each of the features weighed if given."""
+        value, slope = self.rows(features)
+        normal = slope.T @ slope
+        diagonal = np.diag(normal).copy()
+        diagonal[diagonal <= 0] = 1.0
+        # What nothing depends on stays where it is.
+        return np.linalg.solve(normal + np.diag(damping * diagonal + 1e-9 * diagonal), -slope.T @ value)
+
+
+def complement(slope: np.ndarray, ridge: float = 1e-9):
+    """The projection [n] -> [n] onto what these columns [n, k] cannot explain, as a function of [n, ...]."""
+    if not slope.shape[1]:
+        return lambda values: values
+    scale = np.sqrt((slope**2).sum(axis=0))
+    basis, triangle = np.linalg.qr(slope / np.where(scale > 0, scale, 1.0))
+    basis = basis[:, np.abs(np.diag(triangle)) > ridge]
+    return lambda values: values - basis @ (basis.T @ values)

@@ -1,0 +1,127 @@
+"""Which hypotheses deserve a fit (step 5): a score test of every effect at every place.
+
+A hypothesis' slopes are secants at the sizes at which it is looked for, from where the model stands; those of several
+places are the sum of those of each. What the free coordinates explain is projected out.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from jaxtune.discovery.fit import Fit, Free
+from jaxtune.discovery.least_squares import Linear, complement
+from jaxtune.discovery.problem import Hypothesis
+
+_VISIBLE = 4.0  # standard deviations
+_OUT_OF_SIZE = 3.0  # a secant speaks for sizes up to this multiple of its own
+
+
+@dataclass(frozen=True)
+class Score:
+    """What a score test says of a hypothesis."""
+
+    gain: float
+    """By how much the loss falls."""
+    coordinates: np.ndarray
+    """[parameters] at which it falls most."""
+    visible: float
+    """How many standard deviations the smallest size of interest, or a larger one, would move the residuals."""
+
+    @property
+    def testable(self) -> bool:
+        """Whether these logs could show it."""
+        return self.visible >= _VISIBLE
+
+
+class Screen:
+    """Secants of all hypotheses at one point.
+
+    Args:
+      fit: the point, with the slopes of what is free.
+      columns: [features] of every (axis, size) that `probes` asked for, per unit of the coordinate.
+    """
+
+    def __init__(self, fit: Fit, columns: Mapping[tuple, np.ndarray]):
+        self._fit, self._columns = fit, columns
+        self._projections = {}
+
+    def scores(self, hypotheses: Sequence[Hypothesis], residual: np.ndarray | None = None) -> dict[str, Score]:
+        """A score for every hypothesis; for other residuals [features], measured at the prior's centre, if given."""
+        return {hypothesis.key: self._score(hypothesis, residual) for hypothesis in hypotheses}
+
+    def _score(self, hypothesis: Hypothesis, residual: np.ndarray | None) -> Score:
+        own = given_up(self._fit.free, hypothesis)
+        value, project = self._projected(own)
+        least = np.sum(self._projected(np.zeros_like(own))[0] ** 2)
+        if residual is not None:
+            padding = np.zeros(len(value) - len(residual))
+            value = np.concatenate([np.sqrt(self._fit.weight) * residual, padding])
+            least = np.sum(self._projected(np.zeros_like(own))[1](self._with_prior(value, own)) ** 2)
+            value = project(value)
+        best = Score(0.0, np.zeros(len(hypothesis.directions)), 0.0)
+        visible = 0.0
+        for sizes, group in groups(hypothesis):
+            column = np.stack([sum(self._columns[key] for key in keys) for keys in group], axis=1)
+            padding = np.zeros((len(value) - len(column), column.shape[1]))
+            slope = project(np.concatenate([np.sqrt(self._fit.weight) * column, padding]))
+            visible = max(visible, float(np.abs(sizes * np.sqrt((slope**2).sum(axis=0))).max()))
+            normal = slope.T @ slope
+            if np.trace(normal) < 1e-12:
+                continue
+            found = -np.linalg.solve(normal + 1e-9 * np.trace(normal) * np.eye(len(normal)), slope.T @ value)
+            full = np.zeros(len(hypothesis.directions))
+            full[: len(found)] = found
+            low, high = hypothesis.bounds.T
+            if len(hypothesis.probes) > 1 and low[0] >= 0:
+                high = np.minimum(high, _OUT_OF_SIZE * sizes.max())
+            full = np.clip(full, low, high)
+            gain = float(least - np.sum((value + slope @ full[: len(found)]) ** 2))
+            if gain > best.gain:
+                best = Score(gain, full, 0.0)
+        return Score(best.gain, best.coordinates, visible)
+
+    def _with_prior(self, value: np.ndarray, own: np.ndarray) -> np.ndarray:
+        return np.concatenate([value, np.zeros(int(own.sum()))])
+
+    def _projected(self, own: np.ndarray):
+        """The point's residuals and the projection, without the coordinates that a hypothesis takes over."""
+        key = own.tobytes()
+        if key not in self._projections:
+            linear = self._fit.linear
+            left = Linear(
+                linear.residual, linear.jacobian[:, ~own], linear.offset[~own], linear.sd[~own], linear.weight
+            )
+            value, slope = left.rows()
+            project = complement(slope)
+            self._projections[key] = (project(value), project)
+        return self._projections[key]
+
+
+def given_up(free: Free, hypothesis: Hypothesis) -> np.ndarray:
+    """Which coordinates [coordinates] are the hypothesis' own: nominal parameters at its places, prior and all."""
+    if len(hypothesis.directions) > 1:
+        return np.zeros(len(free.sd), bool)
+    mine = hypothesis.directions[0] != 0
+    within = np.array([not (direction[~mine] != 0).any() for direction in free.directions])
+    return within & np.isfinite(free.sd)
+
+
+def groups(hypothesis: Hypothesis):
+    """(sizes [k], keys of each of the k directions) for every size at which it is looked for."""
+    free = [index for index in range(len(hypothesis.directions)) if (hypothesis.probes[:, index] != 0).any()]
+    together = len(free) > 1
+    rows = [hypothesis.probes.max(axis=0)] if together else hypothesis.probes
+    for probe in rows:
+        yield (
+            np.array([probe[index] for index in free]),
+            [
+                [(int(axis), float(probe[index])) for axis in np.flatnonzero(hypothesis.directions[index])]
+                for index in free
+            ],
+        )
+
+
+def probes(hypotheses: Sequence[Hypothesis]) -> list[tuple[int, float]]:
+    """All (axis, size) whose secants the hypotheses need."""
+    return sorted({key for hypothesis in hypotheses for _, group in groups(hypothesis) for keys in group for key in keys})
