@@ -10,7 +10,6 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 
-from envs import domain
 from envs.logs import Log, Run
 from envs.rig import hung
 from envs.segments import noise, quantum_of, smoothed
@@ -33,19 +32,17 @@ def _drawn(spec: mujoco.MjSpec, rng: np.random.Generator) -> mujoco.MjModel:
     model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     model.opt.iterations, model.opt.ls_iterations = 100, 50
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION
-    bodies = {
-        f"mass {i}": domain.Entry(
-            name=f"mass {i}", kind="body", targets=(model.body(i).name,), fields=("body_mass", "body_inertia"), bounds=(0, 9)
-        )
-        for i in range(1, model.nbody)
-        if model.body_mass[i] > 0
-    }
-    draw = lambda size=None: np.exp(_SPREAD * rng.standard_normal(size).clip(-2, 2))
-    model = domain.apply_mujoco(model, {name: float(draw(1)[0]) for name in bodies}, bodies)
+    masses = _factors(rng, model.nbody)
+    model.body_mass[:] *= masses
+    model.body_inertia[:] *= masses[:, None]
     for name in ("dof_armature", "dof_damping", "dof_frictionloss"):
-        getattr(model, name)[:] *= draw(model.nv)
+        getattr(model, name)[:] *= _factors(rng, model.nv)
     mujoco.mj_setConst(model, mujoco.MjData(model))
     return model
+
+
+def _factors(rng: np.random.Generator, count: int) -> np.ndarray:
+    return np.exp(_SPREAD * rng.standard_normal(count).clip(-2.0, 2.0))
 
 
 def replay(run: Run, model: mujoco.MjModel, joints, rng: np.random.Generator) -> Run:
@@ -64,7 +61,8 @@ def replay(run: Run, model: mujoco.MjModel, joints, rng: np.random.Generator) ->
     times = run.time[0] + model.opt.timestep * looks
     last = np.clip(np.searchsorted(run.time, times + 1e-9, side="right") - 1, 0, len(run.time) - 1)
     states, torques = np.empty((len(looks), 2, len(joints))), np.empty((len(looks), len(joints)))
-    mujoco.mj_step(model, data, looks[0]) if looks[0] else None
+    if looks[0]:
+        mujoco.mj_step(model, data, int(looks[0]))
     for look, row in enumerate(last):
         q, dq = data.qpos[qpos], data.qvel[dof]
         if not driven:

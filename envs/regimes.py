@@ -8,7 +8,12 @@ from envs.segments import smoothed
 REGIMES = ("steady", "fast", "loaded", "reversal", "saturated", "motor off")
 """Later ones rule where two apply."""
 
-_FAST, _LOADED, _STILL, _SATURATED = 1.5, 1.5, 0.15, 0.98  # shares of the joint's own root mean square, and of the limit
+_FAST, _LOADED, _STILL, _SATURATED = (
+    1.5,
+    1.5,
+    0.15,
+    0.98,
+)  # shares of the joint's own root mean square, and of the limit
 
 
 def regimes(run: Run) -> np.ndarray:

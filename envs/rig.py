@@ -14,8 +14,8 @@ import mujoco
 import numpy as np
 from mujoco import mjx
 
-from envs import domain
-from envs.effects import LIBRARY
+from envs import domain, sensing
+from envs.effects import LIBRARY, RESIDUAL
 from envs.effects.memory import LONGEST_S
 from envs.segments import Segment
 from jaxtune.types import Effect, Parameter
@@ -33,6 +33,7 @@ class Now:
     """What an effect may look at."""
 
     dt: float
+    position: jax.Array  # [joints] rad
     speed: jax.Array  # [joints] rad/s
     load: jax.Array  # [joints] Nm through the gears
     limit: jax.Array  # [joints] Nm, the controller's
@@ -78,6 +79,7 @@ class Rig:
         scales: Mapping[str, np.ndarray] | None = None,
     ):
         model = hung(spec)
+        self.control_hz = control_hz
         self.dt = 1.0 / control_hz / np.ceil(1.0 / control_hz / _LONGEST_STEP_S - 1e-9)
         model.opt.timestep = self.dt
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION
@@ -85,7 +87,11 @@ class Rig:
         found = [model.joint(name) for name in joints]
         self.qpos = np.array([joint.qposadr[0] for joint in found])
         self.dof = np.array([joint.dofadr[0] for joint in found])
-        moving = [i for i in range(1, model.nbody) if model.body_weldid[i] > 0 and model.body_mass[i] > 0]
+        moving = [
+            i
+            for i in range(1, model.nbody)
+            if model.body_weldid[i] > 0 and model.body_mass[i] > 0 and model.body(i).name
+        ]
         self._bodies = np.array(moving)
         self.bodies = tuple(model.body(i).name for i in moving)
         self.mj_model = model
@@ -97,9 +103,12 @@ class Rig:
         self._model = mjx.put_model(device)
         self._friction = jnp.asarray(model.dof_frictionloss[self.dof], jnp.float32)
         self._data = mjx.make_data(self._model)
+        # The IMU sits on the body that holds the others.
+        self._gravity = sensing.projected_gravity(jnp.asarray(model.body_quat[1], jnp.float32))
         self._scales = dict(scales or {})
         self.places = {"joint": self.joints, "body": self.bodies, "foot": (), "robot": ("robot",)}
-        self.effects = {name: row for name, row in LIBRARY.items() if self.places[row.on] and row.needs != "free"}
+        rows = (*LIBRARY.values(), RESIDUAL)
+        self.effects = {row.name: row for row in rows if self.places[row.on] and row.needs != "free"}
         self.axes = tuple(
             Axis(name, parameter.name, place, index)
             for name, row in self.effects.items()
@@ -182,21 +191,20 @@ class Rig:
                 params[key] = jnp.exp(inner) if parameter.form == "ratio" else inner
         return domain.apply(self._model, params, entries)
 
-    def simulate(self, coordinates: Coordinates, segments: Segment) -> dict[str, jax.Array]:
-        """Moves the robot through segments.
+    def simulate(self, coordinates: Coordinates, segment: Segment) -> dict[str, jax.Array]:
+        """Moves the robot through a segment.
 
         Args:
           coordinates: of all effects, one hypothesis.
-          segments: [segments, ...] on every field.
+          segment: what was sent, and what was measured before it.
 
         Returns:
-          What is read at the rows, [segments, rows, joints] by signal.
+          What is read at the rows, [rows, joints] by signal; of `gravity` [rows, 3].
         """
-        values = self._values(coordinates)
-        model = self.model(values)
-        return jax.vmap(lambda segment: self._play(values, model, segment))(segments)
+        values = self.values(coordinates)
+        return self._play(values, self.model(values), segment)
 
-    def _values(self, coordinates: Coordinates) -> dict:
+    def values(self, coordinates: Coordinates) -> dict:
         """What the physics reads of the coordinates."""
         return {
             name: {
@@ -238,7 +246,7 @@ class Rig:
             bias = data.qfrc_bias[self.dof]
             motor = joint.at[0].add(self._offset(memory))
             memory, (torque, read) = self._drive(values, memory, motor, x)
-            now = self._now(x, joint[1], load=0.5 * jnp.abs(torque + bias), data=data)
+            now = self._now(x, joint, load=0.5 * jnp.abs(torque + bias), data=data)
             friction, _ = self._stage("friction", values, self._friction, now, memory)
             wrench, _ = self._stage("wrench", values, self._calm(), now, memory)
             # With a bound of nothing at all MJX brakes the joint.
@@ -253,7 +261,9 @@ class Rig:
         _, read = jax.lax.scan(move, (memory, data), future)
         step, share = segment.row_step, segment.row_share[:, None]
         following = jnp.minimum(step + 1, len(future["sample"]) - 1)
-        return jax.tree.map(lambda x: x[step] + share * (x[following] - x[step]), read)
+        read = jax.tree.map(lambda x: x[step] + share * (x[following] - x[step]), read)
+        gravity, _ = self._stage("gravity", values, self._gravity, None, {})
+        return read | {"gravity": jnp.broadcast_to(gravity, (len(step), 3))}
 
     def _rows(self, stage: str) -> list[Effect]:
         return [row for row in self.effects.values() if row.enters == stage]
@@ -285,7 +295,7 @@ class Rig:
 
     def _drive(self, values, memory, motor, x):
         """From what is true of the motors [2, joints] to the torque on the joints, and what is read."""
-        now = self._now(x, motor[1])
+        now = self._now(x, motor)
         readings, memory = self._stage("sensor", values, motor, now, memory)
         target, memory = self._stage("command", values, x["target"], now, memory)
         error, memory = self._stage("error", values, target - readings[0], now, memory)
@@ -299,12 +309,13 @@ class Rig:
         """How far the motors are ahead of the joints, [joints] rad."""
         return sum(memory[row.name] for row in self._rows("transmission"))
 
-    def _now(self, x, speed, load=0.0, data=None) -> Now:
+    def _now(self, x, state, load=0.0, data=None) -> Now:
         velocity = jnp.zeros((len(self.bodies), 3)) if data is None else _velocity(self._model, data)[self._bodies]
         return Now(
             dt=self.dt,
-            speed=speed,
-            load=load * jnp.ones_like(speed),
+            position=state[0],
+            speed=state[1],
+            load=load * jnp.ones_like(state[1]),
             limit=x["limit"],
             stiffness=x["stiffness"],
             damping=x["damping"] + x["emf"],

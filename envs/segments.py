@@ -17,7 +17,7 @@ from envs.logs import Run
 
 _SMOOTHING_S = 0.012  # half width of the fit that finds measured states
 _MIN_HALF_ROWS = 2
-_HISTORY_S = LONGEST_S + 0.02
+HISTORY_S = LONGEST_S + 0.02
 
 
 @chex.dataclass(frozen=True)
@@ -124,11 +124,11 @@ def cut(runs: Sequence[Run], horizon_s: float, dt: float, bin_s: float = 0.01) -
     rows = max(1, round(horizon_s / period / together)) * together
     pieces = []
     for number, run in enumerate(runs):
-        first = int(np.searchsorted(run.time, run.time[0] + _HISTORY_S))
+        first = int(np.searchsorted(run.time, run.time[0] + HISTORY_S))
         pieces += [(number, start) for start in range(first, len(run.time) - rows, rows)]
     if not pieces:
         longest = max(run.time[-1] - run.time[0] for run in runs)
-        raise ValueError(f"runs: the longest has {longest:.3g} s, expected more than {horizon_s + _HISTORY_S:.3g} s")
+        raise ValueError(f"runs: the longest has {longest:.3g} s, expected more than {horizon_s + HISTORY_S:.3g} s")
     after = 1 + max(int(np.ceil((runs[n].time[i + rows] - runs[n].time[i]) / dt)) for n, i in pieces)
     prepared = [_Prepared(run, dt) for run in runs]
     segments = [prepared[number].segment(start, rows, after) for number, start in pieces]
@@ -187,7 +187,7 @@ class _Prepared:
 
     def segment(self, start: int, rows: int, after: int) -> Segment:
         run, dt = self._run, self._dt
-        before, ahead = round(_HISTORY_S / dt), round(LONGEST_S / dt)
+        before, ahead = round(HISTORY_S / dt), round(LONGEST_S / dt)
         begin = run.time[start]
         grid = begin + dt * np.arange(-before, after)
         # A row's target acts from its time stamp until the next.

@@ -8,7 +8,6 @@ on the robot, and put what was measured beside them.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import mujoco
 import numpy as np

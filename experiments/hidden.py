@@ -5,7 +5,7 @@ the controller ticks at its rate, late by a jitter, and holds; friction is a bri
 smoothly; lags are of second order; play and springs are joints of their own. What is read has noise and is rounded.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import mujoco
@@ -80,7 +80,10 @@ class _Robot:
         self._truth, self._joints = truth, tuple(joints)
         spec = spec.copy()
         nominal = hung(spec)
-        off = lambda: float(np.exp(rng.choice([-1, 1]) * rng.uniform(0.5, 1.5) * nominal_error))
+
+        def off() -> float:
+            return float(np.exp(rng.choice([-1, 1]) * rng.uniform(0.5, 1.5) * nominal_error))
+
         masses = {nominal.body(i).name: off() for i in range(1, nominal.nbody)}
         for body in spec.bodies:
             if body.name in masses:
@@ -177,7 +180,10 @@ class _Robot:
         lag, lag_read = np.zeros((2, len(at))), None
         bristle = np.zeros(len(at))
         rate = 1.0 / float(np.median(np.diff(motion.time)))
-        row_of = lambda time: min(max(int(time * rate + 1e-6), 0), len(motion.target) - 1)
+
+        def row_of(time: float) -> int:
+            return min(max(int(time * rate + 1e-6), 0), len(motion.target) - 1)
+
         torque = np.zeros(len(at))
         for step in range(count):
             now = step * _STEP_S
@@ -220,8 +226,10 @@ class _Robot:
                 data.xfrc_applied[body, :3] = -drag * velocity[3:]
             mujoco.mj_step(model, data)
         grid = np.arange(count) * _STEP_S
-        at_rows = lambda values: np.stack([np.interp(motion.time, grid, column) for column in values.T], axis=1)
-        return at_rows(read[:, 0]), at_rows(read[:, 1])
+        position, speed = (
+            np.stack([np.interp(motion.time, grid, column) for column in read[:, kind].T], axis=1) for kind in (0, 1)
+        )
+        return position, speed
 
     def _past(self, seen, step, behind):
         if step == 0:
@@ -265,9 +273,7 @@ class _Robot:
         stiffness = _BRISTLE * np.maximum(level, 1e-9)
         rate = speed - stiffness * np.abs(speed) / np.maximum(level, 1e-9) * bristle
         # Implicit in the bristle: the explicit form is unstable where speed is high.
-        bristle = np.where(
-            there, (bristle + _STEP_S * speed) / (1 + _STEP_S * _BRISTLE * np.abs(speed)), 0.0
-        )
+        bristle = np.where(there, (bristle + _STEP_S * speed) / (1 + _STEP_S * _BRISTLE * np.abs(speed)), 0.0)
         damping = 0.3 * np.sqrt(stiffness * 1e-3)
         return bristle, np.where(there, stiffness * bristle + damping * np.where(np.abs(speed) < 0.05, rate, 0.0), 0.0)
 

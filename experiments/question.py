@@ -9,10 +9,12 @@ import mujoco
 import numpy as np
 
 from envs import regimes, segments
+from envs.effects import LIBRARY, RESIDUAL
 from envs.healthy import healthy
 from envs.logs import Log, splits
 from envs.rig import Rig
 from jaxtune.discovery.problem import Hypothesis, Problem, Segments
+from jaxtune.types import Effect
 
 HORIZONS_S = (0.05, 0.15, 0.45)
 _BIN_S = 0.01
@@ -27,6 +29,8 @@ class Question:
     rig: Rig
     push: Mapping[str, int]
     """Axis of a constant torque, by joint."""
+    splits: Mapping[str, tuple[str, ...]]
+    """Names of the runs by split."""
     notes: tuple[str, ...]
     """What the gate left out, and why."""
 
@@ -43,7 +47,7 @@ def ask(
     rate = log.runs[0].controller.rate_hz
     plain = Rig(spec, log.joints, rate)
     rig = Rig(spec, log.joints, rate, measure_scales(plain, log))
-    signals = tuple(name for name in ("dq", "q") if all(name in run.signals for run in log.runs))
+    signals = tuple(name for name in ("dq", "gravity", "q") if all(name in run.signals for run in log.runs))
     nominal = rig.nominal()
     index = {(axis.effect, axis.place): number for number, axis in enumerate(rig.axes)}
 
@@ -54,18 +58,21 @@ def ask(
     problem = Problem(
         simulate=simulate,
         axes=len(rig.axes),
-        hypotheses=hypotheses(rig),
+        hypotheses=hypotheses(rig, {name: row for name, row in rig.effects.items() if name in LIBRARY}),
         prior=np.array([nominal.get(axis, 0.0) for axis in rig.axes]),
+        timing=_timing(rig),
         data=_cut(log, rig, signals, horizons),
         healthy=[
-            _cut(healthy(log, spec, seed + number), rig, signals, horizons, ("train", "select"))
+            _cut(healthy(log, spec, seed + number), rig, signals, horizons, ("train",))["train"]
             for number in range(healthy_logs)
         ],
         bin_rows=segments.rows_together(1.0 / log.rate_hz, _BIN_S),
         regimes=regimes.REGIMES,
-        components=dict.fromkeys(signals, rig.joints),
+        components={name: tuple("xyz") if name == "gravity" else rig.joints for name in signals},
+        residual={h.places[0]: h for h in hypotheses(rig, {RESIDUAL.name: RESIDUAL}) if len(h.places) == 1},
     )
-    return Question(problem, rig, {joint: index["constant_push", joint] for joint in rig.joints}, notes)
+    names = {split: tuple(run.name for run in runs) for split, runs in splits(log).items()}
+    return Question(problem, rig, {joint: index["constant_push", joint] for joint in rig.joints}, names, notes)
 
 
 def gate(log: Log) -> tuple[Log, tuple[str, ...]]:
@@ -91,26 +98,29 @@ def measure_scales(rig: Rig, log: Log) -> dict[str, np.ndarray]:
         speed.append(velocity)
         limit.append(np.where(np.isfinite(most), most, 0.0))
         pose.append(position)
-    rms = lambda values: np.sqrt((np.concatenate(values) ** 2).mean(axis=0)) + 1e-6
     mass, inertia = rig.inertias(np.concatenate(pose).mean(axis=0))
     return {
-        "torque": rms(torque),
-        "damping": rms(torque) / rms(speed),
-        "stiffness": rms(torque) / 0.02,
+        "torque": _rms(torque),
+        "damping": _rms(torque) / _rms(speed),
+        "stiffness": _rms(torque) / 0.02,
         "inertia": inertia,
         "mass": mass,
         "drag": mass * 9.81,  # N s/m that weigh as much as the link at 1 m/s
-        "speed": rms(speed),
-        "slow": 0.1 * rms(speed),
-        "motor": np.maximum(np.concatenate(limit).max(axis=0), 1e-6) / rms(speed),
+        "speed": _rms(speed),
+        "slow": 0.1 * _rms(speed),
+        "motor": np.maximum(np.concatenate(limit).max(axis=0), 1e-6) / _rms(speed),
     }
 
 
-def hypotheses(rig: Rig) -> tuple[Hypothesis, ...]:
+def _rms(values: Sequence[np.ndarray]) -> np.ndarray:
+    return np.sqrt((np.concatenate(values) ** 2).mean(axis=0)) + 1e-6
+
+
+def hypotheses(rig: Rig, rows: Mapping[str, Effect]) -> tuple[Hypothesis, ...]:
     """Every effect at every place alone, at left/right pairs, and at all of them."""
     index = {(axis.effect, axis.parameter, axis.place): number for number, axis in enumerate(rig.axes)}
     found = []
-    for name, row in rig.effects.items():
+    for name, row in rows.items():
         free = [number for number, parameter in enumerate(row.parameters) if not parameter.shape]
         sizes = np.zeros((len(free) if len(free) > 1 else len(row.sizes), len(row.parameters)))
         if len(free) > 1:
@@ -120,7 +130,13 @@ def hypotheses(rig: Rig) -> tuple[Hypothesis, ...]:
         for places in place_sets(rig.places[row.on]):
             directions = np.zeros((len(row.parameters), len(rig.axes)))
             for number, parameter in enumerate(row.parameters):
-                directions[number, [index[name, parameter.name, place] for place in places]] = 1.0
+                scale = dict(zip(rig.places[row.on], rig.scale(row, parameter), strict=True))
+                for place in places:
+                    # The same physical size everywhere, whatever a coordinate stands for there.
+                    ratio = scale[places[0]] / scale[place]
+                    factor = 1.0 / ratio if parameter.form == "reciprocal" else ratio
+                    shared = parameter.form == "ratio"
+                    directions[number, index[name, parameter.name, place]] = 1.0 if shared else factor
             found.append(
                 Hypothesis(
                     name=name,
@@ -133,6 +149,12 @@ def hypotheses(rig: Rig) -> tuple[Hypothesis, ...]:
                 )
             )
     return tuple(found)
+
+
+def _timing(rig: Rig) -> np.ndarray:
+    """Half a period of the controller, as the delay of all readings, [1, axes]."""
+    late = [axis.effect == "sensor_delay" for axis in rig.axes]
+    return np.array([late], float) * 0.5 / rig.control_hz
 
 
 def place_sets(places: Sequence[str]) -> list[tuple[str, ...]]:

@@ -1,6 +1,7 @@
 """What the parts of jaxtune, and everything built on it, hand to each other."""
 
 import enum
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -95,6 +96,14 @@ class Parameter:
         if self.form == "reciprocal":
             return 1.0 / inner
         return jnp.exp(inner) if self.form == "ratio" and not self.shape else inner
+
+    def coordinate(self, value: float, scale: float) -> float:
+        """The inverse of `value`."""
+        if self.form == "reciprocal":
+            return scale / value
+        if self.form == "ratio":
+            return math.log(value / scale if self.shape else value)
+        return value / scale
 
 
 @dataclass(frozen=True, kw_only=True)

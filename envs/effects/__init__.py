@@ -10,6 +10,8 @@ in the order in which the rows stand:
 
 from envs.effects import actuator, contact, external, inertia, joint_friction, sensing, transmission
 
+RESIDUAL = external.RESIDUAL
+
 LIBRARY = {
     row.name: row
     for family in (joint_friction, actuator, transmission, inertia, sensing, contact, external)

@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 
-from envs.effects.memory import delayed, delay_line, lagged
+from envs.effects.memory import delay_line, delayed, lagged
 from jaxtune.types import Effect, Parameter
 
 _ACTUATOR = {"family": "actuator", "on": "joint"}
@@ -67,9 +67,7 @@ ROWS = (
     Effect(
         name="target_slew",
         enters="command",
-        parameters=(
-            Parameter(name="rad_per_s", form="reciprocal", scale="speed", bounds=(0.0, 3.0), prior=0.5),
-        ),
+        parameters=(Parameter(name="rad_per_s", form="reciprocal", scale="speed", bounds=(0.0, 3.0), prior=0.5),),
         sizes=(0.2, 0.6),
         act=_target_slew,
         start=lambda target, dt: target,

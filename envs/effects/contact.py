@@ -9,9 +9,7 @@ ROWS = (
         name="ground_friction",
         on="foot",
         parameters=(
-            Parameter(
-                name="ratio", form="ratio", bounds=(-2.0, 1.5), prior=0.3, fields=("geom_friction",), column=0
-            ),
+            Parameter(name="ratio", form="ratio", bounds=(-2.0, 1.5), prior=0.3, fields=("geom_friction",), column=0),
         ),
         sizes=(0.1,),
         sentence="The feet slip earlier or later than the model says.",
@@ -21,9 +19,7 @@ ROWS = (
     Effect(
         name="ground_compliance",
         on="foot",
-        parameters=(
-            Parameter(name="seconds", bounds=(-0.005, 0.1), prior=0.01, fields=("geom_solref",), column=0),
-        ),
+        parameters=(Parameter(name="seconds", bounds=(-0.005, 0.1), prior=0.01, fields=("geom_solref",), column=0),),
         sizes=(0.005,),
         sentence="The ground gives way and comes back more slowly.",
         excited_by="stepping in place, harder and softer",

@@ -1,5 +1,7 @@
 """From outside the robot."""
 
+import jax.numpy as jnp
+
 from jaxtune.types import Effect, Parameter
 
 _EXTERNAL = {"family": "external", "enters": "wrench"}
@@ -15,6 +17,36 @@ def _constant_push(values, wrench, now, memory):
     del now
     return wrench.replace(torque=wrench.torque + values["nm"]), memory
 
+
+def _residual_torque(values, wrench, now, memory):
+    """What nobody has a name for: a torque that depends on where the joint is and how it moves."""
+    torque = (
+        values["constant_nm"]
+        + values["sine_nm"] * jnp.sin(now.position)
+        + values["cosine_nm"] * jnp.cos(now.position)
+        + values["direction_nm"] * jnp.tanh(now.speed / 0.1)
+        + values["speed_nm_s_per_rad"] * now.speed
+    )
+    return wrench.replace(torque=wrench.torque + torque), memory
+
+
+RESIDUAL = Effect(
+    name="residual_torque",
+    on="joint",
+    parameters=(
+        *(
+            Parameter(name=f"{name}_nm", scale="torque", bounds=(-1.0, 1.0), prior=0.3)
+            for name in ("constant", "sine", "cosine", "direction")
+        ),
+        Parameter(name="speed_nm_s_per_rad", scale="damping", bounds=(-1.0, 1.0), prior=0.3),
+    ),
+    sizes=(0.05,),
+    act=_residual_torque,
+    sentence="Something that the library has no name for acts on the joint.",
+    excited_by="a longer log of this joint in more postures",
+    **_EXTERNAL,
+)
+"""No hypothesis, but what is left where none fits: it names nothing, and is bounded."""
 
 ROWS = (
     Effect(

@@ -41,9 +41,7 @@ ROWS = (
         name="viscous",
         enters="model",
         parameters=(
-            Parameter(
-                name="nm_s_per_rad", scale="damping", bounds=(-0.5, 5.0), prior=0.3, fields=("dof_damping",)
-            ),
+            Parameter(name="nm_s_per_rad", scale="damping", bounds=(-0.5, 5.0), prior=0.3, fields=("dof_damping",)),
         ),
         sizes=(0.03,),
         sentence="The joint loses a torque in proportion to its speed.",

@@ -97,9 +97,7 @@ ROWS = (
         name="imu_tilt",
         on="robot",
         enters="gravity",
-        parameters=tuple(
-            Parameter(name=f"{axis}_rad", bounds=(-0.3, 0.3), prior=0.03) for axis in ("roll", "pitch")
-        ),
+        parameters=tuple(Parameter(name=f"{axis}_rad", bounds=(-0.3, 0.3), prior=0.03) for axis in ("roll", "pitch")),
         sizes=(0.01,),
         act=_imu_tilt,
         needs="gravity",

@@ -50,9 +50,7 @@ ROWS = (
     Effect(
         name="compliance",
         enters="transmission",
-        parameters=(
-            Parameter(name="nm_per_rad", form="reciprocal", scale="stiffness", bounds=(0.0, 20.0), prior=1.0),
-        ),
+        parameters=(Parameter(name="nm_per_rad", form="reciprocal", scale="stiffness", bounds=(0.0, 20.0), prior=1.0),),
         sizes=(0.2, 2.0),
         act=_compliance,
         start=_no_offset,
@@ -63,9 +61,7 @@ ROWS = (
     Effect(
         name="armature",
         enters="model",
-        parameters=(
-            Parameter(name="kg_m2", scale="inertia", bounds=(-0.5, 5.0), prior=0.3, fields=("dof_armature",)),
-        ),
+        parameters=(Parameter(name="kg_m2", scale="inertia", bounds=(-0.5, 5.0), prior=0.3, fields=("dof_armature",)),),
         sizes=(0.03,),
         sentence="The motor's rotor weighs more, seen through the gears, than the model says.",
         excited_by="a chirp to 10 Hz at two controller gains",

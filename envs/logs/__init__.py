@@ -8,5 +8,6 @@ Nothing is dropped, reordered or filled.
 
 from envs.logs.files import read, write
 from envs.logs.format import Controller, Log, Run, splits
+from envs.logs.xl330 import read_xl330
 
-__all__ = ["Controller", "Log", "Run", "read", "splits", "write"]
+__all__ = ["Controller", "Log", "Run", "read", "read_xl330", "splits", "write"]

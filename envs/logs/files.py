@@ -7,7 +7,6 @@ import pyarrow
 import pyarrow.csv
 import yaml
 
-from envs.biteno.constants import JOINTS
 from envs.logs.format import (
     JOINT_SIGNALS,
     SCALAR_SIGNALS,
@@ -19,9 +18,7 @@ from envs.logs.format import (
 )
 from envs.logs.meta import Meta
 from envs.logs.tables import READERS, check_time, check_values, refuse_first
-
-ROBOTS = {"biteno": JOINTS, "pendulum": ("hinge",)}
-"""Joints of the built-in models; any other robot is the path of an MJCF file, relative to the folder."""
+from envs.models import BUILT_IN
 
 _UNIT_NORM = 0.05  # how far a unit vector may be from one
 _RATE_RATIO = 2.0  # between nominal and recorded rate
@@ -37,7 +34,7 @@ def read(folder: Path) -> Log:
       ValueError: names the file, the row (of data, from 1) or the key, what was found and what was expected.
     """
     folder = Path(folder)
-    meta = Meta(folder, ROBOTS)
+    meta = Meta(folder, {name: joints for name, (_, joints) in BUILT_IN.items()})
     paths = sorted(folder.glob("run_*"))
     for path in paths:
         if path.suffix not in READERS or not path.is_file():

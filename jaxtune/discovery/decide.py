@@ -56,8 +56,16 @@ def passes(evidence: Evidence, thresholds: Thresholds) -> dict[str, bool]:
 
 
 def paired(before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Fall of the mean square of every segment, [segments], of residuals [segments, bins, components]."""
-    return (before**2).mean(axis=(1, 2)) - (after**2).mean(axis=(1, 2))
+    """How much better every segment is, [segments], of residuals [segments, bins, components]."""
+    return losses(before) - losses(after)
+
+
+def losses(residual: np.ndarray) -> np.ndarray:
+    """What a segment's residuals [segments, bins, components] count for, [segments].
+
+    The logarithm keeps the few segments in which everything is far off from drowning the others.
+    """
+    return np.log1p((residual**2).mean(axis=(1, 2)))
 
 
 def t_statistic(gains: np.ndarray) -> float:
@@ -79,26 +87,25 @@ def max_t(gains: Mapping[str, np.ndarray], level: float, seed: int = 0) -> float
     return float(np.quantile((drawn.mean(axis=2) / np.maximum(error, 1e-12)).max(axis=0), 1.0 - level))
 
 
-def alike(losses: Mapping[str, np.ndarray], errors: float) -> list[str]:
+def alike(lost: Mapping[str, np.ndarray], errors: float) -> list[str]:
     """Those that cannot be told from the best, best first.
 
     Args:
-      losses: [segments] by hypothesis.
+      lost: what every segment counts for, [segments] by hypothesis.
       errors: how many standard errors of the paired difference count as a difference.
     """
-    order = sorted(losses, key=lambda key: losses[key].mean())
-    best = losses[order[0]]
-    close = lambda key: (losses[key] - best).mean() <= errors * _standard_error(losses[key] - best)
-    return [key for key in order if key == order[0] or close(key)]
+    order = sorted(lost, key=lambda key: lost[key].mean())
+    worse = {key: lost[key] - lost[order[0]] for key in order}
+    return [key for key in order if worse[key].mean() <= errors * _standard_error(worse[key])]
 
 
-def bagged(losses: Mapping[str, np.ndarray], seed: int = 0) -> dict[str, float]:
+def bagged(lost: Mapping[str, np.ndarray], seed: int = 0) -> dict[str, float]:
     """How often each is best when segments are drawn with repetition."""
-    values = np.stack(list(losses.values()))
+    values = np.stack(list(lost.values()))
     count = values.shape[1]
     draws = np.random.default_rng(seed).integers(count, size=(_DRAWS, count))
     winners = values[:, draws].mean(axis=2).argmin(axis=0)
-    return {key: float((winners == index).mean()) for index, key in enumerate(losses)}
+    return {key: float((winners == index).mean()) for index, key in enumerate(lost)}
 
 
 def simplest(keys: Sequence[str], complexity: Mapping[str, int]) -> str:
@@ -120,6 +127,6 @@ def sandwich(residual: np.ndarray, jacobian: np.ndarray, weight: float, sd: np.n
       sd: [coordinates] of the prior.
     """
     normal = weight * np.einsum("sfi,sfj->ij", jacobian, jacobian) + np.diag(1.0 / sd**2)
-    inverse = np.linalg.inv(normal + 1e-9 * np.diag(np.diag(normal)))
+    inverse = np.linalg.pinv(normal, hermitian=True)
     pull = weight * np.einsum("sfi,sf->si", jacobian, residual)
     return np.sqrt(np.diag(inverse @ (pull.T @ pull + np.diag(1.0 / sd**2)) @ inverse))

@@ -6,7 +6,11 @@ import numpy as np
 
 
 def cells(
-    residual: np.ndarray, regimes: np.ndarray, regime_names: Sequence[str], components: Sequence[tuple[str, str]], key: int
+    residual: np.ndarray,
+    regimes: np.ndarray,
+    regime_names: Sequence[str],
+    components: Sequence[tuple[str, str]],
+    key: int,
 ) -> list[dict]:
     """Energy above the floor by component and regime, largest first, with bootstrap intervals over segments.
 

@@ -23,10 +23,10 @@ class Gauge:
     """[bins, components]"""
     weight: float
     """Share of the bins that count as independent."""
-    jacobian: dict[str, np.ndarray]
-    """[segments, bins, components, nominal axes] by split, in floor units per prior standard deviation, at the null."""
-    healthy: tuple[dict[str, np.ndarray], ...]
-    """Residuals of every healthy log by split, in floor units, before any fit."""
+    jacobian: np.ndarray
+    """[segments, bins, components, directions] of what is free from the start, at the nominal model, on `train`."""
+    healthy: tuple[np.ndarray, ...]
+    """Residuals [segments, bins, components] of every healthy log before any fit, on its `train`."""
 
 
 def jacobian(measure: Residuals, vector: np.ndarray, directions: np.ndarray, segments: Segments) -> np.ndarray:
@@ -36,39 +36,33 @@ def jacobian(measure: Residuals, vector: np.ndarray, directions: np.ndarray, seg
 
 
 def nominal_directions(problem: Problem) -> np.ndarray:
-    """A prior standard deviation along every nominal axis, [nominal axes, axes]."""
-    return np.diag(problem.prior)[problem.prior > 0]
+    """A prior standard deviation along everything that is free from the start, [directions, axes]."""
+    return np.concatenate([np.diag(problem.prior)[problem.prior > 0], problem.timing])
 
 
-def gauge(problem: Problem, measure: Residuals, horizon: float, say=lambda done: None) -> Gauge:
-    """Measures the floor at one horizon."""
-    splits = ("train", "select")
+def gauge(problem: Problem, measure: Residuals, horizon: float, known: tuple[np.ndarray, float] | None = None) -> Gauge:
+    """Measures the floor at one horizon, or takes one that is known: floor and independent share."""
     zero = np.zeros(problem.axes)
-    directions = nominal_directions(problem)
-    slopes, raw = {}, []
-    for split in splits:
-        slopes[split] = jacobian(measure, zero, directions, problem.data[split][horizon])
-        say(split)
-    for log in problem.healthy:
-        raw.append({split: measure(zero, log[split][horizon])[0] for split in splits})
-        say("healthy")
-    pooled = np.concatenate([log["train"] for log in raw])
-    floor = np.sqrt((pooled**2).mean(axis=0))
-    weight = 1.0
+    slope = jacobian(measure, zero, nominal_directions(problem), problem.data["train"][horizon])
+    if known is not None:
+        return Gauge(floor=known[0], weight=known[1], jacobian=slope / known[0][..., None], healthy=())
+    raw = [measure(zero, log[horizon])[0] for log in problem.healthy]
+    floor, weight = np.sqrt((np.concatenate(raw) ** 2).mean(axis=0)), 1.0
     for _ in range(2):
-        left = [_refitted(log["train"] / floor, slopes["train"] / floor[..., None], weight) for log in raw]
-        weight = independent_share(np.concatenate(left))
-        fresh = floor * np.sqrt((np.concatenate(left) ** 2).mean(axis=0))
+        left = np.concatenate([refitted(log / floor, slope / floor[..., None], weight) for log in raw])
+        weight = independent_share(left)
+        fresh = floor * np.sqrt((left**2).mean(axis=0))
         floor = np.maximum(fresh, _LEAST_SHARE * fresh.mean(axis=0))
     return Gauge(
         floor=floor,
         weight=weight,
-        jacobian={split: slope / floor[..., None] for split, slope in slopes.items()},
-        healthy=tuple({split: values / floor for split, values in log.items()} for log in raw),
+        jacobian=slope / floor[..., None],
+        healthy=tuple(log / floor for log in raw),
     )
 
 
-def _refitted(residual: np.ndarray, slope: np.ndarray, weight: float) -> np.ndarray:
+def refitted(residual: np.ndarray, slope: np.ndarray, weight: float) -> np.ndarray:
+    """Residuals once the nominal parameters have answered, by slopes [..., nominal axes]."""
     count = slope.shape[-1]
     flat = slope.reshape(-1, count)
     linear = Linear(residual.ravel(), flat, np.zeros(count), np.ones(count), weight)
@@ -79,4 +73,6 @@ def independent_share(residual: np.ndarray) -> float:
     """Independent bins of a segment as a share of all, from how their mean scatters: [segments, bins, components]."""
     whole = (residual**2).mean(axis=(0, 1))
     of_means = (residual.mean(axis=1) ** 2).mean(axis=0)
-    return float(np.clip((whole / np.maximum(of_means, 1e-12)).mean() / residual.shape[1], 1.0 / residual.shape[1], 1.0))
+    return float(
+        np.clip((whole / np.maximum(of_means, 1e-12)).mean() / residual.shape[1], 1.0 / residual.shape[1], 1.0)
+    )

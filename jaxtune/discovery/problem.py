@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 Simulate = Callable[[jax.Array, Any], Mapping[str, jax.Array]]
-"""`simulate(coordinates [axes], inputs [segments, ...]) -> {signal: [segments, rows, components]}`."""
+"""`simulate(coordinates [axes], inputs) -> {signal: [rows, components]}`, of one segment."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,7 +24,7 @@ class Hypothesis:
     family: str
     places: tuple[str, ...]
     directions: np.ndarray
-    """[parameters, axes] of zeros and ones."""
+    """[parameters, axes]: how far each axis goes for one unit of a parameter; one at the first place."""
     probes: np.ndarray
     """[probes, parameters] where it is looked for, the smallest size of interest first."""
     bounds: np.ndarray
@@ -66,16 +66,21 @@ class Problem:
     hypotheses: Sequence[Hypothesis]
     prior: np.ndarray
     """[axes] standard deviation of the nominal parameters, zero for every other axis."""
+    timing: np.ndarray
+    """[directions, axes] a standard deviation along what nobody knows better either: when the controller looks."""
     data: Mapping[str, Mapping[float, Segments]]
     """Segments by split and horizon in s."""
-    healthy: Sequence[Mapping[str, Mapping[float, Segments]]]
-    """The same of logs in which nothing is missing: the nominal model in another engine, with the log's noise."""
+    healthy: Sequence[Mapping[float, Segments]]
+    """Segments by horizon, of `train`, of logs in which nothing is missing: the nominal model in another engine, with
+    the log's noise."""
     bin_rows: int
     """Rows that are taken together."""
     regimes: tuple[str, ...]
     """Names of the regimes."""
-    components: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    components: Mapping[str, tuple[str, ...]]
     """Names of the components of every signal."""
+    residual: Mapping[str, Hypothesis] = field(default_factory=dict)
+    """A torque without a name, by joint: what stands in where nothing fits."""
 
     @property
     def horizons(self) -> tuple[float, ...]:
@@ -86,54 +91,54 @@ class Problem:
 class Residuals:
     """Measured less simulated, in means over a few rows: [hypotheses, segments, bins, components of all signals].
 
-    Works through (vector, chunk of segments) pairs in a loop whose length is an argument, so it compiles once for every
-    length of segments, whatever their number and that of the vectors.
+    Every (vector, segment) is a simulation of its own; they are moved side by side, `width` at a time, in a loop whose
+    length is an argument. So it compiles once for every length of segments, whatever their number and the vectors'.
     """
 
-    _BATCH = 32
-    """Pairs that are handed over at once."""
+    _CHUNKS = 16
+    """Chunks that are handed over at once."""
 
-    def __init__(self, problem: Problem, chunk: int = 64):
-        self._problem, self._chunk = problem, chunk
+    def __init__(self, problem: Problem, width: int = 128):
+        self._problem, self._width = problem, width
         self._compiled = jax.jit(self._loop)
 
     def _loop(self, count, vectors, inputs):
-        simulate = lambda vector, segments: binned(self._problem.simulate(vector, segments), self._problem.bin_rows)
-        first = lambda tree: jax.tree.map(lambda leaf: leaf[0], tree)
-        shape = jax.eval_shape(simulate, vectors[0], first(inputs))
+        def simulate(vector, segment):
+            return binned(self._problem.simulate(vector, segment), self._problem.bin_rows)
+
+        shape = jax.eval_shape(simulate, *jax.tree.map(lambda leaf: leaf[0, 0], (vectors, inputs)))
 
         def work(index, found):
-            at = lambda tree: jax.tree.map(lambda leaf: leaf[index], tree)
-            return found.at[index].set(simulate(vectors[index], at(inputs)))
+            mine = jax.tree.map(lambda leaf: leaf[index], (vectors, inputs))
+            return found.at[index].set(jax.vmap(simulate)(*mine))
 
-        return jax.lax.fori_loop(0, count, work, jnp.zeros((self._BATCH, *shape.shape), shape.dtype))
+        return jax.lax.fori_loop(0, count, work, jnp.zeros((*vectors.shape[:2], *shape.shape), shape.dtype))
 
     def __call__(self, vectors: np.ndarray, segments: Segments) -> np.ndarray:
         """Residuals of vectors [hypotheses, axes]; those that are not finite come back as they are."""
         vectors = np.atleast_2d(np.asarray(vectors, np.float32))
-        measured = binned(segments.signals, self._problem.bin_rows)
-        count, size = len(measured), self._chunk
-        chunks = -(-count // size)
-        filled = jax.tree.map(
-            lambda leaf: np.asarray(leaf)[np.arange(chunks * size) % count].reshape(chunks, size, *leaf.shape[1:]),
-            segments.inputs,
-        )
-        pairs = [(vector, chunk) for vector in range(len(vectors)) for chunk in range(chunks)]
+        measured = np.stack([binned(piece, self._problem.bin_rows) for piece in _pieces(segments.signals)])
+        which, piece = (grid.ravel() for grid in np.indices((len(vectors), len(measured))))
         found = []
-        for start in range(0, len(pairs), self._BATCH):
-            some = pairs[start : start + self._BATCH]
-            which = np.array(some + [some[-1]] * (self._BATCH - len(some)))
-            inputs = jax.tree.map(lambda leaf, chunk=which[:, 1]: leaf[chunk], filled)
-            found.append(np.asarray(self._compiled(len(some), vectors[which[:, 0]], inputs))[: len(some)])
-        predicted = np.concatenate(found).reshape(len(vectors), chunks * size, *measured.shape[1:])[:, :count]
+        once = self._CHUNKS * self._width
+        for start in range(0, len(which), once):
+            count = min(once, len(which) - start)
+            mine = start + np.arange(once) % count
+            shaped = (self._CHUNKS, self._width)
+            inputs = jax.tree.map(
+                lambda leaf, at=piece[mine]: leaf[at].reshape(*shaped, *leaf.shape[1:]), segments.inputs
+            )
+            out = self._compiled(-(-count // self._width), vectors[which[mine]].reshape(*shaped, -1), inputs)
+            found.append(np.asarray(out).reshape(once, *measured.shape[1:])[:count])
+        predicted = np.concatenate(found).reshape(len(vectors), *measured.shape)
         return measured[None] - predicted
 
 
+def _pieces(signals: Mapping[str, np.ndarray]):
+    return [dict(zip(signals, values, strict=True)) for values in zip(*signals.values(), strict=True)]
+
+
 def binned(signals: Mapping[str, Any], rows: int):
-    """Means of `rows` rows, [segments, bins, components of all signals], signals in the order of their names."""
-    parts = [
-        signal.reshape(signal.shape[0], -1, rows, signal.shape[-1]).mean(axis=2)
-        for _, signal in sorted(signals.items())
-    ]
-    # What the simulator reads beyond what was measured is left out where the two are made (see `Problem.simulate`).
+    """Means of `rows` rows of [rows, components], [bins, components of all signals], in the order of the names."""
+    parts = [signal.reshape(-1, rows, signal.shape[-1]).mean(axis=1) for _, signal in sorted(signals.items())]
     return (jnp if isinstance(parts[0], jax.Array) else np).concatenate(parts, axis=-1)

@@ -62,7 +62,9 @@ class Screen:
         best = Score(0.0, np.zeros(len(hypothesis.directions)), 0.0)
         visible = 0.0
         for sizes, group in groups(hypothesis):
-            column = np.stack([sum(self._columns[key] for key in keys) for keys in group], axis=1)
+            column = np.stack(
+                [sum(share * self._columns[key] for key, share in keys.items()) for keys in group], axis=1
+            )
             padding = np.zeros((len(value) - len(column), column.shape[1]))
             slope = project(np.concatenate([np.sqrt(self._fit.weight) * column, padding]))
             visible = max(visible, float(np.abs(sizes * np.sqrt((slope**2).sum(axis=0))).max()))
@@ -108,7 +110,7 @@ def given_up(free: Free, hypothesis: Hypothesis) -> np.ndarray:
 
 
 def groups(hypothesis: Hypothesis):
-    """(sizes [k], keys of each of the k directions) for every size at which it is looked for."""
+    """For every size at which it is looked for: sizes [k], and its (axis, size) and shares for each of k directions."""
     free = [index for index in range(len(hypothesis.directions)) if (hypothesis.probes[:, index] != 0).any()]
     together = len(free) > 1
     rows = [hypothesis.probes.max(axis=0)] if together else hypothesis.probes
@@ -116,7 +118,10 @@ def groups(hypothesis: Hypothesis):
         yield (
             np.array([probe[index] for index in free]),
             [
-                [(int(axis), float(probe[index])) for axis in np.flatnonzero(hypothesis.directions[index])]
+                {
+                    (int(axis), float(probe[index])): float(hypothesis.directions[index, axis])
+                    for axis in np.flatnonzero(hypothesis.directions[index])
+                }
                 for index in free
             ],
         )
@@ -124,4 +129,6 @@ def groups(hypothesis: Hypothesis):
 
 def probes(hypotheses: Sequence[Hypothesis]) -> list[tuple[int, float]]:
     """All (axis, size) whose secants the hypotheses need."""
-    return sorted({key for hypothesis in hypotheses for _, group in groups(hypothesis) for keys in group for key in keys})
+    return sorted(
+        {key for hypothesis in hypotheses for _, group in groups(hypothesis) for keys in group for key in keys}
+    )

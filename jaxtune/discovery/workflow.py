@@ -6,14 +6,14 @@ A round ends the ladder where nothing passes. Sealed segments are simulated by `
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from jaxtune.discovery import decide, localise
 from jaxtune.discovery.fit import Fit, Free, refine
-from jaxtune.discovery.measure import Gauge, gauge, jacobian, nominal_directions
+from jaxtune.discovery.measure import Gauge, gauge, jacobian, nominal_directions, refitted
 from jaxtune.discovery.problem import Hypothesis, Problem, Residuals
 from jaxtune.discovery.screen import Score, Screen, given_up, probes
 
@@ -32,6 +32,10 @@ class Settings:
     """Of naming something where nothing is missing."""
     share: float = 0.5
     """Of the energy above the floor that the named effects must explain together; else it is `unnamed`."""
+    at_floor: float = 1.5
+    """Floor units up to which a gap is none."""
+    changed: float = 3.0
+    """Prior standard deviations beyond which a nominal parameter is another one."""
     rounds: int = 4
     """Of a fit."""
 
@@ -62,9 +66,26 @@ class Result:
     needs_torque: dict[str, float] = field(default_factory=dict)
     not_testable: list[str] = field(default_factory=list)
     not_finite: list[str] = field(default_factory=list)
-    rejected: dict[str, dict] = field(default_factory=dict)
-    """Tests of the best that was not accepted."""
-    sealed: dict[str, Any] = field(default_factory=dict)
+    rejected: dict[str, Any] = field(default_factory=dict)
+    """The best that was not accepted, and its tests."""
+    changed: dict[int, float] = field(default_factory=dict)
+    """Nominal axes that moved too far to be the same parameter, with their standard deviations from the prior."""
+    residual: Fit | None = None
+    """With a free torque at one joint, where something has no name."""
+    gap: dict[str, float] = field(default_factory=dict)
+    proof: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What healthy logs say, which depends on the robot, its motion and its noise alone."""
+
+    floors: dict[float, tuple[np.ndarray, float]]
+    """Floor [bins, components] and independent share by horizon."""
+    gain: float
+    """What the best hypothesis gains on them."""
+    penalty: float
+    """Under which no joint of them needs a torque."""
 
 
 class Discovery:
@@ -74,14 +95,16 @@ class Discovery:
       problem: what is asked.
       settings: how.
       push: axes of a constant torque at every joint, by joint name; for localising.
+      calibration: what another log of the same robot and the same motion has found of healthy logs.
       say: told what is being done.
     """
 
     def __init__(
         self,
         problem: Problem,
-        settings: Settings = Settings(),  # noqa: B008  (frozen)
+        settings: Settings = Settings(),
         push: Mapping[str, int] | None = None,
+        calibration: "Calibration | None" = None,
         say: Callable[[str], None] = lambda text: None,
     ):
         self.problem, self.settings, self.say = problem, settings, say
@@ -89,7 +112,11 @@ class Discovery:
         self.measure = Residuals(problem)
         self.main = problem.horizons[len(problem.horizons) // 2]
         self.gauges: dict[float, Gauge] = {}
+        self.fits: dict[float, Fit] = {}
         self.result = Result()
+        self._calibration, self._looked = calibration, False
+        self._healthy_gain = calibration.gain if calibration else 0.0
+        self._penalty = calibration.penalty if calibration else 0.0
 
     # --- what is there before the first question
 
@@ -97,17 +124,17 @@ class Discovery:
         """Floor, null, and what healthy logs would gain by chance."""
         for horizon in self.problem.horizons:
             self.say(f"floor at {horizon:g} s")
-            self.gauges[horizon] = gauge(self.problem, self.measure, horizon)
+            known = self._calibration.floors[horizon] if self._calibration else None
+            self.gauges[horizon] = gauge(self.problem, self.measure, horizon, known)
         self.say("null")
         zero = np.zeros(self.problem.axes)
-        self.fits = {}
         for horizon in self.problem.horizons:
             free = self._nominal()
             start = Fit(
                 free=free,
                 coordinates=np.zeros(len(free.sd)),
                 residual=self._residual(horizon, "train")(zero[None])[0],
-                jacobian=self.gauges[horizon].jacobian["train"].reshape(-1, len(free.sd)),
+                jacobian=self.gauges[horizon].jacobian.reshape(-1, len(free.sd)),
                 weight=self.gauges[horizon].weight,
             )
             self.fits[horizon] = refine([start], self._residual(horizon, "train"), 3)[0]
@@ -116,7 +143,10 @@ class Discovery:
     def _nominal(self) -> Free:
         directions = nominal_directions(self.problem)
         count = len(directions)
-        return Free(directions, np.ones(count), np.tile([-5.0, 5.0], (count, 1)))
+        bounds = np.tile([-5.0, 5.0], (count, 1))
+        # Nobody looks before it is time.
+        bounds[count - len(self.problem.timing) :, 0] = 0.0
+        return Free(directions, np.ones(count), bounds)
 
     def _residual(self, horizon: float, split: str):
         """Residuals [n, features] of vectors [n, axes]."""
@@ -144,13 +174,13 @@ class Discovery:
         unit[np.arange(len(unit)), list(self._push.values())] = 0.05
         slopes = jacobian(self.measure, fit.vector, unit, segments) / gauge_.floor[..., None]
         flat = slopes.reshape(len(residual), -1, len(unit))
-        calm = [log["train"] for log in gauge_.healthy]
-        slope = gauge_.jacobian["train"]
-        penalty = max(
-            localise.least_penalty(_refit(values, slope, gauge_.weight).reshape(len(residual), -1), flat)
-            for values in calm
-        )
-        need = localise.free_torque(residual.reshape(len(residual), -1), flat, penalty)
+        if not self._penalty:
+            slope = gauge_.jacobian
+            self._penalty = max(
+                localise.least_penalty(refitted(values, slope, gauge_.weight).reshape(len(residual), -1), flat)
+                for values in gauge_.healthy
+            )
+        need = localise.free_torque(residual.reshape(len(residual), -1), flat, self._penalty)
         self.result.needs_torque = dict(zip(self._push, need.tolist(), strict=True))
         return [joint for joint, value in self.result.needs_torque.items() if value > 0]
 
@@ -185,7 +215,9 @@ class Discovery:
                 names[hypothesis.name] = names.get(hypothesis.name, 0) + 1
         return chosen
 
-    def fit(self, hypotheses: Sequence[Hypothesis], scores: Mapping[str, Score], horizon: float, starts=None) -> list[Fit]:
+    def fit(
+        self, hypotheses: Sequence[Hypothesis], scores: Mapping[str, Score], horizon: float, starts=None
+    ) -> list[Fit]:
         """Fits hypotheses with everything that is free already."""
         evaluate = self._residual(horizon, "train")
         kept = {h.key: _without(self.fits[horizon], h) for h in hypotheses}
@@ -198,8 +230,13 @@ class Discovery:
             found = scores[hypothesis.key].coordinates
             others = list(hypothesis.probes) if len(hypothesis.probes) > 1 and low[0] >= 0 else []
             tried.append([np.clip(stood + move, low, high) for move in (found, 0.4 * found, 2.5 * found, *others)])
-        at = lambda hypothesis, point: kept[hypothesis.key][0].vector + point @ hypothesis.directions
-        residuals = _dealt(evaluate, [[at(h, point) for point in group] for h, group in zip(hypotheses, tried, strict=True)])
+
+        def at(hypothesis, point):
+            return kept[hypothesis.key][0].vector + point @ hypothesis.directions
+
+        residuals = _dealt(
+            evaluate, [[at(h, point) for point in group] for h, group in zip(hypotheses, tried, strict=True)]
+        )
         begun = []
         for hypothesis, points, found in zip(hypotheses, tried, residuals, strict=True):
             # The best once the nominal parameters have answered.
@@ -214,7 +251,9 @@ class Discovery:
         steps = [
             np.where(point + size > hypothesis.bounds[:, 1], -size, size)
             for hypothesis, (point, _) in zip(hypotheses, begun, strict=True)
-            for size in [0.2 * np.abs(point) + 0.2 * hypothesis.probes.max(axis=0) + 0.02 * (hypothesis.probes == 0).all(axis=0)]
+            for size in [
+                0.2 * np.abs(point) + 0.2 * hypothesis.probes.max(axis=0) + 0.02 * (hypothesis.probes == 0).all(axis=0)
+            ]
         ]
         moved = _dealt(
             evaluate,
@@ -247,7 +286,7 @@ class Discovery:
         gauge_ = self.gauges[self.main]
         best = []
         for log in gauge_.healthy:
-            scores = screen.scores(hypotheses, log["train"].ravel())
+            scores = screen.scores(hypotheses, log.ravel())
             best.append(max(score.gain for score in scores.values()))
         return float(np.quantile(best, 1.0 - self.settings.level, method="higher"))
 
@@ -259,11 +298,13 @@ class Discovery:
         joints = self.localise()
         screen = self.screen(hypotheses, base)
         scores = screen.scores(hypotheses)
-        if not taken:
+        if not self._looked:
+            self._looked = True
             names = dict.fromkeys(h.name for h in hypotheses)
             shown = {h.name for h in hypotheses if scores[h.key].testable}
             self.result.not_testable = [name for name in names if name not in shown]
-            self._healthy_gain = self.healthy_gain(screen, hypotheses)
+            self.say(f"these logs cannot show: {', '.join(self.result.not_testable) or 'nothing is beyond them'}")
+            self._healthy_gain = self._healthy_gain or self.healthy_gain(screen, hypotheses)
         index = {joint: number for number, joint in enumerate(self._push)}
         needing = {index[joint] for joint in joints}
         near = [h for h in hypotheses if not needing or not h.joints or needing & set(h.joints)]
@@ -294,16 +335,14 @@ class Discovery:
             residual = self._residual(horizon, "select")
             found = residual(np.stack([self.fits[horizon].vector, *(fits[h.key].vector for h in short)]))
             shaped = [self._shaped(r, horizon) for r in found]
-            select = {h.key: (r**2).mean(axis=(1, 2)) for h, r in zip(short, shaped[1:], strict=True)}
+            select = {h.key: decide.losses(r) for h, r in zip(short, shaped[1:], strict=True)}
             for key in decide.alike(select, 1.0):
                 best_at[key] += 1
             if horizon == self.main:
                 before = shaped[0]
                 after = {h.key: r for h, r in zip(short, shaped[1:], strict=True)}
                 gains = {key: decide.paired(before, r) for key, r in after.items()}
-                train = {
-                    h.key: (self._shaped(fits[h.key].residual, horizon) ** 2).mean(axis=(1, 2)) for h in short
-                }
+                train = {h.key: decide.losses(self._shaped(fits[h.key].residual, horizon)) for h in short}
                 losses = {key: np.concatenate([train[key], select[key]]) for key in select}
         close = decide.alike(losses, 2.0)
         complexity = {h.key: h.complexity[0] for h in short}
@@ -347,14 +386,202 @@ class Discovery:
             fit.free.sd,
         )
 
-    def run(self) -> Result:
-        """All of it."""
+    def drop(self) -> None:
+        """Takes out earlier effects that no longer pay beside the last one."""
+        for rung in self.result.rungs[:-1]:
+            without = {horizon: self._ablated(horizon, rung.hypothesis) for horizon in self.fits}
+            residual = self._residual(self.main, "select")
+            found = residual(np.stack([without[self.main].vector, self.fits[self.main].vector]))
+            gains = decide.paired(*(self._shaped(one, self.main) for one in found))
+            if decide.t_statistic(gains) < 1.0:
+                self.say(f"drop {rung.hypothesis.key}")
+                self.result.rungs.remove(rung)
+                self.fits = without
+
+    def _ablated(self, horizon: float, hypothesis: Hypothesis) -> Fit:
+        """The fit without an accepted effect, everything else fitted again."""
+        fit = self.fits[horizon]
+        own = np.array([any((d == mine).all() for mine in hypothesis.directions) for d in fit.free.directions])
+        free = Free(*(part[~own] for part in fit.free.parts()))
+        evaluate = self._residual(horizon, "train")
+        start = replace(fit, free=free, coordinates=fit.coordinates[~own], jacobian=fit.jacobian[:, ~own])
+        start = replace(start, residual=evaluate(start.vector[None])[0])
+        return refine([start], evaluate, 3)[0]
+
+    # --- after the last round
+
+    def judge(self) -> None:
+        """The verdict, from what `select` says."""
+        result, settings = self.result, self.settings
+        fit = result.fit = self.fits[self.main]
+        result.errors = self._errors(fit)
+        nominal = self.problem.prior > 0
+        deviations = np.divide(fit.vector, self.problem.prior, out=np.zeros_like(fit.vector), where=nominal)
+        result.changed = {
+            int(axis): float(deviations[axis]) for axis in np.flatnonzero(np.abs(deviations) > settings.changed)
+        }
+        null, after = (self.gap(one.vector, "select") for one in (result.null, fit))
+        unexplained = after > settings.at_floor
+        if result.rungs and null > 1.0:
+            unexplained &= (null**2 - after**2) / (null**2 - 1.0) < settings.share
+        if unexplained:
+            result.verdict = "unnamed"
+            # Parameters of a model that does not explain the logs mean nothing.
+            result.changed = {}
+            result.residual = self._free_residual()
+        elif any(not self.is_nominal(rung.hypothesis) for rung in result.rungs):
+            result.verdict = "named"
+        else:
+            result.verdict = "parameter_change" if result.changed else "no_missing_effect"
+
+    def is_nominal(self, hypothesis: Hypothesis) -> bool:
+        """Whether it is about parameters that every model has."""
+        return bool((self.problem.prior[(hypothesis.directions != 0).any(axis=0)] > 0).all())
+
+    def gap(self, vector: np.ndarray, split: str) -> float:
+        """Root mean square of the worst component of the positions, in floor units, at the main horizon."""
+        residual = self._shaped(self._residual(self.main, split)(vector[None])[0], self.main)
+        return float(np.sqrt((residual**2).mean(axis=(0, 1)))[self._positions()].max())
+
+    def _positions(self) -> np.ndarray:
+        """Components that are positions."""
+        signals = sorted(self.problem.data["train"][self.main].signals)
+        return np.concatenate([[signal == "q"] * len(self.problem.components[signal]) for signal in signals])
+
+    def _free_residual(self) -> Fit | None:
+        """A bounded torque without a name at the joint that needs it most."""
+        if not self.problem.residual:
+            return None
+        need = self.result.needs_torque
+        joint = max(need, key=need.get) if any(need.values()) else self.result.where[0]["joint"]
+        hypothesis = self.problem.residual[joint]
+        scores = {hypothesis.key: Score(0.0, np.zeros(len(hypothesis.directions)), 0.0)}
+        return self.fit([hypothesis], scores, self.main)[0]
+
+    def prove(self) -> None:
+        """Looks at the sealed segments, once."""
+        result = self.result
+        final = result.residual or result.fit
+        zero = np.zeros(self.problem.axes)
+        self.say("sealed")
+        named = {"before": zero, "null": result.null.vector, "after": final.vector}
+        others = {f"without {r.hypothesis.key}": self._ablated(self.main, r.hypothesis).vector for r in result.rungs}
+        others |= self._placebos()
+        residual = self._residual(self.main, "sealed")
+        found = [self._shaped(one, self.main) for one in residual(np.stack([*named.values(), *others.values()]))]
+        rms = {name: np.sqrt((r**2).mean(axis=(0, 1))) for name, r in zip([*named, *others], found, strict=True)}
+        result.gap = {name: float(rms[name][self._positions()].max()) for name in named}
+        signals = sorted(self.problem.data["train"][self.main].signals)
+        cells = [(signal, part) for signal in signals for part in self.problem.components[signal]]
+        result.proof = {
+            "cells": [
+                {
+                    "signal": signal,
+                    "joint": part,
+                    "before": rms["before"][i],
+                    "null": rms["null"][i],
+                    "after": rms["after"][i],
+                }
+                for i, (signal, part) in enumerate(cells)
+            ],
+            "no_cell_worse": bool((rms["after"] <= rms["null"] + 1.0).all()),
+            "others": {name: float(rms[name][self._positions()].max()) for name in others},
+        }
+
+    def _placebos(self) -> dict[str, np.ndarray]:
+        """The first effect at a wrong joint, and a wrong effect at its place, with the same budget."""
+        if not self.result.rungs:
+            return {}
+        truth = self.result.rungs[0].hypothesis
+        same = [h for h in self.problem.hypotheses if h.name == truth.name and len(h.places) == len(truth.places)]
+        elsewhere = [h for h in same if not set(h.places) & set(truth.places)]
+        beside = [h for h in self.problem.hypotheses if h.places == truth.places and h.family != truth.family]
+        kept, self.fits = self.fits, {self.main: self.result.null}
+        found = {}
+        for label, options in {"wrong place": elsewhere, "wrong effect": beside}.items():
+            if options:
+                fit = self.fit(options[:1], {options[0].key: Score(0.0, options[0].probes[0], 0.0)}, self.main)[0]
+                found[f"{label}: {options[0].key}"] = fit.vector
+        self.fits = kept
+        return found
+
+    # --- all of it
+
+    def run(self, state: Mapping[str, Any] | None = None, save: Callable[[dict], None] = lambda state: None) -> Result:
+        """Takes every step.
+
+        Args:
+          state: what an interrupted run saved last.
+          save: told after every acceptance; numbers, texts, lists and dictionaries of them.
+        """
         self.prepare()
+        if state:
+            self.resume(state)
         while len(self.result.rungs) < self.settings.most and self.round():
-            pass
-        self.result.fit = self.fits[self.main]
-        self.result.errors = self._errors(self.result.fit)
+            self.drop()
+            save(self.state())
+        self.judge()
+        self.prove()
         return self.result
+
+    def calibrate(self) -> None:
+        """Finds what healthy logs gain and need, without asking anything of the measured ones."""
+        self.localise()
+        self._healthy_gain = self.healthy_gain(
+            self.screen(self.problem.hypotheses, self.fits[self.main]), self.problem.hypotheses
+        )
+
+    @property
+    def calibration(self) -> Calibration:
+        """What another log of the same robot and motion may be judged by."""
+        floors = {horizon: (gauge_.floor, gauge_.weight) for horizon, gauge_ in self.gauges.items()}
+        return Calibration(floors, self._healthy_gain, self._penalty)
+
+    def state(self) -> dict:
+        """What a run that goes on needs to know."""
+        result = self.result
+        own = lambda fit, hypothesis: [  # noqa: E731
+            float(c)
+            for c, direction in zip(fit.coordinates, fit.free.directions, strict=True)
+            if any((direction == mine).all() for mine in hypothesis.directions)
+        ]
+        return {
+            "rungs": [
+                {
+                    "key": rung.hypothesis.key,
+                    "evidence": asdict(rung.evidence),
+                    "thresholds": asdict(rung.thresholds),
+                    "alike": list(rung.alike),
+                    "coordinates": [own(self.fits[horizon], rung.hypothesis) for horizon in self.problem.horizons],
+                }
+                for rung in result.rungs
+            ],
+            "where": result.where,
+            "not_testable": result.not_testable,
+            "not_finite": result.not_finite,
+            "healthy_gain": self._healthy_gain,
+        }
+
+    def resume(self, state: Mapping[str, Any]) -> None:
+        """Stands where another run stood when it said this."""
+        by_key = {hypothesis.key: hypothesis for hypothesis in self.problem.hypotheses}
+        for saved in state["rungs"]:
+            hypothesis = by_key[saved["key"]]
+            for horizon, coordinates in zip(self.problem.horizons, saved["coordinates"], strict=True):
+                starts = {hypothesis.key: np.array(coordinates)}
+                self.fits[horizon] = self.fit([hypothesis], {}, horizon, starts)[0]
+            evidence = {**saved["evidence"], "interval": tuple(saved["evidence"]["interval"])}
+            self.result.rungs.append(
+                Rung(
+                    hypothesis,
+                    decide.Evidence(**evidence),
+                    decide.Thresholds(**saved["thresholds"]),
+                    tuple(saved["alike"]),
+                )
+            )
+        self.result.where, self.result.not_testable = state["where"], state["not_testable"]
+        self.result.not_finite, self._healthy_gain = state["not_finite"], state["healthy_gain"]
+        self._looked = True
 
 
 def fit_features(gauge_: Gauge) -> int:
@@ -377,9 +604,3 @@ def _dealt(evaluate, groups: Sequence[Sequence[np.ndarray]]) -> list[np.ndarray]
     """Evaluates all vectors of all groups at once; what was found, by group."""
     found = evaluate(np.stack([vector for group in groups for vector in group]))
     return np.split(found, np.cumsum([len(group) for group in groups])[:-1])
-
-
-def _refit(residual: np.ndarray, slope: np.ndarray, weight: float) -> np.ndarray:
-    from jaxtune.discovery.measure import _refitted
-
-    return _refitted(residual, slope, weight)

@@ -1,0 +1,388 @@
+"""The blind benchmark: `python -m experiments.discovery_bench --size smoke --out DIR`.
+
+Hides an effect in a robot that another engine moves (`experiments.hidden`), writes a log as a user would and the truth
+into a folder that only the scorer reads, has discovery work on the log and the nominal model, and scores what it says.
+Every case is a file of its own: the same command goes on where it stopped, and `--piece 0/2` and `--piece 1/2` share
+the work between two processes.
+"""
+
+import json
+import shutil
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from rich.table import Table
+
+from envs import models
+from envs.biteno import constants
+from envs.effects import LIBRARY
+from envs.logs import Controller, Log, read, write
+from experiments import checkpoint, plots
+from experiments.checkpoint import write_json
+from experiments.discover import summarise
+from experiments.excite import Motion, excitation
+from experiments.hidden import OUTSIDE, Truth, record
+from experiments.question import ask
+from experiments.train import console, run
+from jaxtune.discovery.workflow import Calibration, Discovery
+
+ARM = Path(__file__).parent / "arm.xml"
+SEVERITIES = (2.0, 5.0, 15.0)
+
+_BOUNDS = {
+    "coulomb": (0.01, 10.0),
+    "viscous": (0.01, 20.0),
+    "stribeck": (0.01, 20.0),
+    "load_friction": (0.01, 0.8),
+    "command_delay": (0.001, 0.04),
+    "target_slew": (20.0, 0.3),
+    "gain_error": (0.98, 0.3),
+    "deadband": (0.001, 0.15),
+    "torque_speed": (0.1, 20.0),
+    "torque_limit": (60.0, 0.5),
+    "torque_lag": (0.001, 0.06),
+    "torque_scale": (0.98, 0.3),
+    "backlash": (0.001, 0.15),
+    "compliance": (5000.0, 10.0),
+    "armature": (0.001, 0.5),
+    "link_mass": (1.02, 3.0),
+    "com_offset": (0.001, 0.12),
+    "payload": (0.01, 4.0),
+    "encoder_bias": (0.0005, 0.2),
+    "sensor_delay": (0.001, 0.04),
+    "sensor_lag": (0.001, 0.06),
+    "drag": (0.1, 100.0),
+    "constant_push": (0.01, 15.0),
+    "cogging": (0.02, 15.0),
+    "temperature_fade": (0.02, 0.9),
+    "cable_stiffness": (0.1, 500.0),
+    "loose_foot": (0.01, 1.5),
+}
+"""Sizes between which a severity is looked for, the harmless one first."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """One robot."""
+
+    number: int
+    effect: str | None
+    severity: float
+    """In floor units, of what is hidden alone."""
+
+
+@dataclass(frozen=True)
+class Size:
+    """How much is tried, on which robot."""
+
+    model: str
+    """Name or path."""
+    joints: tuple[str, ...]
+    gains: tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]
+    """kp, kd and torque limit, one for every joint."""
+    runs: int
+    seconds: float
+    hidden: tuple[tuple[str, float], ...]
+    """Effects and severities."""
+    empty: int
+    outside: tuple[tuple[str, float], ...]
+    healthy: int
+
+
+def _spread(names: Sequence[str], count: int) -> tuple[tuple[str, float], ...]:
+    """Effects in turn, severities in turn."""
+    return tuple((names[i % len(names)], SEVERITIES[i % len(SEVERITIES)]) for i in range(count))
+
+
+_HIDDEN = tuple(name for name, row in LIBRARY.items() if not row.needs)
+_ARM = (str(ARM), ("shoulder", "elbow"), ((40.0, 20.0), (2.0, 0.8), (15.0, 15.0)))
+_BITENO = ("biteno", constants.JOINTS, ((60.0,) * 6, (2.0,) * 6, (60.0,) * 6))
+SIZES = {
+    "smoke": Size(
+        *_ARM, 6, 2.0, (("coulomb", 15.0), ("command_delay", 15.0), ("payload", 15.0), ("torque_scale", 15.0)), 2, (), 6
+    ),
+    "arm": Size(*_ARM, 6, 3.0, _spread(_HIDDEN, 46), 20, _spread(OUTSIDE[:3], 9), 20),
+    "standard": Size(*_BITENO, 6, 3.0, _spread(_HIDDEN, 48), 40, _spread(OUTSIDE, 10), 20),
+    "full": Size(
+        *_BITENO,
+        12,
+        5.0,
+        tuple((name, severity) for name in _HIDDEN for severity in SEVERITIES for _ in range(5)),
+        100,
+        _spread(OUTSIDE, 24),
+        40,
+    ),
+}
+"""`smoke` for CI, `arm` for an hour, `standard` for a night on a CPU, `full` for a GPU or a few nights."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Args:
+    """Hides effects, has them found, and counts."""
+
+    out: Path = Path("runs/discovery_bench")
+    """Folder of the cases and the scores."""
+    size: str = "smoke"
+    """smoke, arm, standard or full."""
+    seed: int = 0
+    """Seed of everything random."""
+    nominal_error: float = 0.1
+    """By how much nominal parameters are wrong: half of it to one and a half times."""
+    piece: str = "0/1"
+    """Which share of the cases to work on."""
+
+
+class Bench:
+    """The robots of one size."""
+
+    def __init__(self, args: Args):
+        self.args, self.size = args, SIZES[args.size]
+        self.spec = models.spec(self.size.model)
+        names = ("kp", "kd", "torque_limit_nm")
+        gains = {name: np.array(values) for name, values in zip(names, self.size.gains, strict=True)}
+        self.controller = Controller(kind="pd", rate_hz=1000.0, gains=gains)
+        self.motions: list[Motion] = excitation(
+            self.spec, self.size.joints, self.size.runs, self.size.seconds, 500.0, args.seed
+        )
+
+    @property
+    def cases(self) -> list[Case]:
+        """All of them, the harmless ones mixed in."""
+        listed = [*self.size.hidden, *self.size.outside, *[(None, 0.0)] * self.size.empty]
+        order = np.random.default_rng(self.args.seed).permutation(len(listed))
+        return [Case(number, *listed[index]) for number, index in enumerate(order)]
+
+    def record(self, truth: Truth, seed: int, noise: bool = True) -> Log:
+        """Plays the motions on a robot with something in it."""
+        log = record(
+            self.spec, self.size.joints, self.motions, self.controller, truth, self.args.nominal_error, seed, noise
+        )
+        return replace(log, robot=self.size.model)
+
+    @cached_property
+    def calibration(self) -> Calibration:
+        """What healthy logs of this robot and motion say: found once, and kept."""
+        path = self.args.out / "calibration.npz"
+        if not path.exists():
+            question = ask(self.record(Truth(None), 10_000), self.spec, healthy_logs=self.size.healthy)
+            discovery = Discovery(question.problem, push=question.push)
+            discovery.prepare()
+            discovery.calibrate()
+            found = discovery.calibration
+            arrays = {f"floor {horizon}": floor for horizon, (floor, _) in found.floors.items()}
+            arrays |= {f"weight {horizon}": weight for horizon, (_, weight) in found.floors.items()}
+            partial = path.with_suffix(".partial.npz")
+            np.savez(partial, gain=found.gain, penalty=found.penalty, **arrays)
+            partial.replace(path)
+        with np.load(path) as saved:
+            horizons = [float(name.split()[1]) for name in saved.files if name.startswith("floor")]
+            floors = {h: (saved[f"floor {h}"], float(saved[f"weight {h}"])) for h in horizons}
+            return Calibration(floors, float(saved["gain"]), float(saved["penalty"]))
+
+    def truth(self, case: Case) -> tuple[Truth, float]:
+        """Where it hides and how large it is, and its severity in floor units."""
+        if case.effect is None:
+            return Truth(None), 0.0
+        rng = np.random.default_rng((self.args.seed, case.number))
+        on = LIBRARY[case.effect].on if case.effect in LIBRARY else "joint"
+        bodies = [self.spec.joint(name).parent.name for name in self.size.joints]
+        places = tuple(bodies if on == "body" else self.size.joints)
+        place = str(rng.choice(places))
+        if case.effect == "loose_foot":
+            place = str(rng.choice([name for name in self.size.joints if "knee" in name or "elbow" in name]))
+        pair = place.replace("left", "right")
+        chosen = (place, pair) if pair != place and rng.uniform() < 0.2 else (place,)
+        severity = self.severity_of(case, chosen)
+        low, high = np.log(_BOUNDS[case.effect])
+        for _ in range(7):
+            middle = 0.5 * (low + high)
+            low, high = (low, middle) if severity(float(np.exp(middle))) > case.severity else (middle, high)
+        size = float(np.exp(0.5 * (low + high)))
+        return Truth(case.effect, chosen, size), severity(size)
+
+    def severity_of(self, case: Case, places: tuple[str, ...]) -> Callable[[float], float]:
+        """How far an effect of a size moves the worst joint's positions, in floor units, noise apart."""
+        seed = self.seed(case)
+        plain = self.record(Truth(None), seed, noise=False)
+        question = ask(plain, self.spec, healthy_logs=0)
+        discovery = Discovery(question.problem, push=question.push, calibration=self.calibration)
+        zero = np.zeros(question.problem.axes)
+        floor = self.calibration.floors[discovery.main][0]
+        positions = slice(-len(self.size.joints), None)
+        without = discovery.measure(zero, question.problem.data["train"][discovery.main])[0]
+
+        def severity(size: float) -> float:
+            log = self.record(Truth(case.effect, places, size), seed, noise=False)
+            segments = ask(log, self.spec, healthy_logs=0).problem.data["train"][discovery.main]
+            moved = (discovery.measure(zero, segments)[0] - without) / floor
+            if not np.isfinite(moved).all():
+                return np.inf
+            return float(np.sqrt((moved[..., positions] ** 2).mean(axis=(0, 1))).max())
+
+        return severity
+
+    def seed(self, case: Case) -> int:
+        """Of the robot."""
+        return 1000 * (self.args.seed + 1) + case.number
+
+    def write(self, case: Case) -> Path:
+        """Writes a case's log, and its truth where only the scorer looks."""
+        folder, sealed = self.args.out / "logs" / f"case_{case.number:03d}", self._sealed(case)
+        if not sealed.exists():
+            truth, severity = self.truth(case)
+            log = self.record(truth, self.seed(case))
+            shutil.rmtree(folder, ignore_errors=True)
+            folder.mkdir(parents=True)
+            name = log.robot if log.robot in models.BUILT_IN else Path(log.robot).name
+            write(replace(log, robot=name), folder / "log", ".npz")
+            if log.robot not in models.BUILT_IN:
+                shutil.copy(log.robot, folder / "log" / name)
+            sealed.parent.mkdir(parents=True, exist_ok=True)
+            write_json(sealed, {"effect": case.effect, "asked": case.severity, "severity": severity, "truth": truth})
+        return folder / "log"
+
+    def _sealed(self, case: Case) -> Path:
+        return self.args.out / "sealed" / f"case_{case.number:03d}.json"
+
+    def answer(self, case: Case) -> dict:
+        """What discovery says of a case's log; it sees the log, the nominal model and the calibration."""
+        path = self.args.out / "answers" / f"case_{case.number:03d}.json"
+        if not path.exists():
+            folder = self.write(case)
+            began = time.monotonic()
+            log = read(folder)
+            question = ask(log, models.spec(log.robot), healthy_logs=0)
+            result = Discovery(question.problem, push=question.push, calibration=self.calibration).run()
+            path.parent.mkdir(parents=True, exist_ok=True)
+            answer = summarise(question, result) | {"seconds": time.monotonic() - began, "rejected": result.rejected}
+            write_json(path, checkpoint.as_json(answer))
+        return json.loads(path.read_text())
+
+    def scored(self) -> list[dict]:
+        """Truth and answer of every case that is done; the one place that opens the truth."""
+        rows = []
+        for case in self.cases:
+            path = self.args.out / "answers" / f"case_{case.number:03d}.json"
+            if path.exists():
+                truth = json.loads(self._sealed(case).read_text())
+                rows.append(score(truth, json.loads(path.read_text())) | {"case": case.number})
+        return rows
+
+
+def score(truth: dict, answer: dict) -> dict:
+    """One case."""
+    named = [*answer["effects"], *answer["parameter_changes"]]
+    first = named[0] if named else None
+    reported = {first["name"], *first["confusable_with"]} if first else set()
+    effect, gap = truth["effect"], answer["gap"]
+    family = LIBRARY[effect].family if effect in LIBRARY else None
+    return {
+        "effect": effect,
+        "severity": truth["severity"],
+        "asked": truth["asked"],
+        "places": truth["truth"]["places"],
+        "verdict": answer["verdict"],
+        "named": first["name"] if first else None,
+        "named_places": first["places"] if first else [],
+        "others": [other["name"] for other in named[1:]],
+        "set": sorted(reported),
+        "name": bool(first) and first["name"] == effect,
+        "family": bool(first) and first["family"] == family,
+        "in_set": effect in reported,
+        "place": bool(first) and set(first["places"]) == set(truth["truth"]["places"]),
+        "before": gap["null"],
+        "nominal": gap["before"],
+        "after": gap["after"],
+        "seconds": answer["seconds"],
+    }
+
+
+def wilson(hits: int, count: int, z: float = 1.96) -> tuple[float, float]:
+    """95 % interval of a rate (Wilson, 1927)."""
+    if not count:
+        return 0.0, 1.0
+    rate, z2 = hits / count, z * z
+    middle = (rate + z2 / (2 * count)) / (1 + z2 / count)
+    half = z * np.sqrt(rate * (1 - rate) / count + z2 / (4 * count**2)) / (1 + z2 / count)
+    return float(max(middle - half, 0.0)), float(min(middle + half, 1.0))
+
+
+def tally(rows: Sequence[dict]) -> list[dict]:
+    """The table of rates."""
+    hidden = [row for row in rows if row["effect"] in LIBRARY]
+    outside = [row for row in rows if row["effect"] in OUTSIDE]
+    empty = [row for row in rows if row["effect"] is None]
+    plain = [row for row in hidden if row["asked"] >= 5.0]
+    measures = [
+        ("top-1 name, 5 floor units and more", plain, "name", ">= 0.90"),
+        *(
+            (f"top-1 name, {severity:g} floor units", [r for r in hidden if r["asked"] == severity], "name", "")
+            for severity in SEVERITIES
+        ),
+        ("top-1 family, 5 floor units and more", plain, "family", ">= 0.93"),
+        ("truth in the reported set, 5 and more", plain, "in_set", ">= 0.95"),
+        ("place right, 5 and more", plain, "place", ">= 0.95"),
+    ]
+    lines = [_rate(label, [row[key] for row in group], goal) for label, group, key, goal in measures]
+    lines.append(
+        _rate("names something where nothing is hidden", [row["named"] is not None for row in empty], "<= 0.05")
+    )
+    lines.append(_rate("`unnamed` outside the library", [row["verdict"] == "unnamed" for row in outside], ">= 0.80"))
+    sizes = [len(row["set"]) for row in plain if row["set"]]
+    strong = [row for row in hidden if row["asked"] == 15.0 and row["name"]]
+    lines.append(_mean("mean size of the reported set", sizes, "<= 2.5"))
+    lines.append(
+        _mean("gap shrink at 15 floor units, name right", [row["nominal"] / row["after"] for row in strong], ">= 8")
+    )
+    lines.append(_mean("final gap, floor units, name right", [row["after"] for row in plain if row["name"]], "<= 1.3"))
+    lines.append(_mean("seconds a case", [row["seconds"] for row in rows], "<= 300"))
+    return lines
+
+
+def _rate(label: str, hits: Sequence[bool], goal: str) -> dict:
+    low, high = wilson(sum(hits), len(hits))
+    rate = sum(hits) / len(hits) if hits else None
+    return {"measure": label, "value": rate, "low": low, "high": high, "count": len(hits), "goal": goal}
+
+
+def _mean(label: str, values: Sequence[float], goal: str) -> dict:
+    value = float(np.mean(values)) if values else None
+    return {"measure": label, "value": value, "low": None, "high": None, "count": len(values), "goal": goal}
+
+
+def main(args: Args) -> None:
+    """Works off this piece's cases and scores all that are done."""
+    checkpoint.set_up_compiler("")
+    if args.size not in SIZES:
+        raise ValueError(f"size: got '{args.size}', expected one of {', '.join(SIZES)}")
+    number, _, pieces = args.piece.partition("/")
+    if not (number.isdigit() and pieces.isdigit() and int(number) < int(pieces)):
+        raise ValueError(f"piece: got '{args.piece}', expected '0/1', '0/2', '1/2', ...")
+    args.out.mkdir(parents=True, exist_ok=True)
+    write_json(args.out / "config.json", {"size": args.size, "seed": args.seed, "nominal_error": args.nominal_error})
+    bench = Bench(args)
+    cases = bench.cases[int(number) :: int(pieces)]
+    for done, case in enumerate(cases, start=1):
+        answer = bench.answer(case)
+        names = ", ".join(effect["name"] for effect in [*answer["effects"], *answer["parameter_changes"]])
+        console.print(
+            f"{done}/{len(cases)} case {case.number}: {answer['verdict']} {names} ({answer['seconds']:.0f} s)"
+        )
+    rows = bench.scored()
+    lines = tally(rows)
+    write_json(args.out / "scores.json", {"cases": rows, "table": lines, "versions": checkpoint.versions()})
+    plots.confusion(args.out / "confusion.png", rows)
+    table = Table("measure", "value", "95 % interval", "cases", "to reach")
+    for line in lines:
+        shown = "-" if line["value"] is None else f"{line['value']:.2f}"
+        interval = "" if line["low"] is None else f"{line['low']:.2f} to {line['high']:.2f}"
+        table.add_row(line["measure"], shown, interval, str(line["count"]), line["goal"])
+    console.print(table)
+
+
+if __name__ == "__main__":
+    run(main, Args)
