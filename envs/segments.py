@@ -131,7 +131,7 @@ def cut(runs: Sequence[Run], horizon_s: float, dt: float, bin_s: float = 0.01) -
         raise ValueError(f"runs: the longest has {longest:.3g} s, expected more than {horizon_s + HISTORY_S:.3g} s")
     after = 1 + max(int(np.ceil((runs[n].time[i + rows] - runs[n].time[i]) / dt)) for n, i in pieces)
     prepared = [_Prepared(run, dt) for run in runs]
-    segments = [prepared[number].segment(start, rows, after) for number, start in pieces]
+    segments = [prepared[number].segment(start, start + 1 + np.arange(rows), after) for number, start in pieces]
     names = [name for name in ("q", "dq", "tau", "gravity") if all(name in run.signals for run in runs)]
     if not all("target" in run.signals for run in runs):
         names = [name for name in names if name != "tau"]
@@ -144,6 +144,30 @@ def cut(runs: Sequence[Run], horizon_s: float, dt: float, bin_s: float = 0.01) -
         },
         run=np.array([number for number, _ in pieces]),
         row=row,
+    )
+
+
+def whole(runs: Sequence[Run], dt: float) -> Cut:
+    """Every run in one piece, from its first state with a history to its end.
+
+    Runs are of equal shape: rows past a run's end are its last one again.
+    """
+    prepared = [_Prepared(run, dt) for run in runs]
+    first = [int(np.searchsorted(run.time, run.time[0] + HISTORY_S)) for run in runs]
+    counts = [len(run.time) - 1 - start for run, start in zip(runs, first, strict=True)]
+    rows = np.array(
+        [
+            np.minimum(start + 1 + np.arange(max(counts)), len(run.time) - 1)
+            for run, start in zip(runs, first, strict=True)
+        ]
+    )
+    after = 1 + max(int(np.ceil((run.time[-1] - run.time[start]) / dt)) for run, start in zip(runs, first, strict=True))
+    segments = [one.segment(start, row, after) for one, start, row in zip(prepared, first, rows, strict=True)]
+    return Cut(
+        segments=jax.tree.map(lambda *leaves: np.stack(leaves), *segments),
+        signals={"q": np.stack([run.signals["q"][row] for run, row in zip(runs, rows, strict=True)])},
+        run=np.arange(len(runs)),
+        row=rows,
     )
 
 
@@ -185,7 +209,8 @@ class _Prepared:
             **numbers,
         }
 
-    def segment(self, start: int, rows: int, after: int) -> Segment:
+    def segment(self, start: int, rows: np.ndarray, after: int) -> Segment:
+        """From row `start` on, read at `rows`, all later."""
         run, dt = self._run, self._dt
         before, ahead = round(HISTORY_S / dt), round(LONGEST_S / dt)
         begin = run.time[start]
@@ -194,7 +219,7 @@ class _Prepared:
         last = np.clip(np.searchsorted(run.time, grid + 1e-9, side="right") - 1, 0, len(run.time) - 1)
         period = 1.0 / run.controller.rate_hz
         ticks = np.floor((grid - run.time[0]) / period + 1e-6)
-        at = (run.time[start + 1 : start + 1 + rows] - begin) / dt
+        at = (run.time[rows] - begin) / dt
         step = np.minimum(np.floor(at + 1e-6).astype(np.int32), after - 1)
         return Segment(
             **{name: values[last].astype(np.float32) for name, values in self._held.items()},

@@ -159,8 +159,7 @@ def _effect(question: Question, hypothesis: Hypothesis, fit: Fit, errors: np.nda
 def free_runs(log: Log, question: Question, result: Result) -> dict:
     """Every run simulated from its first state to its end, before and after: errors in rad, and the traces."""
     rig = question.rig
-    shortest = min(run.time[-1] - run.time[0] for run in log.runs)
-    cut = segments.cut(log.runs, shortest - segments.HISTORY_S - 0.05, rig.dt)
+    cut = segments.whole(log.runs, rig.dt)
     play = jax.jit(jax.vmap(lambda vector, inputs: rig.simulate(rig.tree(vector), inputs)["q"], (None, 0)))
     vectors = {
         "before": np.zeros(len(rig.axes)),
@@ -170,18 +169,18 @@ def free_runs(log: Log, question: Question, result: Result) -> dict:
     found = {name: np.asarray(play(np.asarray(vector, np.float32), cut.segments)) for name, vector in vectors.items()}
     splits = {name: split for split, names in question.splits.items() for name in names}
     runs = []
-    for piece, number in enumerate(cut.run):
-        run = log.runs[number]
-        rows = cut.row[piece]
+    for piece, run in enumerate(log.runs):
+        rows = np.unique(cut.row[piece])
         runs.append(
             {
                 "run": run.name,
                 "split": splits[run.name],
                 "time": run.time[rows] - run.time[rows[0]],
                 "measured": run.signals["q"][rows],
-                **{name: values[piece] for name, values in found.items()},
+                **{name: values[piece][: len(rows)] for name, values in found.items()},
                 "error_rad": {
-                    name: float(np.abs(values[piece] - run.signals["q"][rows]).mean()) for name, values in found.items()
+                    name: float(np.abs(values[piece][: len(rows)] - run.signals["q"][rows]).mean())
+                    for name, values in found.items()
                 },
             }
         )

@@ -124,11 +124,9 @@ class Residuals:
         for start in range(0, len(which), once):
             count = min(once, len(which) - start)
             mine = start + np.arange(once) % count
-            shaped = (self._CHUNKS, self._width)
-            inputs = jax.tree.map(
-                lambda leaf, at=piece[mine]: leaf[at].reshape(*shaped, *leaf.shape[1:]), segments.inputs
-            )
-            out = self._compiled(-(-count // self._width), vectors[which[mine]].reshape(*shaped, -1), inputs)
+            at = (piece[mine]).reshape(self._CHUNKS, self._width)
+            inputs = jax.tree.map(lambda leaf, at=at: leaf[at], segments.inputs)
+            out = self._compiled(-(-count // self._width), vectors[which[mine].reshape(at.shape)], inputs)
             found.append(np.asarray(out).reshape(once, *measured.shape[1:])[:count])
         predicted = np.concatenate(found).reshape(len(vectors), *measured.shape)
         return measured[None] - predicted

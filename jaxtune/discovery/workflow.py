@@ -417,9 +417,9 @@ class Discovery:
         result.errors = self._errors(fit)
         nominal = self.problem.prior > 0
         deviations = np.divide(fit.vector, self.problem.prior, out=np.zeros_like(fit.vector), where=nominal)
-        result.changed = {
-            int(axis): float(deviations[axis]) for axis in np.flatnonzero(np.abs(deviations) > settings.changed)
-        }
+        error = np.sqrt((result.errors[:, None] ** 2 * fit.free.directions**2).sum(axis=0))
+        moved = (np.abs(deviations) > settings.changed) & (np.abs(fit.vector) > 1.96 * error)
+        result.changed = {int(axis): float(deviations[axis]) for axis in np.flatnonzero(moved)}
         null, after = (self.gap(one.vector, "select") for one in (result.null, fit))
         unexplained = after > settings.at_floor
         if result.rungs and null > 1.0:
