@@ -104,10 +104,9 @@ def _xl330(folder: Path) -> bool:
 
 def summarise(question: Question, result: Result) -> dict:
     """What `summary.json` says; times and versions apart."""
-    prior = question.problem.prior
     effects, changes = [], []
     for rung in result.rungs:
-        nominal = bool((prior[(rung.hypothesis.directions != 0).any(axis=0)] > 0).all())
+        nominal = question.problem.is_nominal(rung.hypothesis)
         (changes if nominal else effects).append(
             _effect(question, rung.hypothesis, result.fit, result.errors, rung.alike)
         )
@@ -169,17 +168,17 @@ def free_runs(log: Log, question: Question, result: Result) -> dict:
     found = {name: np.asarray(play(np.asarray(vector, np.float32), cut.segments)) for name, vector in vectors.items()}
     splits = {name: split for split, names in question.splits.items() for name in names}
     runs = []
-    for piece, run in enumerate(log.runs):
+    for piece, recorded in enumerate(log.runs):
         rows = np.unique(cut.row[piece])
         runs.append(
             {
-                "run": run.name,
-                "split": splits[run.name],
-                "time": run.time[rows] - run.time[rows[0]],
-                "measured": run.signals["q"][rows],
+                "run": recorded.name,
+                "split": splits[recorded.name],
+                "time": recorded.time[rows] - recorded.time[rows[0]],
+                "measured": recorded.signals["q"][rows],
                 **{name: values[piece][: len(rows)] for name, values in found.items()},
                 "error_rad": {
-                    name: float(np.abs(values[piece][: len(rows)] - run.signals["q"][rows]).mean())
+                    name: float(np.abs(values[piece][: len(rows)] - recorded.signals["q"][rows]).mean())
                     for name, values in found.items()
                 },
             }

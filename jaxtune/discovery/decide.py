@@ -61,11 +61,12 @@ def paired(before: np.ndarray, after: np.ndarray) -> np.ndarray:
 
 
 def losses(residual: np.ndarray) -> np.ndarray:
-    """What a segment's residuals [segments, bins, components] count for, [segments].
+    """What a segment's residuals [segments, bins, components] count for: their root mean square, [segments].
 
-    The logarithm keeps the few segments in which everything is far off from drowning the others.
+    Squares would let the few segments in which everything is far off drown the others; logarithms would hide what an
+    effect explains where another one is missing too.
     """
-    return np.log1p((residual**2).mean(axis=(1, 2)))
+    return np.sqrt((residual**2).mean(axis=(1, 2)))
 
 
 def t_statistic(gains: np.ndarray) -> float:

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from jaxtune.discovery.least_squares import Linear
+from jaxtune.discovery.problem import Hypothesis
 
 Evaluate = Callable[[np.ndarray], np.ndarray]
 """`evaluate(vectors [n, axes]) -> residuals [n, features]` in floor units."""
@@ -102,3 +103,90 @@ def _learn(fit: Fit, point: np.ndarray, residual: np.ndarray) -> Fit:
         return fit
     surprise = residual - fit.residual - fit.jacobian @ step
     return replace(fit, jacobian=fit.jacobian + np.outer(surprise, step) / length)
+
+
+def begin(
+    base: Fit, hypotheses: Sequence[Hypothesis], tried: Sequence[Sequence[np.ndarray]], evaluate: Evaluate
+) -> list[Fit]:
+    """Fits that are about to start: each hypothesis beside what is free in `base`, at the best of its points.
+
+    Args:
+      base: the model without them.
+      hypotheses: one for every fit.
+      tried: points [parameters] for every hypothesis, seen from where the base has what the hypothesis takes over.
+      evaluate: residuals of vectors.
+    """
+    kept, points = [], []
+    for hypothesis, group in zip(hypotheses, tried, strict=True):
+        fit, stood = without(base, given_up(base.free, hypothesis), hypothesis)
+        kept.append(fit)
+        points.append([np.clip(stood + point, *hypothesis.bounds.T) for point in group])
+    places = list(zip(kept, hypotheses, points, strict=True))
+    found = _dealt(evaluate, [[fit.vector + p @ h.directions for p in group] for fit, h, group in places])
+    best = [_best_start(fit, residuals) for fit, residuals in zip(kept, found, strict=True)]
+    at = [(group[index], residuals[index]) for group, residuals, index in zip(points, found, best, strict=True)]
+    steps = [_probing_step(hypothesis, point) for hypothesis, (point, _) in zip(hypotheses, at, strict=True)]
+    moved = _dealt(
+        evaluate,
+        [
+            [fit.vector + (point + step) @ h.directions for step in np.diag(size)]
+            for fit, h, (point, _), size in zip(kept, hypotheses, at, steps, strict=True)
+        ],
+    )
+    return [
+        replace(
+            fit,
+            free=fit.free.and_then(Free(h.directions, _own_prior(h), h.bounds)),
+            coordinates=np.concatenate([fit.coordinates, point]),
+            residual=residual,
+            jacobian=np.concatenate([fit.jacobian, np.nan_to_num((shifted - residual) / size[:, None]).T], axis=1),
+            finite=bool(np.isfinite(residual).all() and np.isfinite(shifted).all()),
+        )
+        for fit, h, (point, residual), size, shifted in zip(kept, hypotheses, at, steps, moved, strict=True)
+    ]
+
+
+def given_up(free: Free, hypothesis: Hypothesis) -> np.ndarray:
+    """Which coordinates [coordinates] are the hypothesis' own: nominal parameters at its places, prior and all."""
+    if len(hypothesis.directions) > 1:
+        return np.zeros(len(free.sd), bool)
+    mine = hypothesis.directions[0] != 0
+    within = np.array([not (direction[~mine] != 0).any() for direction in free.directions])
+    return within & np.isfinite(free.sd)
+
+
+def without(fit: Fit, own: np.ndarray, hypothesis: Hypothesis) -> tuple[Fit, np.ndarray]:
+    """A fit without some of its coordinates, and where those stood in the hypothesis' [parameters]."""
+    stood = np.zeros(len(hypothesis.directions))
+    if own.any():
+        direction = hypothesis.directions[0]
+        vector = fit.coordinates[own] @ fit.free.directions[own]
+        stood[0] = (vector[direction != 0] / direction[direction != 0]).mean()
+    free = Free(*(part[~own] for part in fit.free.parts()))
+    return replace(fit, free=free, coordinates=fit.coordinates[~own], jacobian=fit.jacobian[:, ~own]), stood
+
+
+def _own_prior(hypothesis: Hypothesis) -> np.ndarray:
+    """None; but what means nothing without a size is held by one."""
+    return np.where((hypothesis.probes == 0).all(axis=0), 1.0, np.inf)
+
+
+def _probing_step(hypothesis: Hypothesis, point: np.ndarray) -> np.ndarray:
+    """How far to go for slopes, [parameters], inwards from a bound."""
+    size = 0.2 * np.abs(point) + 0.2 * hypothesis.probes.max(axis=0) + 0.02 * (hypothesis.probes == 0).all(axis=0)
+    return np.where(point + size > hypothesis.bounds[:, 1], -size, size)
+
+
+def _best_start(fit: Fit, residuals: np.ndarray) -> int:
+    """The point with the least misfit once the nominal parameters have answered."""
+    misfits = []
+    for residual in residuals:
+        linear = replace(fit, residual=residual).linear
+        misfits.append(np.sum((residual + linear.jacobian @ linear.step(_DAMPING)) ** 2))
+    return int(np.argmin(np.where(np.isfinite(misfits), misfits, np.inf)))
+
+
+def _dealt(evaluate: Evaluate, groups: Sequence[Sequence[np.ndarray]]) -> list[np.ndarray]:
+    """Evaluates all vectors of all groups at once; what was found, by group."""
+    found = evaluate(np.stack([vector for group in groups for vector in group]))
+    return np.split(found, np.cumsum([len(group) for group in groups])[:-1])

@@ -87,6 +87,15 @@ class Problem:
         """Lengths of segments in s, rising."""
         return tuple(sorted(self.data["train"]))
 
+    @property
+    def cells(self) -> list[tuple[str, str]]:
+        """Signal and part of every component of the residuals."""
+        return [(signal, part) for signal in sorted(self.components) for part in self.components[signal]]
+
+    def is_nominal(self, hypothesis: Hypothesis) -> bool:
+        """Whether it is about parameters that every model has."""
+        return bool((self.prior[(hypothesis.directions != 0).any(axis=0)] > 0).all())
+
 
 class Residuals:
     """Measured less simulated, in means over a few rows: [hypotheses, segments, bins, components of all signals].

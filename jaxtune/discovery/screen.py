@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jaxtune.discovery.fit import Fit, Free
+from jaxtune.discovery.fit import Fit, given_up
 from jaxtune.discovery.least_squares import Linear, complement
 from jaxtune.discovery.problem import Hypothesis
 
@@ -98,15 +98,6 @@ class Screen:
             project = complement(slope)
             self._projections[key] = (project(value), project)
         return self._projections[key]
-
-
-def given_up(free: Free, hypothesis: Hypothesis) -> np.ndarray:
-    """Which coordinates [coordinates] are the hypothesis' own: nominal parameters at its places, prior and all."""
-    if len(hypothesis.directions) > 1:
-        return np.zeros(len(free.sd), bool)
-    mine = hypothesis.directions[0] != 0
-    within = np.array([not (direction[~mine] != 0).any() for direction in free.directions])
-    return within & np.isfinite(free.sd)
 
 
 def groups(hypothesis: Hypothesis):

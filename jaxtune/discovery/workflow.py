@@ -12,10 +12,13 @@ from typing import Any
 import numpy as np
 
 from jaxtune.discovery import decide, localise
-from jaxtune.discovery.fit import Fit, Free, refine
+from jaxtune.discovery.fit import Fit, Free, begin, refine
 from jaxtune.discovery.measure import Gauge, gauge, jacobian, nominal_directions, refitted
 from jaxtune.discovery.problem import Hypothesis, Problem, Residuals
-from jaxtune.discovery.screen import Score, Screen, given_up, probes
+from jaxtune.discovery.prove import judge, prove
+from jaxtune.discovery.screen import Score, Screen, probes
+
+_ROUNDS_MORE = 2  # where a fit starts from another one
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -133,11 +136,11 @@ class Discovery:
             start = Fit(
                 free=free,
                 coordinates=np.zeros(len(free.sd)),
-                residual=self._residual(horizon, "train")(zero[None])[0],
+                residual=self.residual(horizon, "train")(zero[None])[0],
                 jacobian=self.gauges[horizon].jacobian.reshape(-1, len(free.sd)),
                 weight=self.gauges[horizon].weight,
             )
-            self.fits[horizon] = refine([start], self._residual(horizon, "train"), 3)[0]
+            self.fits[horizon] = refine([start], self.residual(horizon, "train"), 3)[0]
         self.result.null = self.fits[self.main]
 
     def _nominal(self) -> Free:
@@ -148,12 +151,12 @@ class Discovery:
         bounds[count - len(self.problem.timing) :, 0] = 0.0
         return Free(directions, np.ones(count), bounds)
 
-    def _residual(self, horizon: float, split: str):
+    def residual(self, horizon: float, split: str):
         """Residuals [n, features] of vectors [n, axes]."""
         floor, segments = self.gauges[horizon].floor, self.problem.data[split][horizon]
         return lambda vectors: (self.measure(vectors, segments) / floor).reshape(len(vectors), -1)
 
-    def _shaped(self, residual: np.ndarray, horizon: float) -> np.ndarray:
+    def shaped(self, residual: np.ndarray, horizon: float) -> np.ndarray:
         """[segments, bins, components, ...] again."""
         return residual.reshape(-1, *self.gauges[horizon].floor.shape, *residual.shape[1:])
 
@@ -162,12 +165,11 @@ class Discovery:
     def localise(self) -> list[str]:
         """Fills in where the gap is; returns the joints that need a torque."""
         problem, gauge_, fit = self.problem, self.gauges[self.main], self.fits[self.main]
-        residual = self._shaped(fit.residual, self.main)
+        residual = self.shaped(fit.residual, self.main)
         segments = problem.data["train"][self.main]
         regimes = segments.regimes[:, :: problem.bin_rows][:, : residual.shape[1]]
-        names = [(signal, part) for signal in sorted(segments.signals) for part in problem.components[signal]]
         if not self.result.where:
-            self.result.where = localise.cells(residual, regimes, problem.regimes, names, 0)
+            self.result.where = localise.cells(residual, regimes, problem.regimes, problem.cells, 0)
         if not self._push:
             return []
         unit = np.zeros((len(self._push), problem.axes))
@@ -190,7 +192,7 @@ class Discovery:
         steps = np.zeros((len(asked), self.problem.axes))
         for row, (axis, size) in enumerate(asked):
             steps[row, axis] = size
-        evaluate = self._residual(self.main, "train")
+        evaluate = self.residual(self.main, "train")
         columns = {}
         for start in range(0, len(asked), 32):
             self.say(f"screen {start}/{len(asked)}")
@@ -216,69 +218,11 @@ class Discovery:
         return chosen
 
     def fit(
-        self, hypotheses: Sequence[Hypothesis], scores: Mapping[str, Score], horizon: float, starts=None
+        self, hypotheses: Sequence[Hypothesis], tried: Mapping[str, Sequence[np.ndarray]], horizon: float, rounds: int
     ) -> list[Fit]:
-        """Fits hypotheses with everything that is free already."""
-        evaluate = self._residual(horizon, "train")
-        kept = {h.key: _without(self.fits[horizon], h) for h in hypotheses}
-        tried = []
-        for hypothesis in hypotheses:
-            stood, low, high = kept[hypothesis.key][1], *hypothesis.bounds.T
-            if starts is not None:
-                tried.append([starts[hypothesis.key]])
-                continue
-            found = scores[hypothesis.key].coordinates
-            others = list(hypothesis.probes) if len(hypothesis.probes) > 1 and low[0] >= 0 else []
-            tried.append([np.clip(stood + move, low, high) for move in (found, 0.4 * found, 2.5 * found, *others)])
-
-        def at(hypothesis, point):
-            return kept[hypothesis.key][0].vector + point @ hypothesis.directions
-
-        residuals = _dealt(
-            evaluate, [[at(h, point) for point in group] for h, group in zip(hypotheses, tried, strict=True)]
-        )
-        begun = []
-        for hypothesis, points, found in zip(hypotheses, tried, residuals, strict=True):
-            # The best once the nominal parameters have answered.
-            fit = kept[hypothesis.key][0]
-            answers = [replace(fit, residual=residual).linear for residual in found]
-            losses = [
-                linear.weight * np.sum((linear.residual + linear.jacobian @ linear.step(1e-3)) ** 2)
-                for linear in answers
-            ]
-            best = int(np.nanargmin(np.where(np.isfinite(losses), losses, np.inf)))
-            begun.append((points[best], found[best]))
-        steps = [
-            np.where(point + size > hypothesis.bounds[:, 1], -size, size)
-            for hypothesis, (point, _) in zip(hypotheses, begun, strict=True)
-            for size in [
-                0.2 * np.abs(point) + 0.2 * hypothesis.probes.max(axis=0) + 0.02 * (hypothesis.probes == 0).all(axis=0)
-            ]
-        ]
-        moved = _dealt(
-            evaluate,
-            [
-                [at(h, point + step) for step in np.diag(size)]
-                for h, (point, _), size in zip(hypotheses, begun, steps, strict=True)
-            ],
-        )
-        fits = []
-        for hypothesis, (point, residual), size, found in zip(hypotheses, begun, steps, moved, strict=True):
-            fit = kept[hypothesis.key][0]
-            columns = ((found - residual) / size[:, None]).T
-            # What means nothing without a size is held by a prior.
-            sd = np.where((hypothesis.probes == 0).all(axis=0), 1.0, np.inf)
-            fits.append(
-                replace(
-                    fit,
-                    free=fit.free.and_then(Free(hypothesis.directions, sd, hypothesis.bounds)),
-                    coordinates=np.concatenate([fit.coordinates, point]),
-                    residual=residual,
-                    jacobian=np.concatenate([fit.jacobian, np.nan_to_num(columns)], axis=1),
-                    finite=bool(np.isfinite(residual).all()),
-                )
-            )
-        rounds = self.settings.rounds if starts is None else 2
+        """Fits hypotheses with everything that is free already, each from the best of the points that are tried."""
+        evaluate = self.residual(horizon, "train")
+        fits = begin(self.fits[horizon], hypotheses, [tried[h.key] for h in hypotheses], evaluate)
         return refine(fits, evaluate, rounds)
 
     def healthy_gain(self, screen: Screen, hypotheses: Sequence[Hypothesis]) -> float:
@@ -308,12 +252,14 @@ class Discovery:
         index = {joint: number for number, joint in enumerate(self._push)}
         needing = {index[joint] for joint in joints}
         near = [h for h in hypotheses if not needing or not h.joints or needing & set(h.joints)]
-        near = [h for h in near if scores[h.key].testable]
+        # What is larger than the smallest size of interest may show where that would not.
+        near = [h for h in near if scores[h.key].testable or scores[h.key].gain > self._healthy_gain]
         short = self.shortlist(scores, near)
         self.say(f"fit {len(short)}")
         if not short:
             return False
-        fits = dict(zip([h.key for h in short], self.fit(short, scores, self.main), strict=True))
+        tried = {h.key: _starts(h, scores[h.key].coordinates) for h in short}
+        fits = dict(zip([h.key for h in short], self.fit(short, tried, self.main, settings.rounds), strict=True))
         self.result.not_finite += [key for key, fit in fits.items() if not fit.finite]
         short = [h for h in short if fits[h.key].finite]
         short.sort(key=lambda h: fits[h.key].linear.loss)
@@ -323,8 +269,8 @@ class Discovery:
         everywhere = {self.main: {h.key: fits[h.key] for h in short}}
         for horizon in problem.horizons:
             if horizon != self.main:
-                starts = {h.key: fits[h.key].coordinates[-len(h.directions) :] for h in short}
-                found = self.fit(short, scores, horizon, starts)
+                starts = {h.key: [fits[h.key].coordinates[-len(h.directions) :]] for h in short}
+                found = self.fit(short, starts, horizon, _ROUNDS_MORE)
                 everywhere[horizon] = dict(zip([h.key for h in short], found, strict=True))
         return self._decide(short, everywhere, base)
 
@@ -332,9 +278,9 @@ class Discovery:
         settings = self.settings
         losses, gains, best_at = {}, {}, {h.key: 0 for h in short}
         for horizon, fits in everywhere.items():
-            residual = self._residual(horizon, "select")
+            residual = self.residual(horizon, "select")
             found = residual(np.stack([self.fits[horizon].vector, *(fits[h.key].vector for h in short)]))
-            shaped = [self._shaped(r, horizon) for r in found]
+            shaped = [self.shaped(r, horizon) for r in found]
             select = {h.key: decide.losses(r) for h, r in zip(short, shaped[1:], strict=True)}
             for key in decide.alike(select, 1.0):
                 best_at[key] += 1
@@ -342,7 +288,7 @@ class Discovery:
                 before = shaped[0]
                 after = {h.key: r for h, r in zip(short, shaped[1:], strict=True)}
                 gains = {key: decide.paired(before, r) for key, r in after.items()}
-                train = {h.key: decide.losses(self._shaped(fits[h.key].residual, horizon)) for h in short}
+                train = {h.key: decide.losses(self.shaped(fits[h.key].residual, horizon)) for h in short}
                 losses = {key: np.concatenate([train[key], select[key]]) for key in select}
         close = decide.alike(losses, 2.0)
         complexity = {h.key: h.complexity[0] for h in short}
@@ -351,7 +297,7 @@ class Discovery:
         fit = everywhere[self.main][key]
         hypothesis = next(h for h in short if h.key == key)
         count = len(hypothesis.directions)
-        errors = self._errors(fit)
+        errors = self.errors(fit)
         value, error = fit.coordinates[-count], errors[-count]
         low, high = fit.free.bounds[-count]
         drop = (before**2).mean(axis=(0, 1)) - (after[key] ** 2).mean(axis=(0, 1))
@@ -375,11 +321,11 @@ class Discovery:
         self.fits = {horizon: fits[key] for horizon, fits in everywhere.items()}
         return True
 
-    def _errors(self, fit: Fit) -> np.ndarray:
+    def errors(self, fit: Fit) -> np.ndarray:
         """Standard errors of a fit's coordinates."""
         return decide.sandwich(
-            self._shaped(fit.residual, self.main).reshape(-1, fit_features(self.gauges[self.main])),
-            self._shaped(fit.jacobian, self.main).reshape(
+            self.shaped(fit.residual, self.main).reshape(-1, fit_features(self.gauges[self.main])),
+            self.shaped(fit.jacobian, self.main).reshape(
                 -1, fit_features(self.gauges[self.main]), fit.jacobian.shape[-1]
             ),
             fit.weight,
@@ -389,121 +335,24 @@ class Discovery:
     def drop(self) -> None:
         """Takes out earlier effects that no longer pay beside the last one."""
         for rung in self.result.rungs[:-1]:
-            without = {horizon: self._ablated(horizon, rung.hypothesis) for horizon in self.fits}
-            residual = self._residual(self.main, "select")
+            without = {horizon: self.ablated(horizon, rung.hypothesis) for horizon in self.fits}
+            residual = self.residual(self.main, "select")
             found = residual(np.stack([without[self.main].vector, self.fits[self.main].vector]))
-            gains = decide.paired(*(self._shaped(one, self.main) for one in found))
+            gains = decide.paired(*(self.shaped(one, self.main) for one in found))
             if decide.t_statistic(gains) < 1.0:
                 self.say(f"drop {rung.hypothesis.key}")
                 self.result.rungs.remove(rung)
                 self.fits = without
 
-    def _ablated(self, horizon: float, hypothesis: Hypothesis) -> Fit:
+    def ablated(self, horizon: float, hypothesis: Hypothesis) -> Fit:
         """The fit without an accepted effect, everything else fitted again."""
         fit = self.fits[horizon]
         own = np.array([any((d == mine).all() for mine in hypothesis.directions) for d in fit.free.directions])
         free = Free(*(part[~own] for part in fit.free.parts()))
-        evaluate = self._residual(horizon, "train")
+        evaluate = self.residual(horizon, "train")
         start = replace(fit, free=free, coordinates=fit.coordinates[~own], jacobian=fit.jacobian[:, ~own])
         start = replace(start, residual=evaluate(start.vector[None])[0])
         return refine([start], evaluate, 3)[0]
-
-    # --- after the last round
-
-    def judge(self) -> None:
-        """The verdict, from what `select` says."""
-        result, settings = self.result, self.settings
-        fit = result.fit = self.fits[self.main]
-        result.errors = self._errors(fit)
-        nominal = self.problem.prior > 0
-        deviations = np.divide(fit.vector, self.problem.prior, out=np.zeros_like(fit.vector), where=nominal)
-        error = np.sqrt((result.errors[:, None] ** 2 * fit.free.directions**2).sum(axis=0))
-        moved = (np.abs(deviations) > settings.changed) & (np.abs(fit.vector) > 1.96 * error)
-        result.changed = {int(axis): float(deviations[axis]) for axis in np.flatnonzero(moved)}
-        null, after = (self.gap(one.vector, "select") for one in (result.null, fit))
-        unexplained = after > settings.at_floor
-        if result.rungs and null > 1.0:
-            unexplained &= (null**2 - after**2) / (null**2 - 1.0) < settings.share
-        if unexplained:
-            result.verdict = "unnamed"
-            # Parameters of a model that does not explain the logs mean nothing.
-            result.changed = {}
-            result.residual = self._free_residual()
-        elif any(not self.is_nominal(rung.hypothesis) for rung in result.rungs):
-            result.verdict = "named"
-        else:
-            result.verdict = "parameter_change" if result.changed else "no_missing_effect"
-
-    def is_nominal(self, hypothesis: Hypothesis) -> bool:
-        """Whether it is about parameters that every model has."""
-        return bool((self.problem.prior[(hypothesis.directions != 0).any(axis=0)] > 0).all())
-
-    def gap(self, vector: np.ndarray, split: str) -> float:
-        """Root mean square of the worst component of the positions, in floor units, at the main horizon."""
-        residual = self._shaped(self._residual(self.main, split)(vector[None])[0], self.main)
-        return float(np.sqrt((residual**2).mean(axis=(0, 1)))[self._positions()].max())
-
-    def _positions(self) -> np.ndarray:
-        """Components that are positions."""
-        signals = sorted(self.problem.data["train"][self.main].signals)
-        return np.concatenate([[signal == "q"] * len(self.problem.components[signal]) for signal in signals])
-
-    def _free_residual(self) -> Fit | None:
-        """A bounded torque without a name at the joint that needs it most."""
-        if not self.problem.residual:
-            return None
-        need = self.result.needs_torque
-        joint = max(need, key=need.get) if any(need.values()) else self.result.where[0]["joint"]
-        hypothesis = self.problem.residual[joint]
-        scores = {hypothesis.key: Score(0.0, np.zeros(len(hypothesis.directions)), 0.0)}
-        return self.fit([hypothesis], scores, self.main)[0]
-
-    def prove(self) -> None:
-        """Looks at the sealed segments, once."""
-        result = self.result
-        final = result.residual or result.fit
-        zero = np.zeros(self.problem.axes)
-        self.say("sealed")
-        named = {"before": zero, "null": result.null.vector, "after": final.vector}
-        others = {f"without {r.hypothesis.key}": self._ablated(self.main, r.hypothesis).vector for r in result.rungs}
-        others |= self._placebos()
-        residual = self._residual(self.main, "sealed")
-        found = [self._shaped(one, self.main) for one in residual(np.stack([*named.values(), *others.values()]))]
-        rms = {name: np.sqrt((r**2).mean(axis=(0, 1))) for name, r in zip([*named, *others], found, strict=True)}
-        result.gap = {name: float(rms[name][self._positions()].max()) for name in named}
-        signals = sorted(self.problem.data["train"][self.main].signals)
-        cells = [(signal, part) for signal in signals for part in self.problem.components[signal]]
-        result.proof = {
-            "cells": [
-                {
-                    "signal": signal,
-                    "joint": part,
-                    "before": rms["before"][i],
-                    "null": rms["null"][i],
-                    "after": rms["after"][i],
-                }
-                for i, (signal, part) in enumerate(cells)
-            ],
-            "no_cell_worse": bool((rms["after"] <= rms["null"] + 1.0).all()),
-            "others": {name: float(rms[name][self._positions()].max()) for name in others},
-        }
-
-    def _placebos(self) -> dict[str, np.ndarray]:
-        """The first effect at a wrong joint, and a wrong effect at its place, with the same budget."""
-        if not self.result.rungs:
-            return {}
-        truth = self.result.rungs[0].hypothesis
-        same = [h for h in self.problem.hypotheses if h.name == truth.name and len(h.places) == len(truth.places)]
-        elsewhere = [h for h in same if not set(h.places) & set(truth.places)]
-        beside = [h for h in self.problem.hypotheses if h.places == truth.places and h.family != truth.family]
-        kept, self.fits = self.fits, {self.main: self.result.null}
-        found = {}
-        for label, options in {"wrong place": elsewhere, "wrong effect": beside}.items():
-            if options:
-                fit = self.fit(options[:1], {options[0].key: Score(0.0, options[0].probes[0], 0.0)}, self.main)[0]
-                found[f"{label}: {options[0].key}"] = fit.vector
-        self.fits = kept
-        return found
 
     # --- all of it
 
@@ -520,8 +369,10 @@ class Discovery:
         while len(self.result.rungs) < self.settings.most and self.round():
             self.drop()
             save(self.state())
-        self.judge()
-        self.prove()
+        judge(self)
+        named = {rung.hypothesis.name for rung in self.result.rungs}
+        self.result.not_testable = [name for name in self.result.not_testable if name not in named]
+        prove(self)
         return self.result
 
     def calibrate(self) -> None:
@@ -568,8 +419,8 @@ class Discovery:
         for saved in state["rungs"]:
             hypothesis = by_key[saved["key"]]
             for horizon, coordinates in zip(self.problem.horizons, saved["coordinates"], strict=True):
-                starts = {hypothesis.key: np.array(coordinates)}
-                self.fits[horizon] = self.fit([hypothesis], {}, horizon, starts)[0]
+                starts = {hypothesis.key: [np.array(coordinates)]}
+                self.fits[horizon] = self.fit([hypothesis], starts, horizon, _ROUNDS_MORE)[0]
             evidence = {**saved["evidence"], "interval": tuple(saved["evidence"]["interval"])}
             self.result.rungs.append(
                 Rung(
@@ -589,18 +440,7 @@ def fit_features(gauge_: Gauge) -> int:
     return gauge_.floor.size
 
 
-def _without(fit: Fit, hypothesis: Hypothesis) -> tuple[Fit, np.ndarray]:
-    """A fit without what a hypothesis takes over, and where that stood, [parameters] of the hypothesis."""
-    own = given_up(fit.free, hypothesis)
-    stood = np.zeros(len(hypothesis.directions))
-    if own.any():
-        vector = fit.coordinates[own] @ fit.free.directions[own]
-        stood[0] = vector[hypothesis.directions[0] != 0].mean()
-    free = Free(*(part[~own] for part in fit.free.parts()))
-    return replace(fit, free=free, coordinates=fit.coordinates[~own], jacobian=fit.jacobian[:, ~own]), stood
-
-
-def _dealt(evaluate, groups: Sequence[Sequence[np.ndarray]]) -> list[np.ndarray]:
-    """Evaluates all vectors of all groups at once; what was found, by group."""
-    found = evaluate(np.stack([vector for group in groups for vector in group]))
-    return np.split(found, np.cumsum([len(group) for group in groups])[:-1])
+def _starts(hypothesis: Hypothesis, found: np.ndarray) -> list[np.ndarray]:
+    """Points to try: what the screen found, less and more of it; the sizes that were looked at, where these matter."""
+    others = list(hypothesis.probes) if len(hypothesis.probes) > 1 and hypothesis.bounds[0, 0] >= 0 else []
+    return [found, 0.4 * found, 2.5 * found, *others]

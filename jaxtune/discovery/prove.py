@@ -1,0 +1,105 @@
+"""The verdict, and the proof on sealed segments (steps 9 and 10)."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from jaxtune.discovery.fit import Fit
+from jaxtune.discovery.problem import Hypothesis
+
+
+def judge(discovery) -> None:
+    """The verdict, from what `select` says."""
+    result, settings, prior = discovery.result, discovery.settings, discovery.problem.prior
+    fit = result.fit = discovery.fits[discovery.main]
+    result.errors = discovery.errors(fit)
+    null, after = (gap(discovery, one.vector) for one in (result.null, fit))
+    unexplained = after > settings.at_floor
+    if result.rungs and null > 1.0:
+        unexplained &= (null**2 - after**2) / (null**2 - 1.0) < settings.share
+    if unexplained:
+        # Parameters of a model that does not explain the logs mean nothing: none is called changed.
+        result.verdict, result.residual = "unnamed", _free_residual(discovery)
+        return
+    deviations = np.divide(fit.vector, prior, out=np.zeros_like(fit.vector), where=prior > 0)
+    error = np.sqrt((result.errors[:, None] ** 2 * fit.free.directions**2).sum(axis=0))
+    moved = (np.abs(deviations) > settings.changed) & (np.abs(fit.vector) > 1.96 * error)
+    result.changed = {int(axis): float(deviations[axis]) for axis in np.flatnonzero(moved)}
+    if any(not discovery.problem.is_nominal(rung.hypothesis) for rung in result.rungs):
+        result.verdict = "named"
+    else:
+        result.verdict = "parameter_change" if result.changed or result.rungs else "no_missing_effect"
+
+
+def gap(discovery, vector: np.ndarray, split: str = "select") -> float:
+    """Root mean square of the worst component of the positions, in floor units, at the main horizon."""
+    return float(_rms(discovery, vector[None], split)[0][_positions(discovery)].max())
+
+
+def prove(discovery) -> None:
+    """Looks at the sealed segments, once: the gap of every cell, ablations and placebos."""
+    result = discovery.result
+    discovery.say("sealed")
+    final = result.residual or result.fit
+    named = {"before": np.zeros(discovery.problem.axes), "null": result.null.vector, "after": final.vector}
+    others = {
+        f"without {rung.hypothesis.key}": discovery.ablated(discovery.main, rung.hypothesis).vector
+        for rung in result.rungs
+    } | _placebos(discovery)
+    rms = dict(
+        zip([*named, *others], _rms(discovery, np.stack([*named.values(), *others.values()]), "sealed"), strict=True)
+    )
+    positions = _positions(discovery)
+    result.gap = {name: float(rms[name][positions].max()) for name in named}
+    result.proof = {
+        "cells": [
+            {"signal": signal, "joint": part} | {name: float(rms[name][index]) for name in named}
+            for index, (signal, part) in enumerate(discovery.problem.cells)
+        ],
+        "no_cell_worse": bool((rms["after"] <= rms["null"] + 1.0).all()),
+        "others": {name: float(rms[name][positions].max()) for name in others},
+    }
+
+
+def _rms(discovery, vectors: np.ndarray, split: str) -> np.ndarray:
+    """Root mean squares [vectors, components] in floor units."""
+    found = discovery.residual(discovery.main, split)(vectors)
+    return np.stack([np.sqrt((discovery.shaped(one, discovery.main) ** 2).mean(axis=(0, 1))) for one in found])
+
+
+def _positions(discovery) -> np.ndarray:
+    """Components that are positions, [components]."""
+    return np.array([signal == "q" for signal, _ in discovery.problem.cells])
+
+
+def _free_residual(discovery) -> Fit | None:
+    """A bounded torque without a name at the joint that needs it most, so that there is a better simulator at least."""
+    need, stand_in = discovery.result.needs_torque, discovery.problem.residual
+    if not stand_in:
+        return None
+    joint = max(need, key=need.get) if any(need.values()) else discovery.result.where[0]["joint"]
+    hypothesis = stand_in[joint]
+    start = {hypothesis.key: [np.zeros(len(hypothesis.directions))]}
+    return discovery.fit([hypothesis], start, discovery.main, discovery.settings.rounds)[0]
+
+
+def _placebos(discovery) -> dict[str, np.ndarray]:
+    """The first effect at a wrong place, and a wrong effect at its place, with the same budget."""
+    if not discovery.result.rungs:
+        return {}
+    truth, hypotheses = discovery.result.rungs[0].hypothesis, discovery.problem.hypotheses
+    elsewhere = [h for h in hypotheses if h.name == truth.name and not set(h.places) & set(truth.places)]
+    beside = [h for h in hypotheses if h.places == truth.places and h.family != truth.family]
+    return _fitted(discovery, {"wrong place": elsewhere, "wrong effect": beside})
+
+
+def _fitted(discovery, options: dict[str, Sequence[Hypothesis]]) -> dict[str, np.ndarray]:
+    """The first of each kind, fitted from the null."""
+    kept, discovery.fits = discovery.fits, {discovery.main: discovery.result.null}
+    found = {}
+    for label, (first, *_) in {label: some for label, some in options.items() if some}.items():
+        start = {first.key: list(first.probes)}
+        fit = discovery.fit([first], start, discovery.main, discovery.settings.rounds)[0]
+        found[f"{label}: {first.key}"] = fit.vector
+    discovery.fits = kept
+    return found

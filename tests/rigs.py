@@ -1,0 +1,113 @@
+"""Robots on the rig, the motion that they are asked for, and the same motion in MuJoCo C."""
+
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from envs.effects.memory import LONGEST_S
+from envs.rig import Rig
+from envs.segments import HISTORY_S, Segment
+
+ARM = (Path(__file__).parents[1] / "experiments" / "arm.xml").read_text()
+ARM_JOINTS = ("shoulder", "elbow")
+CONTROL_HZ = 200.0
+STEPS = 150
+
+
+class Player:
+    """A rig whose motion is compiled once."""
+
+    def __init__(self, spec, joints, scales=None):
+        self.rig = Rig(spec, joints, CONTROL_HZ, scales)
+        self._simulate = jax.jit(lambda vector, segment: self.rig.simulate(self.rig.tree(vector), segment))
+        self._model = jax.jit(lambda vector: self.rig.model(self.rig.values(self.rig.tree(vector))))
+
+    def vector(self, **effects):
+        """Coordinates [axes]: `effect={(place, parameter): coordinate}`."""
+        vector = np.zeros(len(self.rig.axes), np.float32)
+        for effect, cells in effects.items():
+            for (place, parameter), coordinate in cells.items():
+                (number,) = [
+                    number
+                    for number, axis in enumerate(self.rig.axes)
+                    if (axis.effect, axis.place, axis.parameter) == (effect, place, parameter)
+                ]
+                vector[number] = coordinate
+        return vector
+
+    def play(self, segment, **effects):
+        return jax.tree.map(np.asarray, self._simulate(self.vector(**effects), segment))
+
+    def model(self, **effects):
+        return self._model(self.vector(**effects))
+
+
+def arm():
+    return Player(mujoco.MjSpec.from_string(ARM), ARM_JOINTS)
+
+
+def segment(rig, start, target, kp=0.0, kd=0.0, limit=np.inf, feed=0.0, emf=0.0, speed=0.0, steps=STEPS):
+    """A robot that has stood at `start` [joints] with the first target, read at every step of `target` [steps, joints].
+
+    Where it starts with a speed, it has been there with this speed.
+    """
+    before, ahead = round(HISTORY_S / rig.dt), round(LONGEST_S / rig.dt)
+    joints = len(rig.joints)
+    target = np.broadcast_to(target, (steps, joints))
+    target = np.concatenate([np.broadcast_to(target[0], (before, joints)), target])
+    state = np.stack([np.broadcast_to(start, joints), np.broadcast_to(speed, joints)])
+    held = {"feed": feed, "stiffness": kp, "damping": kd, "limit": limit, "emf": emf}
+    every = round(1.0 / rig.control_hz / rig.dt)
+    return Segment(
+        target=target.astype(np.float32),
+        **{name: np.broadcast_to(value, target.shape).astype(np.float32) for name, value in held.items()},
+        sample=(np.arange(len(target)) - before) % every == 0,
+        measured=np.broadcast_to(state, (before + 1 + ahead, 2, joints)).astype(np.float32),
+        row_step=np.arange(steps, dtype=np.int32),
+        row_share=np.zeros(steps, np.float32),
+    )
+
+
+def in_mujoco(rig, model, segment, command=None, sense=None, motor=None, outside=None):
+    """What MuJoCo C reads of a segment at every step, positions and velocities [steps, 2, joints].
+
+    Args:
+      command: what becomes of targets [steps, joints], of a robot that has stood still before.
+      sense: what becomes of a reading [2, joints].
+      motor: what becomes of a torque [joints].
+      outside: sets forces of `data`.
+    """
+    before = round(HISTORY_S / rig.dt)
+    drive = {
+        name: np.asarray(getattr(segment, name), float)
+        for name in ("target", "feed", "stiffness", "damping", "limit", "emf", "sample")
+    }
+    if command is not None:
+        drive["target"] = command(drive["target"])
+    data = mujoco.MjData(model)
+    data.qpos[rig.qpos], data.qvel[rig.dof] = segment.measured[before]
+    read, held = [], None
+    for step in range(before, len(segment.target)):
+        x = {name: values[step] for name, values in drive.items()}
+        seen = np.stack([data.qpos[rig.qpos], data.qvel[rig.dof]])
+        seen = seen if sense is None else sense(seen)
+        read.append(seen)
+        if x["sample"]:
+            asked = x["stiffness"] * (x["target"] - seen[0]) - x["damping"] * seen[1]
+            held = np.clip(asked, -x["limit"], x["limit"]) + x["feed"]
+        torque = held if motor is None else motor(held)
+        data.qfrc_applied[rig.dof] = torque - x["emf"] * data.qvel[rig.dof]
+        if outside is not None:
+            outside(data)
+        mujoco.mj_step(model, data)
+    return np.array(read)
+
+
+def compiled(text, rig):
+    """An MJCF as MuJoCo C moves it, with the rig's step."""
+    model = mujoco.MjSpec.from_string(text).compile()
+    model.opt.timestep = rig.dt
+    return model
