@@ -89,9 +89,10 @@ def gathered(folders: tuple[Path, ...]) -> Log:
     for folder, log in zip(folders, logs, strict=True):
         if log.base != "fixed":
             raise ValueError(f"{folder}: base: got '{log.base}', expected 'fixed': hang or clamp the robot")
-        for name in ("robot", "joints"):
-            if getattr(log, name) != getattr(first, name):
-                raise ValueError(f"{folder}: {name}: got {getattr(log, name)}, expected {getattr(first, name)}")
+        if log.joints != first.joints:
+            raise ValueError(f"{folder}: joints: got {log.joints}, expected {first.joints}")
+        if models.spec(log.robot).to_xml() != models.spec(first.robot).to_xml():
+            raise ValueError(f"{folder}: robot: got {log.robot}, expected the same model as {first.robot}")
     if len(logs) == 1:
         return first
     runs = tuple(replace(run, name=f"{run.name}_{number}") for number, log in enumerate(logs) for run in log.runs)

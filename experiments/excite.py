@@ -6,16 +6,47 @@ log splits by condition with everything in every part. What is written is a log 
 on the robot, and put what was measured beside them.
 """
 
+import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import mujoco
 import numpy as np
 
+from envs import models
+from envs.logs import Controller, Log, Run, write
 from envs.rig import hung
+from experiments.train import console, run
 
 _CHIRP_HZ = (0.5, 10.0)
 _SHARES = {"triangle": 0.35, "chirp": 0.3, "steps": 0.2, "swing": 0.15}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Args:
+    """Writes targets for a log in which effects can be told apart."""
+
+    out: Path
+    """Folder of the log: meta.yaml, and a run_*.csv of times, targets and motor switches for every run."""
+    robot: str = "biteno"
+    """biteno, pendulum, or the path of an MJCF file."""
+    runs: int = 6
+    """Number of runs, 4 or more."""
+    seconds: float = 3.0
+    """Length of a run."""
+    rate_hz: float = 500.0
+    """Rows a second."""
+    kp: float = 60.0
+    """Proportional gain of the joint controllers in Nm/rad; half of the runs have half of both gains."""
+    kd: float = 2.0
+    """Damping of the joint controllers in Nm s/rad."""
+    torque_limit_nm: float = 60.0
+    """Torque limit of the joint controllers."""
+    control_hz: float = 1000.0
+    """Rate of the joint controllers."""
+    seed: int = 0
+    """Seed of postures and steps."""
 
 
 @dataclass(frozen=True)
@@ -49,16 +80,16 @@ def excitation(
     low, high, home = _ranges(hung(spec), joints)
     splits = ("train", "select", "train", "sealed")
     motions = []
-    for run in range(runs):
+    for number in range(runs):
         posture = home + 0.25 * (high - low) * rng.uniform(-1, 1, len(joints))
         room = np.minimum(np.minimum(high - posture, posture - low), 0.6)
-        gain = (1.0, 0.5)[(run // 2 + run) % 2]
+        gain = (1.0, 0.5)[(number // 2 + number) % 2]
         target, enabled = _medley(posture, np.maximum(room, 0.05), seconds, rate_hz, rng)
-        split = splits[run % len(splits)]
+        split = splits[number % len(splits)]
         motions.append(
             Motion(
-                f"run_{run:03d}",
-                f"posture{run}_gain{gain:g}",
+                f"run_{number:03d}",
+                f"posture{number}_gain{gain:g}",
                 gain,
                 split,
                 np.arange(len(target)) / rate_hz,
@@ -102,3 +133,48 @@ def _medley(posture, room, seconds, rate_hz, rng) -> tuple[np.ndarray, np.ndarra
     enabled = np.ones(len(target))
     enabled[-rows["swing"] :] = 0.0
     return target, enabled
+
+
+def scaled(controller: Controller, gain: float) -> Controller:
+    """A controller with a share of its gains."""
+    gains = {name: values * (gain if name in ("kp", "kd") else 1.0) for name, values in controller.gains.items()}
+    return Controller(kind=controller.kind, rate_hz=controller.rate_hz, gains=gains)
+
+
+def main(args: Args) -> None:
+    """Writes the log that is to be recorded."""
+    for name in ("seconds", "rate_hz", "kp", "torque_limit_nm", "control_hz"):
+        if not 0 < getattr(args, name) < np.inf:
+            raise ValueError(f"{name}: got {getattr(args, name)}, expected a positive, finite number")
+    spec = models.spec(args.robot)
+    kinds = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+    joints = tuple(joint.name for joint in spec.joints if joint.type in kinds)
+    everywhere = np.ones(len(joints))
+    gains = {"kp": args.kp, "kd": args.kd, "torque_limit_nm": args.torque_limit_nm}
+    controller = Controller(
+        kind="pd", rate_hz=args.control_hz, gains={name: value * everywhere for name, value in gains.items()}
+    )
+    runs = tuple(
+        Run(
+            name=motion.name,
+            condition=motion.condition,
+            split=motion.split,
+            controller=scaled(controller, motion.gain),
+            time=motion.time,
+            signals={"target": motion.target, "enabled": motion.enabled},
+        )
+        for motion in excitation(spec, joints, args.runs, args.seconds, args.rate_hz, args.seed)
+    )
+    built_in = args.robot in models.BUILT_IN
+    name = args.robot if built_in else Path(args.robot).name
+    write(Log(robot=name, base="fixed", rate_hz=args.rate_hz, joints=joints, policy=None, runs=runs), args.out)
+    if not built_in:
+        shutil.copy(args.robot, args.out / name)
+    console.print(
+        f"{len(runs)} runs of {args.seconds:g} s for {', '.join(joints)} in {args.out}: play each run's targets, and "
+        "write what was measured into the same files (q.*, and dq.* where there is a sensor)"
+    )
+
+
+if __name__ == "__main__":
+    run(main, Args)

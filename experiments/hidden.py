@@ -13,7 +13,7 @@ import numpy as np
 
 from envs.logs import Controller, Log, Run
 from envs.rig import hung
-from experiments.excite import Motion
+from experiments.excite import Motion, scaled
 
 _STEP_S = 0.0004
 _BRISTLE = 2000.0  # 1/rad: one over the displacement at which bristles slip
@@ -49,10 +49,7 @@ def record(
     robot = _Robot(spec, joints, truth, nominal_error, rng)
     runs = []
     for motion in motions:
-        gains = {
-            name: values * (motion.gain if name in ("kp", "kd") else 1.0) for name, values in controller.gains.items()
-        }
-        own = Controller(kind="pd", rate_hz=controller.rate_hz, gains=gains)
+        own = scaled(controller, motion.gain)
         position, speed = robot.play(motion, own, np.random.default_rng((seed, len(runs))))
         if noise:
             position = np.round(position / _ENCODER_RAD) * _ENCODER_RAD
@@ -124,7 +121,9 @@ class _Robot:
         if truth.effect == "loose_foot":
             for name in truth.places:
                 loose = spec.joint(name).parent.add_body(name=f"{name}_loose", pos=[0.0, 0.0, -0.2])
-                loose.add_joint(name=f"{name}_loose", axis=[0, 1, 0], stiffness=0.5, damping=0.002)
+                loose.add_joint(
+                    name=f"{name}_loose", axis=[0, 1, 0], stiffness=[0.5, 0.0, 0.0], damping=[0.002, 0.0, 0.0]
+                )
                 loose.add_geom(size=[0.02, 0, 0], pos=[0, 0, -0.06], mass=truth.size, contype=0, conaffinity=0)
         for name in truth.places:
             if truth.effect not in ("link_mass", "com_offset", "payload"):
@@ -157,7 +156,7 @@ class _Robot:
             spare.limited, spare.range = mujoco.mjtLimited.mjLIMITED_TRUE, [-half, half]
             spare.solref_limit = [0.002, 1.0]
         elif self._truth.effect == "compliance":
-            spare.stiffness = self._truth.size
+            spare.stiffness = [self._truth.size, 0.0, 0.0]
         return spare
 
     def play(self, motion: Motion, controller: Controller, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:

@@ -1,0 +1,247 @@
+"""Motions, hidden robots and scores of the blind benchmark; what the command refuses."""
+
+import json
+
+import mujoco
+import numpy as np
+import pytest
+
+from envs.logs import Controller, read, splits, write
+from envs.segments import noise
+from experiments import discover, discovery_bench
+from experiments.discovery_bench import ARM, SIZES, score, tally, wilson
+from experiments.excite import excitation
+from experiments.hidden import OUTSIDE, Truth, record
+from experiments.question import gate, hypotheses, measure_scales, place_sets
+
+JOINTS = ("shoulder", "elbow")
+GAINS = {"kp": np.array([40.0, 20.0]), "kd": np.array([2.0, 0.8]), "torque_limit_nm": np.array([15.0, 15.0])}
+CONTROLLER = Controller(kind="pd", rate_hz=1000.0, gains=GAINS)
+
+
+@pytest.fixture(scope="module")
+def spec():
+    return mujoco.MjSpec.from_file(str(ARM))
+
+
+@pytest.fixture(scope="module")
+def motions(spec):
+    return excitation(spec, JOINTS, 4, 1.0, 500.0)
+
+
+def hidden(spec, motions, effect, size, places=("elbow",), **kwargs):
+    settings = {"nominal_error": 0.0, "seed": 3, "noise": False} | kwargs
+    return record(spec, JOINTS, motions, CONTROLLER, Truth(effect, places, size), **settings)
+
+
+@pytest.fixture(scope="module")
+def plain(spec, motions):
+    return hidden(spec, motions, None, 0.0, ())
+
+
+def test_every_split_has_every_kind_of_motion(motions, plain):
+    assert [motion.split for motion in motions] == ["train", "select", "train", "sealed"]
+    assert {split: len(runs) for split, runs in splits(plain).items()} == {"train": 2, "select": 1, "sealed": 1}
+    for motion in motions:
+        assert len(motion.target) == len(motion.time) == len(motion.enabled) == 500
+        # 15 % at the end with the motors off.
+        assert motion.enabled.sum() == 425
+        assert not motion.enabled[-75:].any()
+    assert {motion.gain for motion in motions} == {1.0, 0.5}
+
+
+def test_targets_stay_within_the_joints_ranges(spec):
+    for motion in excitation(spec, JOINTS, 8, 3.0, 500.0, seed=4):
+        low, high = np.array([[-1.6, 1.6], [-2.0, 2.0]]).T
+        assert (motion.target >= low).all()
+        assert (motion.target <= high).all()
+
+
+def test_too_few_runs_to_split_are_refused(spec):
+    with pytest.raises(ValueError, match="runs: got 3, expected 4 or more"):
+        excitation(spec, JOINTS, 3, 1.0, 500.0)
+
+
+@pytest.mark.parametrize(
+    ("effect", "size"),
+    [
+        ("coulomb", 0.4),
+        ("command_delay", 0.01),
+        ("torque_scale", 0.7),
+        ("encoder_bias", 0.05),
+        ("backlash", 0.05),
+        ("compliance", 60.0),
+        ("cogging", 0.5),
+        ("temperature_fade", 0.5),
+        ("cable_stiffness", 3.0),
+        ("loose_foot", 0.2),
+    ],
+)
+def test_what_is_hidden_moves_the_robot_and_more_of_it_further(spec, motions, plain, effect, size):
+    far = {"torque_scale": 0.4, "compliance": 20.0}.get(effect, 2.0 * size)
+    moved = [
+        np.abs(hidden(spec, motions[:1], effect, value).runs[0].signals["q"] - plain.runs[0].signals["q"]).max()
+        for value in (size, far)
+    ]
+    assert 1e-3 < moved[0] < moved[1] < 3.0
+
+
+def test_a_bias_is_in_what_is_read_of_its_joint_alone(spec, motions):
+    # With the motors off nothing answers to what is read.
+    off = [type(motion)(**{**motion.__dict__, "enabled": np.zeros_like(motion.enabled)}) for motion in motions[:1]]
+    difference = (
+        hidden(spec, off, "encoder_bias", 0.05).runs[0].signals["q"] - hidden(spec, off, None, 0.0).runs[0].signals["q"]
+    )
+    np.testing.assert_allclose(difference, np.tile([0.0, 0.05], (500, 1)), atol=1e-9)
+
+
+def test_readings_are_rounded_and_noisy(spec, motions):
+    run = hidden(spec, motions[:1], None, 0.0, (), noise=True).runs[0]
+    quantum = 2 * np.pi / 2**14
+    np.testing.assert_allclose(run.signals["q"] / quantum, np.round(run.signals["q"] / quantum), atol=1e-6)
+    assert noise(run.signals["dq"]) == pytest.approx(0.01, rel=0.3)
+
+
+def test_a_velocity_that_lags_is_left_out_and_said_so(plain):
+    assert gate(plain)[1] == ()
+    runs = []
+    for run in plain.runs:
+        late = np.stack([np.interp(run.time - 0.02, run.time, column) for column in run.signals["dq"].T], axis=1)
+        runs.append(type(run)(**{**run.__dict__, "signals": {**run.signals, "dq": late}}))
+    kept, notes = gate(type(plain)(**{**plain.__dict__, "runs": tuple(runs)}))
+    assert notes == ("dq lags q by 20 ms: it is filtered, and not used",)
+    assert all("dq" not in run.signals for run in kept.runs)
+
+
+def test_places_are_each_alone_pairs_and_all():
+    assert place_sets(("left_hip", "left_knee", "right_hip", "right_knee")) == [
+        ("left_hip",),
+        ("left_knee",),
+        ("right_hip",),
+        ("right_knee",),
+        ("left_hip", "right_hip"),
+        ("left_knee", "right_knee"),
+        ("left_hip", "left_knee", "right_hip", "right_knee"),
+    ]
+    assert place_sets(JOINTS) == [("shoulder",), ("elbow",), JOINTS]
+    assert place_sets(("hinge",)) == [("hinge",)]
+
+
+def test_a_size_at_two_places_is_the_same_physical_size(spec, plain):
+    from envs.rig import Rig
+
+    rig = Rig(spec, JOINTS, 1000.0)
+    rig = Rig(spec, JOINTS, 1000.0, measure_scales(rig, plain))
+    for hypothesis in hypotheses(
+        rig, {name: rig.effects[name] for name in ("coulomb", "torque_limit", "torque_scale")}
+    ):
+        row = rig.effects[hypothesis.name]
+        (parameter,), (direction,) = row.parameters, hypothesis.directions
+        values = [
+            float(parameter.value(0.5 * direction[number], rig.scale(row, parameter)[axis.index]))
+            for number, axis in enumerate(rig.axes)
+            if direction[number]
+        ]
+        assert len(values) == len(hypothesis.places)
+        np.testing.assert_allclose(values, values[0], rtol=1e-5)
+
+
+def test_wilson_interval():
+    # None of 40: z^2 / (40 + z^2) = 3.8416 / 43.8416.
+    low, high = wilson(0, 40)
+    assert low == 0.0
+    assert high == pytest.approx(0.0876, abs=1e-4)
+    assert wilson(20, 40) == pytest.approx((0.352, 0.648), abs=1e-3)
+    assert wilson(0, 0) == (0.0, 1.0)
+
+
+def named(name, family="joint_friction", places=("elbow",), others=()):
+    return {"name": name, "family": family, "places": list(places), "confusable_with": list(others)}
+
+
+def answer(effects=(), changes=(), verdict="named", after=1.0):
+    gap = {"before": 20.0, "null": 10.0, "after": after}
+    return {
+        "verdict": verdict, "effects": list(effects), "parameter_changes": list(changes), "gap": gap, "seconds": 1.0
+    }  # fmt: skip
+
+
+def truth(effect, severity=15.0, places=("elbow",)):
+    return {"effect": effect, "asked": severity, "severity": severity, "truth": {"places": list(places)}}
+
+
+def test_scores_count_names_families_sets_and_places_apart():
+    right = score(truth("coulomb"), answer([named("coulomb")]))
+    kin = score(truth("coulomb"), answer([named("stribeck", others=("coulomb",))]))
+    wrong = score(truth("coulomb", places=("shoulder",)), answer([named("backlash", "transmission")]))
+    change = score(truth("armature"), answer((), [named("armature", "transmission")], "parameter_change"))
+    assert [right[key] for key in ("name", "family", "in_set", "place")] == [True] * 4
+    assert [kin[key] for key in ("name", "family", "in_set", "place")] == [False, True, True, True]
+    assert [wrong[key] for key in ("name", "family", "in_set", "place")] == [False] * 4
+    assert change["name"]
+    rows = [
+        right,
+        kin,
+        wrong,
+        score(truth(None, 0.0, ()), answer(verdict="no_missing_effect")),
+        score(truth(None, 0.0, ()), answer([named("drag", "external")])),
+        score(truth("cogging"), answer(verdict="unnamed")),
+    ]
+    table = {line["measure"]: line for line in tally(rows)}
+    assert table["top-1 name, 5 floor units and more"]["value"] == pytest.approx(1 / 3)
+    assert table["truth in the reported set, 5 and more"]["value"] == pytest.approx(2 / 3)
+    assert table["names something where nothing is hidden"]["value"] == 0.5
+    assert table["`unnamed` outside the library"]["value"] == 1.0
+    assert table["gap shrink at 15 floor units, name right"]["value"] == 20.0
+    assert table["mean size of the reported set"]["value"] == pytest.approx(4 / 3)
+
+
+def test_sizes_hide_what_the_library_has_and_what_it_has_not():
+    standard = SIZES["standard"]
+    assert (len(standard.hidden), standard.empty, len(standard.outside)) == (48, 40, 10)
+    assert {name for name, _ in standard.outside} == set(OUTSIDE)
+    for severity in (2.0, 5.0, 15.0):
+        assert sum(asked == severity for _, asked in standard.hidden) == 16
+    assert all(name in discovery_bench._BOUNDS for name, _ in (*standard.hidden, *standard.outside))
+
+
+def test_the_learner_reads_a_log_that_says_nothing_of_the_truth(tmp_path, spec, motions):
+    bench = discovery_bench.Bench(discovery_bench.Args(out=tmp_path))
+    case = next(case for case in bench.cases if case.effect is None)
+    folder = bench.write(case)
+    assert json.loads((tmp_path / "sealed" / f"case_{case.number:03d}.json").read_text())["effect"] is None
+    log = read(folder)
+    assert log.joints == JOINTS
+    assert {run.split for run in log.runs} == {"train", "select", "sealed"}
+    written = "".join(path.read_text(errors="ignore") for path in folder.iterdir() if path.suffix in (".yaml", ".xml"))
+    assert "effect" not in written
+    # The robot in the log is the nominal one, not the one that moved.
+    assert (folder / "arm.xml").read_text() == ARM.read_text()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"base": "free"}, "base: got 'free', expected 'fixed'"),
+        ({"joints": JOINTS[::-1]}, r"joints: got \('elbow', 'shoulder'\), expected \('shoulder', 'elbow'\)"),
+    ],
+)
+def test_logs_that_do_not_go_together_are_refused(tmp_path, plain, change, message):
+    folders = []
+    for name, changed in {"one": {}, "two": change}.items():
+        folder = tmp_path / name
+        write(type(plain)(**{**plain.__dict__, "robot": "arm.xml", **changed}), folder)
+        (folder / "arm.xml").write_text(ARM.read_text())
+        folders.append(folder)
+    with pytest.raises(ValueError, match=message):
+        discover.gathered(tuple(folders))
+
+
+def test_horizons_that_do_not_rise_are_refused_before_anything_is_computed(tmp_path, plain):
+    folder = tmp_path / "log"
+    write(type(plain)(**{**plain.__dict__, "robot": "arm.xml"}), folder)
+    (folder / "arm.xml").write_text(ARM.read_text())
+    for horizons in ((0.1, 0.2), (0.2, 0.1, 0.4), (0.0, 0.1, 0.2)):
+        with pytest.raises(ValueError, match="horizons: got"):
+            discover.main(discover.Args(logs=(folder,), out=tmp_path / "out", horizons=horizons))
+    assert not (tmp_path / "out").exists()
