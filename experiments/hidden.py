@@ -101,7 +101,6 @@ class _Robot:
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION
         self.qpos = np.array([model.joint(name).qposadr[0] for name in joints])
         self.dof = np.array([model.joint(name).dofadr[0] for name in joints])
-        self._play = np.array([model.joint(f"{name}_play").qposadr[0] for name in self._springs], int)
         model.dof_armature[self.dof] *= [off() for _ in joints]
         model.dof_damping[self.dof] *= [off() for _ in joints]
         self._friction = model.dof_frictionloss[self.dof] * np.array([off() for _ in joints])

@@ -30,6 +30,14 @@ def robot():
 
 
 @pytest.fixture(scope="session")
+def arm():
+    """The arm on the rig."""
+    import rigs
+
+    return rigs.arm()
+
+
+@pytest.fixture(scope="session")
 def apply(robot):
     """The robot's model with given parameters; pass all of them, or it compiles again."""
     return jax.jit(robot.model)

@@ -13,6 +13,18 @@ from envs.segments import HISTORY_S, Segment
 
 ARM = (Path(__file__).parents[1] / "experiments" / "arm.xml").read_text()
 ARM_JOINTS = ("shoulder", "elbow")
+# No two are alike, so that none can stand in another's place.
+ARM_SCALES = {
+    "torque": np.array([1.5, 0.8]),
+    "damping": np.array([0.5, 0.3]),
+    "stiffness": np.array([75.0, 40.0]),
+    "inertia": np.array([0.11, 0.03]),
+    "mass": np.array([1.2, 0.6]),
+    "drag": np.array([11.8, 5.9]),
+    "speed": np.array([3.0, 4.0]),
+    "slow": np.array([0.31, 0.42]),
+    "motor": np.array([1.9, 2.7]),
+}
 CONTROL_HZ = 200.0
 STEPS = 150
 
@@ -26,16 +38,18 @@ class Player:
         self._model = jax.jit(lambda vector: self.rig.model(self.rig.values(self.rig.tree(vector))))
 
     def vector(self, **effects):
-        """Coordinates [axes]: `effect={(place, parameter): coordinate}`."""
+        """Coordinates [axes] of physical values: `effect={place: {parameter: value}}`."""
         vector = np.zeros(len(self.rig.axes), np.float32)
-        for effect, cells in effects.items():
-            for (place, parameter), coordinate in cells.items():
-                (number,) = [
-                    number
-                    for number, axis in enumerate(self.rig.axes)
-                    if (axis.effect, axis.place, axis.parameter) == (effect, place, parameter)
-                ]
-                vector[number] = coordinate
+        left = {(effect, *cell) for effect, places in effects.items() for cell in cells(places)}
+        for number, axis in enumerate(self.rig.axes):
+            cell = (axis.effect, axis.place, axis.parameter)
+            if cell in left:
+                left.remove(cell)
+                row = self.rig.effects[axis.effect]
+                (parameter,) = [parameter for parameter in row.parameters if parameter.name == axis.parameter]
+                value = effects[axis.effect][axis.place][axis.parameter]
+                vector[number] = parameter.coordinate(value, float(self.rig.scale(row, parameter)[axis.index]))
+        assert not left
         return vector
 
     def play(self, segment, **effects):
@@ -45,8 +59,12 @@ class Player:
         return self._model(self.vector(**effects))
 
 
+def cells(places):
+    return [(place, name) for place, parameters in places.items() for name in parameters]
+
+
 def arm():
-    return Player(mujoco.MjSpec.from_string(ARM), ARM_JOINTS)
+    return Player(mujoco.MjSpec.from_string(ARM), ARM_JOINTS, ARM_SCALES)
 
 
 def segment(rig, start, target, kp=0.0, kd=0.0, limit=np.inf, feed=0.0, emf=0.0, speed=0.0, steps=STEPS):

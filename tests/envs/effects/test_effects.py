@@ -1,0 +1,502 @@
+"""Every effect against physics: a closed form, or what MuJoCo C makes of the same."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+import rigs
+
+from envs import effects, models, sensing
+from envs.effects import LIBRARY, RESIDUAL
+from envs.effects.memory import LONGEST_S, delay_line, delayed
+from envs.rig import Now, Wrench
+
+DT = 0.001
+ROWS = (*LIBRARY.values(), RESIDUAL)
+PARAMETERS = [
+    pytest.param(parameter, id=f"{row.name}.{parameter.name}") for row in ROWS for parameter in row.parameters
+]
+ACTING = [row for row in ROWS if row.enters != "model"]
+JOINTS = 2
+
+
+def now(speed=0.0, **fields):
+    joints = np.ones(JOINTS, np.float32)
+    standard = {
+        "dt": DT,
+        "position": joints * 0.0,
+        "load": joints * 0.0,
+        "limit": 5.0 * joints,
+        "stiffness": 20.0 * joints,
+        "damping": 0.0 * joints,
+        "body_velocity": np.zeros((JOINTS, 3), np.float32),
+    }
+    return Now(**(standard | {"speed": speed * joints} | fields))
+
+
+def signal_of(row, rng):
+    """Some signal of the stage that a row enters."""
+    shape = {"sensor": (2, JOINTS), "gravity": (3,)}.get(row.enters, (JOINTS,))
+    if row.enters == "wrench":
+        return Wrench(torque=draw(rng, (JOINTS,)), force=draw(rng, (JOINTS, 3)))
+    return draw(rng, shape)
+
+
+def draw(rng, shape):
+    return jnp.asarray(rng.uniform(-3.0, 3.0, shape), jnp.float32)
+
+
+def values_of(row, **physical):
+    """What `act` is given for physical values, each for all places or one per place."""
+    values = {}
+    for parameter in row.parameters:
+        each = np.broadcast_to(physical[parameter.name], JOINTS)
+        inner = [parameter.inner(parameter.coordinate(float(value), 1.0), 1.0) for value in each]
+        values[parameter.name] = jnp.asarray(inner, jnp.float32)
+    return values
+
+
+def act(name, signal, memory=None, at=None, **physical):
+    """One step of one effect."""
+    row = LIBRARY[name]
+    return row.act(values_of(row, **physical), jnp.asarray(signal, jnp.float32), at or now(), memory)[0]
+
+
+def series(name, signals, at=None, **physical):
+    """What becomes of signals [time, ...] one after the other, of one that has always been the first."""
+    row, at = LIBRARY[name], at or now()
+    values, signals = values_of(row, **physical), jnp.asarray(signals, jnp.float32)
+
+    def step(memory, signal):
+        signal, memory = row.act(values, signal, at, memory)
+        return memory, signal
+
+    return np.asarray(jax.lax.scan(step, row.start(signals[0], DT), signals)[1])
+
+
+# The library.
+
+
+def test_no_two_rows_have_one_name():
+    families = (getattr(effects, name) for name in {row.family for row in ROWS})
+    assert sum(len(family.ROWS) for family in families) == len(LIBRARY)
+    assert RESIDUAL.name not in LIBRARY
+    assert len({row.sentence for row in ROWS}) == len(ROWS)
+
+
+@pytest.mark.parametrize("row", ROWS, ids=lambda row: row.name)
+def test_sizes_of_interest_are_positive_and_within_the_bounds(row):
+    assert row.sizes[0] > 0
+    assert list(row.sizes) == sorted(row.sizes)
+    for parameter in row.parameters:
+        low, high = parameter.bounds
+        assert low <= 0 < high
+        assert all(size < high for size in row.sizes) or parameter.shape
+
+
+@pytest.mark.parametrize("row", ROWS, ids=lambda row: row.name)
+def test_a_row_acts_or_names_fields(row):
+    assert (row.act is None) == (row.enters == "model")
+    for parameter in row.parameters:
+        assert bool(parameter.fields) == (row.enters == "model")
+
+
+@pytest.mark.parametrize("parameter", PARAMETERS)
+@pytest.mark.parametrize("scale", [1.0, 0.3])
+def test_a_coordinate_is_the_inverse_of_a_value(parameter, scale):
+    low, high = parameter.bounds
+    for coordinate in np.linspace(low, high, 5)[1:]:
+        if coordinate:
+            value = float(parameter.value(coordinate, scale))
+            np.testing.assert_allclose(parameter.coordinate(value, scale), coordinate, rtol=1e-5, atol=1e-7)
+
+
+@pytest.mark.parametrize("parameter", PARAMETERS)
+def test_a_coordinate_of_zero_is_no_effect(parameter):
+    inner = parameter.inner(0.0, 0.3)
+    # What only shapes an effect has a value all the same: its scale.
+    np.testing.assert_allclose(inner, 0.3 if parameter.shape else 0.0, rtol=1e-6)
+
+
+@pytest.mark.parametrize("row", ACTING, ids=lambda row: row.name)
+def test_what_is_not_there_changes_nothing(row):
+    rng = np.random.default_rng(0)
+    values = {p.name: jnp.asarray(p.inner(np.zeros(JOINTS, np.float32), 0.3)) for p in row.parameters}
+    at = now(
+        speed=rng.uniform(-9, 9, JOINTS),
+        load=rng.uniform(0, 9, JOINTS),
+        damping=rng.uniform(0, 1, JOINTS),
+        limit=np.full(JOINTS, 0.1),  # less than the torque, which a controller without a limit of its own may have
+        body_velocity=rng.uniform(-9, 9, (JOINTS, 3)),
+    )
+    first = signal_of(row, rng)
+    memory = None if row.start is None else row.start(first, DT)
+    for _ in range(3):
+        signal = signal_of(row, rng)
+        got, following = row.act(values, signal, at, memory)
+        jax.tree.map(lambda one, two: np.testing.assert_allclose(one, two, rtol=1e-6, atol=1e-6), got, signal)
+        if row.start is not None:
+            # Of one shape for ever, or no loop could carry it.
+            assert jax.tree.map(jnp.shape, following) == jax.tree.map(jnp.shape, memory)
+            memory = following
+
+
+@pytest.mark.parametrize("row", [row for row in ACTING if row.undo], ids=lambda row: row.name)
+def test_undoing_what_is_not_there_changes_nothing(row):
+    readings = draw(np.random.default_rng(1), (20, 2, JOINTS))
+    values = {parameter.name: jnp.zeros(JOINTS) for parameter in row.parameters}
+    np.testing.assert_allclose(row.undo(values, readings, DT), readings, rtol=1e-6, atol=1e-6)
+
+
+# Joint friction.
+
+
+@pytest.fixture(scope="module")
+def pendulum():
+    return rigs.Player(models.spec("pendulum"), ("hinge",))
+
+
+# 0.49 kg at 0.1 m: 0.0049. The sphere itself, 2/5 0.49 0.02^2: 0.0000784. The arm, 0.001 kg and 0.1 m long: 0.0000033.
+# The motor: 0.0019. Together in kg m^2:
+PENDULUM_INERTIA = 0.0068817
+OWN_FRICTION_NM = 0.019
+
+
+def test_a_joint_sticks_within_its_friction(pendulum):
+    # Hanging down, pushed by 0.05 of 0.019 + 0.04 Nm. MuJoCo's stick creeps: its friction is 1 / 0.9 - 1 = 0.111 soft
+    # and brakes by 2 / (0.9 x 0.02 s) = 111 /s, so that it is 0.05 / 0.0069 x 0.111 / 111 = 0.0073 rad/s fast.
+    segment = rigs.segment(pendulum.rig, 0.0, 0.0, feed=0.05)
+    read = pendulum.play(segment, coulomb={"hinge": {"torque_nm": 0.04}})
+    assert np.abs(read["dq"]).max() < 0.008
+    assert np.abs(pendulum.play(segment)["dq"]).max() > 0.3
+
+
+def test_a_joint_slides_with_what_is_more_than_its_friction(pendulum):
+    segment = rigs.segment(pendulum.rig, 0.0, 0.0, feed=0.2)
+    read = pendulum.play(segment, coulomb={"hinge": {"torque_nm": 0.04}})
+    # After 5 ms gravity still is 0.5 x 20.5 x 0.005^2 x 0.481 = 0.0001 Nm.
+    expected = (0.2 - OWN_FRICTION_NM - 0.04) / PENDULUM_INERTIA * 0.005
+    np.testing.assert_allclose(read["dq"][5, 0], expected, rtol=2e-3)
+
+
+def test_coulomb_friction_is_what_is_added_to_the_bound():
+    np.testing.assert_allclose(act("coulomb", [0.1, 0.2], torque_nm=[0.3, 0.0]), [0.4, 0.2], rtol=1e-6)
+
+
+def test_stribeck_friction_decays_with_speed_whichever_way():
+    def extra(speed):
+        return act("stribeck", [0.1, 0.1], at=now(speed), torque_nm=0.3, speed_rad_s=0.5)
+
+    # At rest all of it, at the speed of its name 1 / e, at five times that 0.007.
+    np.testing.assert_allclose(extra(0.0), 0.4, rtol=1e-6)
+    np.testing.assert_allclose(extra(0.5), 0.1 + 0.3 * 0.367879, rtol=1e-5)
+    np.testing.assert_allclose(extra(-0.5), extra(0.5), rtol=1e-6)
+    np.testing.assert_allclose(extra(2.5), 0.1 + 0.3 * 0.0067379, rtol=1e-5)
+
+
+def test_friction_of_the_load_is_a_share_of_it():
+    at = now(load=np.array([2.0, 0.0], np.float32))
+    np.testing.assert_allclose(act("load_friction", [0.1, 0.1], at=at, ratio=0.25), [0.6, 0.1], rtol=1e-6)
+
+
+# Actuator.
+
+
+def test_a_late_signal_is_the_one_of_so_many_steps_ago():
+    targets = np.random.default_rng(2).normal(size=(80, JOINTS)).astype(np.float32)
+    got = series("command_delay", targets, seconds=[0.003, LONGEST_S])
+    np.testing.assert_allclose(got[3:, 0], targets[:-3, 0], atol=1e-5)
+    np.testing.assert_allclose(got[40:, 1], targets[:-40, 1], atol=1e-5)
+    # Before that, what has always been.
+    np.testing.assert_allclose(got[:3, 0], targets[0, 0], atol=1e-5)
+
+
+def test_between_samples_a_late_signal_is_both_in_proportion():
+    targets = np.random.default_rng(3).normal(size=(30, JOINTS)).astype(np.float32)
+    got = series("command_delay", targets, seconds=[0.0025, 0.0002])
+    np.testing.assert_allclose(got[3:, 0], 0.5 * targets[1:-2, 0] + 0.5 * targets[:-3, 0], atol=1e-4)
+    np.testing.assert_allclose(got[1:, 1], 0.8 * targets[1:, 1] + 0.2 * targets[:-1, 1], atol=1e-4)
+
+
+def test_a_line_is_no_longer_than_it_is():
+    line = delay_line(jnp.arange(2.0), DT)
+    assert line.shape == (41, 2)
+    got, line = delayed(line, jnp.ones(2), jnp.array([1.0, 0.0]), DT)
+    np.testing.assert_array_equal(got, [0.0, 1.0])
+    np.testing.assert_array_equal(line[0], 1.0)
+
+
+def test_a_slow_controller_follows_its_target_at_its_speed():
+    # 0.1 rad at 2 rad/s takes 50 steps of a millisecond; back again at half the speed, 100.
+    targets = np.concatenate([np.zeros(1), np.full(60, 0.1)])[:, None] * [1.0, -1.0]
+    got = series("target_slew", targets, rad_per_s=[2.0, 1.0])
+    steps = np.arange(61)
+    np.testing.assert_allclose(got[:, 0], np.minimum(0.002 * steps, 0.1), atol=1e-6)
+    np.testing.assert_allclose(got[:, 1], -0.001 * steps, atol=1e-6)
+
+
+def test_a_deadband_swallows_half_its_width_on_each_side():
+    errors = [[0.005, -0.005], [0.03, -0.03], [0.01, 0.0]]
+    expected = [[0.0, 0.0], [0.02, -0.02], [0.0, 0.0]]
+    for error, after in zip(errors, expected, strict=True):
+        np.testing.assert_allclose(act("deadband", error, rad=0.02), after, atol=1e-8)
+
+
+@pytest.mark.parametrize("name", ["gain_error", "torque_scale"])
+def test_a_ratio_multiplies(name):
+    np.testing.assert_allclose(act(name, [2.0, -3.0], ratio=[0.8, 1.5]), [1.6, -4.5], rtol=1e-6)
+
+
+def test_a_torque_is_limited_both_ways():
+    np.testing.assert_allclose(act("torque_limit", [2.0, -3.0], torque_nm=[1.5, 2.5]), [1.5, -2.5], rtol=1e-6)
+    np.testing.assert_allclose(act("torque_limit", [2.0, -3.0], torque_nm=4.0), [2.0, -3.0], rtol=1e-6)
+
+
+def test_a_motor_gives_less_the_faster_it_turns():
+    def most(torque, speed):
+        return act("torque_speed", [torque, torque], at=now(speed), nm_s_per_rad=[0.2, 0.0])
+
+    # A limit of 5 Nm, less 0.2 x 10: 3 Nm in the direction of its speed. In the other the back-EMF helps.
+    np.testing.assert_allclose(most(4.0, 10.0), [3.0, 4.0], rtol=1e-6)
+    np.testing.assert_allclose(most(-4.0, -10.0), [-3.0, -4.0], rtol=1e-6)
+    np.testing.assert_allclose(most(-4.0, 10.0), -4.0, rtol=1e-6)
+    np.testing.assert_allclose(most(2.9, 10.0), 2.9, rtol=1e-6)
+    np.testing.assert_allclose(most(4.0, 0.0), 4.0, rtol=1e-6)
+
+
+def test_a_motor_that_is_off_gives_no_torque_at_any_speed():
+    at = now(10.0, limit=np.zeros(JOINTS, np.float32))
+    np.testing.assert_array_equal(act("torque_speed", [0.0, 0.0], at=at, nm_s_per_rad=0.2), 0.0)
+
+
+def test_a_lagging_torque_rises_as_an_exponential():
+    # 1 - exp(-t / T) of a step that is seen from the end of its first millisecond on.
+    torque = np.concatenate([np.zeros(1), np.ones(50)])[:, None] * [2.0, -1.0]
+    got = series("torque_lag", torque, seconds=[0.01, 0.004])
+    time = DT * np.arange(51)[:, None]
+    np.testing.assert_allclose(got, [2.0, -1.0] * (1 - np.exp(-time / [0.01, 0.004])), atol=1e-5)
+
+
+# Transmission: a joint that is held, so that what the motor does is all there is.
+
+
+def wound(name, targets, damping=0.0, stiffness=20.0, **physical):
+    """Torque on the held joint and how far the motor is ahead of it, [time] each, as a controller turns the motor."""
+    row = LIBRARY[name]
+    values = values_of(row, **physical)
+    at = now(stiffness=jnp.full(JOINTS, stiffness), damping=jnp.full(JOINTS, damping))
+
+    def step(offset, target):
+        torque, offset = row.act(values, stiffness * (target - offset), at, offset)
+        return offset, (torque, offset)
+
+    _, (torque, offset) = jax.lax.scan(step, row.start(jnp.zeros(JOINTS), DT), jnp.asarray(targets, jnp.float32))
+    return np.asarray(torque)[:, 0], np.asarray(offset)[:, 0]
+
+
+def test_in_the_gap_a_joint_feels_nothing():
+    torque, offset = wound("backlash", np.full(5, 0.009), rad=0.02)
+    np.testing.assert_allclose(torque, 0.0, atol=1e-6)
+    np.testing.assert_allclose(offset, 0.009, rtol=1e-5)
+
+
+@pytest.mark.parametrize("way", [1.0, -1.0])
+def test_beyond_the_gap_the_motor_is_half_of_it_ahead(way):
+    torque, offset = wound("backlash", np.full(5, 0.05 * way), rad=0.02)
+    # 20 Nm/rad x (0.05 - 0.01) rad
+    np.testing.assert_allclose(offset, 0.01 * way, rtol=1e-5)
+    np.testing.assert_allclose(torque, 0.8 * way, rtol=1e-5)
+
+
+def test_torque_comes_back_once_the_motor_has_crossed_the_gap():
+    # Half a rad and back, by a controller that brakes: 1.2 Nm s/rad and 20 Nm/rad close in on the target with a time
+    # constant of 60 ms, so from 0.2 to -0.2 it takes 60 ms x ln((0.5 + 0.2) / (0.5 - 0.2)) = 50.8 ms.
+    targets = np.repeat([0.5, -0.5], [1000, 200])
+    torque, offset = wound("backlash", targets, damping=1.2, rad=0.4)
+    np.testing.assert_allclose(offset[999], 0.2, rtol=1e-5)
+    np.testing.assert_allclose(torque[999], 20.0 * 0.3, rtol=1e-4)
+    back = torque[1000:]
+    crossing = DT * np.flatnonzero(np.abs(back) > 1e-3)[0]
+    np.testing.assert_allclose(crossing, 0.0508, atol=0.002)
+    np.testing.assert_allclose(back[-1], -20.0 * 0.3, rtol=1e-4)
+    np.testing.assert_allclose(offset[-1], -0.2, rtol=1e-5)
+
+
+def test_a_spring_winds_up_by_torque_over_stiffness():
+    # Two springs in a row: 20 Nm/rad of the controller, 60 of the gears; a quarter of 0.1 rad is in the gears.
+    torque, offset = wound("compliance", np.full(5, 0.1), nm_per_rad=60.0)
+    np.testing.assert_allclose(offset, 0.025, rtol=1e-5)
+    np.testing.assert_allclose(torque, 1.5, rtol=1e-5)
+    np.testing.assert_allclose(torque / offset, 60.0, rtol=1e-5)
+
+
+def test_a_spring_winds_up_as_slowly_as_its_controller_lets_it():
+    # 0.8 Nm s/rad against 20 + 60 Nm/rad: a time constant of 10 ms. Steps are taken by their end, so a step of 1 ms
+    # leaves 1 / 1.1.
+    _, offset = wound("compliance", np.full(40, 0.1), damping=0.8, nm_per_rad=60.0)
+    np.testing.assert_allclose(offset, 0.025 * (1 - 1.1 ** -np.arange(1.0, 41.0)), rtol=1e-4)
+
+
+# Sensing.
+
+
+def motion(count=600):
+    """Smooth positions and velocities [time, 2, joints]."""
+    time = DT * np.arange(count)[:, None]
+    pace = 2 * np.pi * np.array([2.0, 3.0])
+    return np.stack([0.4 * np.sin(pace * time), 0.4 * pace * np.cos(pace * time)], axis=1).astype(np.float32)
+
+
+def test_a_biased_encoder_reads_positions_off_and_velocities_right():
+    got = act("encoder_bias", [[0.1, 0.2], [1.0, 2.0]], rad=[0.03, -0.05])
+    np.testing.assert_allclose(got, [[0.13, 0.15], [1.0, 2.0]], rtol=1e-6)
+
+
+def test_a_late_sensor_reads_positions_and_velocities_late():
+    readings = motion(100)
+    got = series("sensor_delay", readings, seconds=[0.005, 0.012])
+    np.testing.assert_allclose(got[12:, :, 0], readings[7:-5, :, 0], atol=1e-5)
+    np.testing.assert_allclose(got[12:, :, 1], readings[:-12, :, 1], atol=1e-5)
+
+
+def test_a_lagging_sensor_is_behind_a_ramp_by_its_time_constant():
+    # Held over each step, a ramp of 2 rad/s is behind by half a step less: 2 x (0.01 - 0.0005).
+    time = DT * np.arange(300)
+    ramp = np.stack([2.0 * time, np.full(300, 2.0)], axis=1)[:, :, None] * np.ones(JOINTS)
+    got = series("sensor_lag", ramp, seconds=0.01)
+    np.testing.assert_allclose(ramp[-1, 0] - got[-1, 0], 0.019, rtol=2e-3)
+    np.testing.assert_allclose(got[:, 1], 2.0, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "physical"),
+    [
+        ("encoder_bias", {"rad": [0.03, -0.05]}),
+        ("sensor_delay", {"seconds": [0.0124, 0.031]}),
+        ("sensor_lag", {"seconds": [0.008, 0.02]}),
+    ],
+)
+def test_what_a_sensor_did_is_undone(name, physical):
+    truth, row = motion(), LIBRARY[name]
+    values = values_of(row, **physical)
+    if row.start is None:
+        readings = np.stack([act(name, reading, **physical) for reading in truth])
+    else:
+        readings = series(name, truth, **physical)
+    got = np.asarray(row.undo(values, jnp.asarray(readings), DT))
+    # Until a lag of 20 ms has forgotten its start, and as long as a delay of 31 ms knows what comes.
+    inner = slice(200, 560)
+    # A lag is half a millisecond shorter than it says, of motion at up to 7.5 rad/s and 142 rad/s^2.
+    np.testing.assert_allclose(got[inner, 0], truth[inner, 0], atol=0.0005 * 7.6 + 1e-4)
+    np.testing.assert_allclose(got[inner, 1], truth[inner, 1], atol=0.0005 * 143 + 1e-3)
+    # Left alone they are further off.
+    assert np.abs(readings[inner, 0] - truth[inner, 0]).max() > 0.02
+
+
+@pytest.mark.parametrize("axis", ["roll", "pitch"])
+def test_a_tilted_imu_reads_gravity_in_its_own_frame(axis):
+    angle, upright = 0.02, np.array([0.28, -0.6, -0.75], np.float32)
+    half = np.array([np.cos(angle / 2), np.sin(angle / 2)])
+    quat = [half[0], half[1], 0.0, 0.0] if axis == "roll" else [half[0], 0.0, half[1], 0.0]
+    tilt = {"roll_rad": 0.0, "pitch_rad": 0.0} | {f"{axis}_rad": angle}
+    expected = sensing.rotate_inverse(jnp.asarray(quat, jnp.float32), jnp.asarray(upright))
+    # Small angles: half of 0.02^2 is left out.
+    np.testing.assert_allclose(act("imu_tilt", upright, **tilt), expected, atol=2.5e-4)
+    assert np.abs(expected - upright).max() > 0.01
+
+
+# From outside.
+
+
+def test_what_has_no_name_depends_on_position_and_speed():
+    zero = dict.fromkeys(("constant_nm", "sine_nm", "cosine_nm", "direction_nm", "speed_nm_s_per_rad"), 0.0)
+
+    def torque(position, speed, **terms):
+        nothing = Wrench(torque=jnp.full(JOINTS, 0.5), force=jnp.zeros((JOINTS, 3)))
+        at = now(speed, position=jnp.full(JOINTS, position))
+        return RESIDUAL.act(values_of(RESIDUAL, **(zero | terms)), nothing, at, None)[0].torque
+
+    np.testing.assert_allclose(torque(0.3, 2.0, constant_nm=0.2), 0.7, rtol=1e-6)
+    np.testing.assert_allclose(torque(np.pi / 2, 2.0, sine_nm=0.2, cosine_nm=9.0), 0.7, rtol=1e-5)
+    np.testing.assert_allclose(torque(np.pi, 2.0, cosine_nm=0.2, sine_nm=9.0), 0.3, rtol=1e-5)
+    # From 0.1 rad/s on it has its direction.
+    np.testing.assert_allclose(torque(0.3, -2.0, direction_nm=0.2), 0.3, rtol=1e-5)
+    np.testing.assert_allclose(torque(0.3, -2.0, speed_nm_s_per_rad=0.2), 0.1, rtol=1e-5)
+
+
+# Against MuJoCo C: an arm under its controller, with the effect and without.
+
+
+def replaced(text, old, new):
+    assert text.count(old) == 1
+    return text.replace(old, new)
+
+
+LOWER = 'fromto="0 0 0 0 0 -0.25"'
+UPPER = '<geom type="capsule" size="0.03" fromto="0 0 0 0 0 -0.3" mass="1.2"/>'
+IN_THE_MODEL = {
+    # 0.05 and 0.01 are everybody's.
+    "viscous": (
+        {"shoulder": {"nm_s_per_rad": 0.15}},
+        [('name="shoulder"', 'name="shoulder" damping="0.2"')],
+    ),
+    "armature": ({"elbow": {"kg_m2": 0.02}}, [('name="elbow"', 'name="elbow" armature="0.03"')]),
+    "coulomb": ({"elbow": {"torque_nm": 0.2}}, [('name="elbow"', 'name="elbow" frictionloss="0.2"')]),
+    # Geometries give a body mass and inertia alike.
+    "link_mass": ({"lower": {"ratio": 1.5}}, [('mass="0.6"', 'mass="0.9"')]),
+    "com_offset": (
+        {"lower": {"x_m": 0.03, "z_m": -0.02}},
+        [(LOWER, 'fromto="0.03 0 -0.02 0.03 0 -0.27"')],
+    ),
+    # At the centre of the upper link, too small to have an inertia of its own.
+    "payload": (
+        {"upper": {"kg": 0.7}},
+        [(UPPER, UPPER + '<geom type="sphere" size="0.0005" pos="0 0 -0.15" mass="0.7"/>')],
+    ),
+}
+
+
+@pytest.fixture(scope="module")
+def swing(arm):
+    """A step of both targets, from a posture with gravity torque."""
+    start = np.array([0.5, -0.7])
+    return rigs.segment(arm.rig, start, start + [0.3, 0.5], kp=12.0, kd=0.3, limit=3.0)
+
+
+@pytest.mark.parametrize("name", IN_THE_MODEL)
+def test_effects_of_the_model_move_it_as_if_compiled_with_them(arm, swing, name):
+    places, changes = IN_THE_MODEL[name]
+    text = rigs.ARM
+    for change in changes:
+        text = replaced(text, *change)
+    check(arm, swing, rigs.in_mujoco(arm.rig, rigs.compiled(text, arm.rig), swing), **{name: places})
+
+
+def test_a_push_is_a_torque_that_is_applied(arm, swing):
+    def push(data):
+        data.qfrc_applied[arm.rig.dof] += [0.0, -0.4]
+
+    expected = rigs.in_mujoco(arm.rig, rigs.compiled(rigs.ARM, arm.rig), swing, outside=push)
+    check(arm, swing, expected, constant_push={"elbow": {"nm": -0.4}})
+
+
+def test_drag_is_a_force_against_the_velocity_of_a_links_centre(arm, swing):
+    model = rigs.compiled(rigs.ARM, arm.rig)
+    lower = model.body("lower").id
+
+    def drag(data):
+        # Of the last step's kinematics, which both have at hand.
+        velocity = np.zeros(6)
+        mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, lower, velocity, 0)
+        data.xfrc_applied[lower, :3] = -2.0 * velocity[3:]
+
+    check(arm, swing, rigs.in_mujoco(arm.rig, model, swing, outside=drag), drag={"lower": {"n_s_per_m": 2.0}})
+
+
+def check(arm, segment, expected, **effect):
+    read, without = arm.play(segment, **effect), arm.play(segment)
+    # Single precision; what they do is a thousand times as much.
+    np.testing.assert_allclose(read["q"], expected[:, 0], atol=5e-6)
+    np.testing.assert_allclose(read["dq"], expected[:, 1], atol=1e-4)
+    assert np.abs(without["q"] - expected[:, 0]).max() > 5e-3

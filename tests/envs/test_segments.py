@@ -1,0 +1,294 @@
+"""What is measured of a log, and how it is cut."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from envs import segments
+from envs.effects.memory import LONGEST_S
+from envs.logs import Controller, Run
+
+DT = 0.001
+PD = {"kp": np.array([20.0, 10.0]), "kd": np.array([0.5, 0.2]), "torque_limit_nm": np.array([5.0, 3.0])}
+SERVO = {"gain": np.array([2.0, 3.0]), "kt": np.array([0.4, 0.5]), "resistance_ohm": np.array([2.0, 4.0])}
+
+
+def times(seconds=1.0, rate_hz=200.0):
+    return np.arange(round(seconds * rate_hz) + 1) / rate_hz
+
+
+def run(time, name="run_000", kind="pd", gains=PD, **signals):
+    """A run of two joints, still at zero where nothing else is said."""
+    still = {"q": np.zeros((len(time), 2)), "target": np.zeros((len(time), 2))}
+    signals = {name: values for name, values in (still | signals).items() if values is not None}
+    return Run(
+        name=name,
+        condition=name,
+        split=None,
+        controller=Controller(kind=kind, rate_hz=200.0, gains=gains),
+        time=time,
+        signals=signals,
+    )
+
+
+def parabola(time):
+    """Positions and velocities [rows, joints] under constant accelerations."""
+    time = time[:, None]
+    acceleration, speed = np.array([4.0, -6.0]), np.array([-1.0, 2.0])
+    return 0.3 + speed * time + 0.5 * acceleration * time**2, speed + acceleration * time
+
+
+# Smoothing.
+
+
+@pytest.mark.parametrize("with_velocity", [True, False])
+@pytest.mark.parametrize("even", [True, False])
+def test_a_parabola_is_recovered_to_its_ends(with_velocity, even):
+    time = times()
+    if not even:
+        time = time + 0.002 * np.random.default_rng(0).uniform(size=len(time))
+    position, velocity = parabola(time)
+    got = segments.smoothed(run(time, q=position, dq=velocity if with_velocity else None))
+    assert got.shape == (201, 2, 2)
+    np.testing.assert_allclose(got[:, 0], position, atol=1e-5)
+    np.testing.assert_allclose(got[:, 1], velocity, atol=1e-3)
+
+
+def test_smoothing_takes_noise_out():
+    rng = np.random.default_rng(1)
+    time = times(4.0)
+    position, velocity = parabola(time)
+    noisy = position + 0.01 * rng.standard_normal(position.shape)
+    got = segments.smoothed(run(time, q=noisy))[10:-10]
+    # Two rows on each side: a parabola through five points leaves 17 / 35 of the variance of the middle one, 0.697 of
+    # its deviation; and a slope's is 0.01 / (5 ms sqrt(10)).
+    np.testing.assert_allclose((got[:, 0] - position[10:-10]).std(), 0.697 * 0.01, rtol=0.06)
+    np.testing.assert_allclose((got[:, 1] - velocity[10:-10]).std(), 0.01 / (0.005 * 10**0.5), rtol=0.06)
+
+
+def test_a_good_velocity_counts_for_more_than_positions():
+    rng = np.random.default_rng(2)
+    time = times(4.0)
+    position, velocity = parabola(time)
+    noisy = position + 0.01 * rng.standard_normal(position.shape)
+    measured = velocity + 0.01 * rng.standard_normal(velocity.shape)
+    got = segments.smoothed(run(time, q=noisy, dq=measured))[10:-10]
+    # Positions would know it to 0.63 rad/s, see above; five velocities to 0.01 / sqrt(5).
+    np.testing.assert_allclose((got[:, 1] - velocity[10:-10]).std(), 0.01 / 5**0.5, rtol=0.1)
+
+
+# Noise and rounding.
+
+
+def test_noise_is_what_changes_from_row_to_row():
+    rng = np.random.default_rng(3)
+    time = times(20.0)
+    position, _ = parabola(time)
+    # 8000 draws; a median of theirs is good to a few percent.
+    np.testing.assert_allclose(
+        segments.noise(position + 0.02 * rng.standard_normal(position.shape)), 0.02, rtol=0.05
+    )
+
+
+def test_noise_of_a_smooth_signal_is_none_and_not_zero():
+    position, _ = parabola(times())
+    assert 0 < segments.noise(position) < 1e-5
+    assert segments.noise(np.zeros((50, 2))) > 0
+
+
+@pytest.mark.parametrize("quantum", [2 * np.pi / 2**14, 2 * np.pi / 4096, 0.005, 0.25])
+def test_a_quantum_is_found(quantum):
+    position, _ = parabola(times(2.0))
+    rounded = np.round(position / quantum) * quantum
+    np.testing.assert_allclose(segments.quantum_of(rounded), quantum, rtol=1e-5)
+    # At least the noise of rounding, a uniform distribution's.
+    assert segments.noise(rounded) >= quantum / 12**0.5 * (1 - 1e-5)
+
+
+def test_what_was_not_rounded_has_no_quantum():
+    rng = np.random.default_rng(4)
+    assert segments.quantum_of(rng.standard_normal((500, 2))) == 0.0
+    assert segments.quantum_of(parabola(times())[0].astype(np.float32)) == 0.0
+    assert segments.quantum_of(np.ones((500, 2))) == 0.0
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.007, 0.02])
+def test_a_late_velocity_is_found(late_s):
+    time = times(4.0)
+    pace = 2 * np.pi * np.array([1.0, 2.5])
+    position = 0.3 * np.sin(pace * time[:, None])
+    velocity = 0.3 * pace * np.cos(pace * (time[:, None] - late_s))
+    np.testing.assert_allclose(segments.velocity_lag(run(time, q=position, dq=velocity)), late_s, atol=0.0011)
+
+
+# Cutting.
+
+
+@pytest.fixture(scope="module")
+def moving():
+    """A parabola under targets that name their row: 1, 2, ... for one joint, -1, -2, ... for the other."""
+    time = times(1.0)
+    position, velocity = parabola(time)
+    number = np.arange(len(time), dtype=float)[:, None]
+    return run(time, q=position, dq=velocity, target=number * [1.0, -1.0])
+
+
+# 0.06 s before, 0.04 s ahead, 0.15 s of 1 ms each, one more for the end.
+BEFORE, AHEAD, AFTER = 60, 40, 151
+
+
+def test_pieces_follow_on_each_other_and_have_a_history(moving):
+    cut = segments.cut([moving], 0.15, DT)
+    # 0.15 s are 30 rows; the first with 0.06 s before it is row 12: from 12, 42, ... up to row 200.
+    np.testing.assert_array_equal(cut.row[:, 0], [13, 43, 73, 103, 133, 163])
+    np.testing.assert_array_equal(cut.row, cut.row[:, :1] + np.arange(30))
+    np.testing.assert_array_equal(cut.run, 0)
+    assert round(LONGEST_S / DT) == AHEAD
+    assert round(segments.HISTORY_S / DT) == BEFORE
+    one = cut.segments
+    assert one.measured.shape == (6, BEFORE + 1 + AHEAD, 2, 2)
+    for name in ("target", "feed", "stiffness", "damping", "limit", "emf"):
+        assert getattr(one, name).shape == (6, BEFORE + AFTER, 2), name
+    assert one.sample.shape == (6, BEFORE + AFTER)
+    assert one.row_step.shape == one.row_share.shape == (6, 30)
+
+
+def test_what_was_measured_at_the_rows_is_what_was_measured(moving):
+    cut = segments.cut([moving], 0.15, DT)
+    assert set(cut.signals) == {"q", "dq"}
+    for name, values in cut.signals.items():
+        np.testing.assert_allclose(values, moving.signals[name][cut.row], rtol=1e-6)
+
+
+def test_rows_are_read_at_their_times(moving):
+    cut = segments.cut([moving], 0.15, DT)
+    at = DT * (cut.segments.row_step + cut.segments.row_share)
+    np.testing.assert_allclose(at, moving.time[cut.row] - moving.time[cut.row[:, :1] - 1], atol=1e-6)
+
+
+def test_rows_between_steps_are_read_between_steps():
+    # 1 / 60 s apart: 16.67 steps.
+    time = times(1.0, rate_hz=60.0)
+    cut = segments.cut([run(time)], 0.1, DT)
+    np.testing.assert_array_equal(cut.segments.row_step[0, :3], [16, 33, 50])
+    np.testing.assert_allclose(cut.segments.row_share[0, :3], [2 / 3, 1 / 3, 0.0], atol=1e-3)
+
+
+def test_a_segment_starts_where_the_robot_was(moving):
+    cut = segments.cut([moving], 0.15, DT)
+    start = moving.time[cut.row[:, 0] - 1]
+    grid = start[:, None] + DT * np.arange(-BEFORE, AHEAD + 1)
+    position, velocity = parabola(grid.ravel())
+    # Past the last row it stays what it was.
+    there = grid <= moving.time[-1]
+    measured = np.asarray(cut.segments.measured)
+    np.testing.assert_allclose(measured[:, :, 0][there], position.reshape(*grid.shape, 2)[there], atol=1e-5)
+    np.testing.assert_allclose(measured[:, :, 1][there], velocity.reshape(*grid.shape, 2)[there], atol=1e-3)
+
+
+def test_a_target_is_held_until_the_next_row(moving):
+    cut = segments.cut([moving], 0.15, DT)
+    target = np.asarray(cut.segments.target)
+    first = cut.row[:, 0] - 1
+    steps = np.arange(-BEFORE, AFTER)
+    # A row's target acts for the five steps from its time on.
+    expected = np.minimum(first[:, None] + steps // 5, len(moving.time) - 1)
+    np.testing.assert_array_equal(target[..., 0], expected)
+    np.testing.assert_array_equal(target[..., 1], -expected)
+
+
+def test_a_controller_looks_at_its_rate(moving):
+    cut = segments.cut([moving], 0.15, DT)
+    # 200 Hz at a millisecond: every fifth step, the start among them; the first step of all has nothing to hold.
+    sample = np.asarray(cut.segments.sample)[:, 1:]
+    steps = np.arange(-BEFORE, AFTER)[1:]
+    np.testing.assert_array_equal(sample, np.broadcast_to(steps % 5 == 0, sample.shape))
+
+
+def test_the_controllers_numbers_are_the_logs(moving):
+    cut = segments.cut([moving], 0.15, DT)
+    for name, gain in (("stiffness", "kp"), ("damping", "kd"), ("limit", "torque_limit_nm")):
+        values = getattr(cut.segments, name)
+        np.testing.assert_allclose(values, np.broadcast_to(PD[gain], values.shape), rtol=1e-6)
+    np.testing.assert_array_equal(cut.segments.emf, 0.0)
+    np.testing.assert_array_equal(cut.segments.feed, 0.0)
+
+
+def test_a_motor_that_is_off_has_no_stiffness_and_no_torque(moving):
+    enabled = (np.arange(len(moving.time)) < 20).astype(float)
+    off = replace(moving, signals={**moving.signals, "enabled": enabled})
+    cut = segments.cut([off], 0.15, DT)
+    # The first piece begins at row 12, so eight rows of five steps are left.
+    for name in ("stiffness", "damping", "limit"):
+        values = np.asarray(getattr(cut.segments, name))
+        assert np.all(values[0, : BEFORE + 40] > 0), name
+        np.testing.assert_array_equal(values[0, BEFORE + 40 :], 0.0, err_msg=name)
+        np.testing.assert_array_equal(values[1:, BEFORE:], 0.0, err_msg=name)
+
+
+def test_a_servo_is_a_stiffness_a_limit_and_a_brake(moving):
+    volts = np.full(len(moving.time), 8.0)
+    servo = replace(moving, controller=replace(moving.controller, kind="servo", gains=SERVO))
+    servo = replace(servo, signals={**moving.signals, "volts": volts})
+    one = segments.cut([servo], 0.15, DT).segments
+    # At 8 V it stalls at 8 x 0.4 / 2 = 1.6 and 8 x 0.5 / 4 = 1.0 Nm; its windings brake by kt^2 / R.
+    np.testing.assert_allclose(one.limit[0, 0], [1.6, 1.0], rtol=1e-6)
+    np.testing.assert_allclose(one.stiffness[0, 0], [3.2, 3.0], rtol=1e-6)
+    np.testing.assert_allclose(one.emf[0, 0], [0.08, 0.0625], rtol=1e-6)
+    np.testing.assert_array_equal(one.damping, 0.0)
+
+
+def test_torques_that_were_sent_are_fed(moving):
+    number = np.arange(len(moving.time), dtype=float)[:, None] * [1.0, -1.0]
+    fed = run(moving.time, q=moving.signals["q"], target=None, tau=number)
+    cut = segments.cut([fed], 0.15, DT)
+    np.testing.assert_array_equal(cut.segments.feed, segments.cut([moving], 0.15, DT).segments.target)
+    np.testing.assert_array_equal(cut.segments.stiffness, 0.0)
+    # What was sent is no measurement.
+    assert set(cut.signals) == {"q"}
+
+
+def test_runs_are_cut_alike_and_know_whose_they_are(moving):
+    short = run(times(0.4), name="run_001")
+    cut = segments.cut([moving, short], 0.15, DT)
+    # 0.4 s are 80 rows: from 12 and from 42.
+    np.testing.assert_array_equal(cut.run, [0] * 6 + [1] * 2)
+    np.testing.assert_array_equal(cut.row[6:, 0], [13, 43])
+    np.testing.assert_array_equal(cut.signals["q"][6:], 0.0)
+    # Only one of them has velocities.
+    assert set(cut.signals) == {"q"}
+
+
+def test_a_segment_has_whole_bins():
+    # At 1 kHz ten rows make a bin of 10 ms; 0.0463 s are 4.6 bins.
+    cut = segments.cut([run(times(0.5, rate_hz=1000.0))], 0.0463, DT)
+    assert segments.rows_together(0.001, 0.01) == 10
+    assert cut.row.shape[1] == 50
+
+
+def test_runs_that_are_too_short_are_named():
+    with pytest.raises(ValueError, match=r"runs: the longest has 0\.2 s, expected more than 0\.21 s"):
+        segments.cut([run(times(0.2))], 0.15, DT)
+
+
+# Whole runs.
+
+
+def test_a_whole_run_is_one_piece(moving):
+    cut = segments.whole([moving], DT)
+    np.testing.assert_array_equal(cut.row, [np.arange(13, 201)])
+    np.testing.assert_allclose(cut.signals["q"][0], moving.signals["q"][13:], rtol=1e-6)
+    at = DT * (cut.segments.row_step + cut.segments.row_share)
+    np.testing.assert_allclose(at[0], moving.time[13:] - moving.time[12], atol=1e-6)
+    # The last row can be read, and no more is simulated than it takes.
+    assert cut.segments.target.shape == (1, BEFORE + 941, 2)
+
+
+def test_whole_runs_are_of_equal_shape(moving):
+    short = run(times(0.4), name="run_001", q=np.ones((81, 2)))
+    cut = segments.whole([moving, short], DT)
+    np.testing.assert_array_equal(cut.run, [0, 1])
+    np.testing.assert_array_equal(cut.row[1], [*range(13, 81), *[80] * 120])
+    np.testing.assert_allclose(cut.segments.row_step[1, 68:], 340)
+    assert len(np.unique(cut.row[1])) == 68
