@@ -35,7 +35,7 @@ class Now:
     dt: float
     position: jax.Array  # [joints] rad
     speed: jax.Array  # [joints] rad/s
-    load: jax.Array  # [joints] Nm through the gears
+    load: jax.Array  # [joints] Nm on the gears, the larger of those of their two sides
     limit: jax.Array  # [joints] Nm, the controller's
     stiffness: jax.Array  # [joints] Nm/rad
     damping: jax.Array  # [joints] Nm s/rad
@@ -246,7 +246,7 @@ class Rig:
             bias = data.qfrc_bias[self.dof]
             motor = joint.at[0].add(self._offset(memory))
             memory, (torque, read) = self._drive(values, memory, motor, x)
-            now = self._now(x, joint, load=0.5 * jnp.abs(torque + bias), data=data)
+            now = self._now(x, joint, load=jnp.maximum(jnp.abs(torque), jnp.abs(bias)), data=data)
             friction, _ = self._stage("friction", values, self._friction, now, memory)
             wrench, _ = self._stage("wrench", values, self._calm(), now, memory)
             # With a bound of nothing at all MJX brakes the joint.

@@ -145,6 +145,7 @@ def hypotheses(rig: Rig, rows: Mapping[str, Effect]) -> tuple[Hypothesis, ...]:
                     directions=directions,
                     probes=sizes,
                     bounds=np.array([parameter.bounds for parameter in row.parameters]),
+                    prior=np.array([parameter.prior for parameter in row.parameters]),
                     joints=tuple(sorted({joint for place in places for joint in rig.moves(row.on, place)})),
                 )
             )

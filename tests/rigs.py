@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 
@@ -32,8 +31,8 @@ STEPS = 150
 class Player:
     """A rig whose motion is compiled once."""
 
-    def __init__(self, spec, joints, scales=None):
-        self.rig = Rig(spec, joints, CONTROL_HZ, scales)
+    def __init__(self, rig):
+        self.rig = rig
         self._simulate = jax.jit(lambda vector, segment: self.rig.simulate(self.rig.tree(vector), segment))
         self._model = jax.jit(lambda vector: self.rig.model(self.rig.values(self.rig.tree(vector))))
 
@@ -53,7 +52,10 @@ class Player:
         return vector
 
     def play(self, segment, **effects):
-        return jax.tree.map(np.asarray, self._simulate(self.vector(**effects), segment))
+        return self.read(self.vector(**effects), segment)
+
+    def read(self, vector, segment):
+        return jax.tree.map(np.asarray, self._simulate(vector, segment))
 
     def model(self, **effects):
         return self._model(self.vector(**effects))
@@ -64,32 +66,34 @@ def cells(places):
 
 
 def arm():
-    return Player(mujoco.MjSpec.from_string(ARM), ARM_JOINTS, ARM_SCALES)
+    return Player(Rig(mujoco.MjSpec.from_string(ARM), ARM_JOINTS, CONTROL_HZ, ARM_SCALES))
 
 
 def segment(rig, start, target, kp=0.0, kd=0.0, limit=np.inf, feed=0.0, emf=0.0, speed=0.0, steps=STEPS):
-    """A robot that has stood at `start` [joints] with the first target, read at every step of `target` [steps, joints].
+    """A robot that has been at `start` [joints] with the first target, read at every step of `target` [steps, joints].
 
-    Where it starts with a speed, it has been there with this speed.
+    Where it has a speed [joints], it came there with it.
     """
     before, ahead = round(HISTORY_S / rig.dt), round(LONGEST_S / rig.dt)
     joints = len(rig.joints)
     target = np.broadcast_to(target, (steps, joints))
     target = np.concatenate([np.broadcast_to(target[0], (before, joints)), target])
-    state = np.stack([np.broadcast_to(start, joints), np.broadcast_to(speed, joints)])
+    speed = np.broadcast_to(speed, joints)
+    time = rig.dt * np.arange(-before, ahead + 1)[:, None]
+    measured = np.stack([start + time * speed, speed + 0 * time], axis=1)
     held = {"feed": feed, "stiffness": kp, "damping": kd, "limit": limit, "emf": emf}
     every = round(1.0 / rig.control_hz / rig.dt)
     return Segment(
         target=target.astype(np.float32),
         **{name: np.broadcast_to(value, target.shape).astype(np.float32) for name, value in held.items()},
         sample=(np.arange(len(target)) - before) % every == 0,
-        measured=np.broadcast_to(state, (before + 1 + ahead, 2, joints)).astype(np.float32),
+        measured=measured.astype(np.float32),
         row_step=np.arange(steps, dtype=np.int32),
         row_share=np.zeros(steps, np.float32),
     )
 
 
-def in_mujoco(rig, model, segment, command=None, sense=None, motor=None, outside=None):
+def in_mujoco(rig, model, segment, command=None, sense=None, motor=None, outside=None, start=None):
     """What MuJoCo C reads of a segment at every step, positions and velocities [steps, 2, joints].
 
     Args:
@@ -97,6 +101,7 @@ def in_mujoco(rig, model, segment, command=None, sense=None, motor=None, outside
       sense: what becomes of a reading [2, joints].
       motor: what becomes of a torque [joints].
       outside: sets forces of `data`.
+      start: where it is [2, joints], if not where it was measured.
     """
     before = round(HISTORY_S / rig.dt)
     drive = {
@@ -106,7 +111,7 @@ def in_mujoco(rig, model, segment, command=None, sense=None, motor=None, outside
     if command is not None:
         drive["target"] = command(drive["target"])
     data = mujoco.MjData(model)
-    data.qpos[rig.qpos], data.qvel[rig.dof] = segment.measured[before]
+    data.qpos[rig.qpos], data.qvel[rig.dof] = segment.measured[before] if start is None else start
     read, held = [], None
     for step in range(before, len(segment.target)):
         x = {name: values[step] for name, values in drive.items()}

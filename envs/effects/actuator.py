@@ -78,7 +78,7 @@ ROWS = (
     Effect(
         name="gain_error",
         enters="error",
-        parameters=(Parameter(name="ratio", form="ratio", bounds=(-1.0, 1.0), prior=0.1),),
+        parameters=(Parameter(name="ratio", form="ratio", bounds=(-1.0, 1.0), prior=0.3),),
         sizes=(0.05,),
         act=_gain_error,
         sentence="The controller's proportional gain is not the one that was set.",
@@ -129,7 +129,7 @@ ROWS = (
     Effect(
         name="torque_scale",
         enters="torque",
-        parameters=(Parameter(name="ratio", form="ratio", bounds=(-1.0, 1.0), prior=0.1),),
+        parameters=(Parameter(name="ratio", form="ratio", bounds=(-1.0, 1.0), prior=0.3),),
         sizes=(0.05,),
         act=_torque_scale,
         sentence="The motor gives a share of the torque that it is asked for.",

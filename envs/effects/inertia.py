@@ -8,7 +8,7 @@ ROWS = (
     Effect(
         name="link_mass",
         parameters=(
-            Parameter(name="ratio", form="ratio", bounds=(-1.6, 1.6), prior=0.1, fields=("body_mass", "body_inertia")),
+            Parameter(name="ratio", form="ratio", bounds=(-1.6, 1.6), prior=0.5, fields=("body_mass", "body_inertia")),
         ),
         sizes=(0.05,),
         sentence="The link is heavier or lighter than the model says, its shape the same.",

@@ -22,7 +22,7 @@ def _stribeck(values, bound, now, memory):
 
 
 def _load_friction(values, bound, now, memory):
-    """In proportion to the torque that the gears pass on."""
+    """In proportion to what loads the gears: the motor's torque or the robot's weight and inertia, the larger."""
     return bound + values["ratio"] * now.load, memory
 
 

@@ -26,17 +26,19 @@ class Free:
     directions: np.ndarray
     """[coordinates, axes] a standard deviation, or a typical size, along each."""
     sd: np.ndarray
-    """[coordinates] of the prior, infinite where there is none."""
+    """[coordinates] of the prior, in units of the directions."""
     bounds: np.ndarray
     """[coordinates, 2]"""
+    nominal: np.ndarray
+    """[coordinates] True for what is free under every hypothesis."""
 
     def and_then(self, other: "Free") -> "Free":
         """Both together."""
         return Free(*(np.concatenate(pair) for pair in zip(self.parts(), other.parts(), strict=True)))
 
-    def parts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def parts(self) -> tuple[np.ndarray, ...]:
         """Its fields."""
-        return self.directions, self.sd, self.bounds
+        return self.directions, self.sd, self.bounds, self.nominal
 
 
 @dataclass(frozen=True)
@@ -136,7 +138,7 @@ def begin(
     return [
         replace(
             fit,
-            free=fit.free.and_then(Free(h.directions, _own_prior(h), h.bounds)),
+            free=fit.free.and_then(Free(h.directions, h.prior, h.bounds, np.zeros(len(h.prior), bool))),
             coordinates=np.concatenate([fit.coordinates, point]),
             residual=residual,
             jacobian=np.concatenate([fit.jacobian, np.nan_to_num((shifted - residual) / size[:, None]).T], axis=1),
@@ -152,7 +154,7 @@ def given_up(free: Free, hypothesis: Hypothesis) -> np.ndarray:
         return np.zeros(len(free.sd), bool)
     mine = hypothesis.directions[0] != 0
     within = np.array([not (direction[~mine] != 0).any() for direction in free.directions])
-    return within & np.isfinite(free.sd)
+    return within & free.nominal
 
 
 def without(fit: Fit, own: np.ndarray, hypothesis: Hypothesis) -> tuple[Fit, np.ndarray]:
@@ -164,11 +166,6 @@ def without(fit: Fit, own: np.ndarray, hypothesis: Hypothesis) -> tuple[Fit, np.
         stood[0] = (vector[direction != 0] / direction[direction != 0]).mean()
     free = Free(*(part[~own] for part in fit.free.parts()))
     return replace(fit, free=free, coordinates=fit.coordinates[~own], jacobian=fit.jacobian[:, ~own]), stood
-
-
-def _own_prior(hypothesis: Hypothesis) -> np.ndarray:
-    """None; but what means nothing without a size is held by one."""
-    return np.where((hypothesis.probes == 0).all(axis=0), 1.0, np.inf)
 
 
 def _probing_step(hypothesis: Hypothesis, point: np.ndarray) -> np.ndarray:

@@ -1,7 +1,7 @@
 """Least squares with priors, on residuals in floor units.
 
 Coordinates `u` are those that may move from a point: r(u) = r + J u, and the loss is
-weight |r|^2 + |(offset + u) / sd|^2 with `sd` infinite where nothing is known before.
+weight |r|^2 + |(offset + u) / sd|^2.
 """
 
 from dataclasses import dataclass

@@ -29,6 +29,8 @@ class Hypothesis:
     """[probes, parameters] where it is looked for, the smallest size of interest first."""
     bounds: np.ndarray
     """[parameters, 2] least and largest coordinate."""
+    prior: np.ndarray
+    """[parameters] standard deviation of the coordinates, before anything was measured."""
     joints: tuple[int, ...]
     """Components of the signals beside which it sits; empty where it may show in any."""
 
@@ -111,34 +113,44 @@ class Residuals:
         self._problem, self._width = problem, width
         self._compiled = jax.jit(self._loop)
 
-    def _loop(self, count, vectors, inputs):
+    def _loop(self, count, vectors, which, piece, inputs):
         def simulate(vector, segment):
             return binned(self._problem.simulate(vector, segment), self._problem.bin_rows)
 
-        shape = jax.eval_shape(simulate, *jax.tree.map(lambda leaf: leaf[0, 0], (vectors, inputs)))
+        shape = jax.eval_shape(simulate, vectors[0], jax.tree.map(lambda leaf: leaf[0], inputs))
 
         def work(index, found):
-            mine = jax.tree.map(lambda leaf: leaf[index], (vectors, inputs))
-            return found.at[index].set(jax.vmap(simulate)(*mine))
+            mine = jax.tree.map(lambda leaf: leaf[piece[index]], inputs)
+            return found.at[index].set(jax.vmap(simulate)(vectors[which[index]], mine))
 
-        return jax.lax.fori_loop(0, count, work, jnp.zeros((*vectors.shape[:2], *shape.shape), shape.dtype))
+        return jax.lax.fori_loop(0, count, work, jnp.zeros((*which.shape, *shape.shape), shape.dtype))
 
     def __call__(self, vectors: np.ndarray, segments: Segments) -> np.ndarray:
         """Residuals of vectors [hypotheses, axes]; those that are not finite come back as they are."""
         vectors = np.atleast_2d(np.asarray(vectors, np.float32))
         measured = np.stack([binned(piece, self._problem.bin_rows) for piece in _pieces(segments.signals)])
-        which, piece = (grid.ravel() for grid in np.indices((len(vectors), len(measured))))
-        found = []
+        # Splits of other sizes are filled up.
+        filled = np.arange(self._largest(segments)) % len(measured)
+        inputs = jax.tree.map(lambda leaf: jnp.asarray(leaf[filled]), segments.inputs)
+        each, piece = (grid.ravel() for grid in np.indices((len(vectors), len(measured))))
+        shape, found = (self._CHUNKS, self._width), []
         once = self._CHUNKS * self._width
-        for start in range(0, len(which), once):
-            count = min(once, len(which) - start)
-            mine = start + np.arange(once) % count
-            at = (piece[mine]).reshape(self._CHUNKS, self._width)
-            inputs = jax.tree.map(lambda leaf, at=at: leaf[at], segments.inputs)
-            out = self._compiled(-(-count // self._width), vectors[which[mine].reshape(at.shape)], inputs)
+        for start in range(0, len(each), once):
+            count = min(once, len(each) - start)
+            mine = (start + np.arange(once) % count).reshape(shape)
+            used, which = np.unique(each[mine], return_inverse=True)
+            some = vectors[used[np.arange(once) % len(used)]]
+            out = self._compiled(-(-count // self._width), some, which.reshape(shape), piece[mine], inputs)
             found.append(np.asarray(out).reshape(once, *measured.shape[1:])[:count])
         predicted = np.concatenate(found).reshape(len(vectors), *measured.shape)
         return measured[None] - predicted
+
+    def _largest(self, segments: Segments) -> int:
+        """Segments of the largest split of the same length."""
+        rows = next(iter(segments.signals.values())).shape[1]
+        splits = [one for split in self._problem.data.values() for one in split.values()]
+        same = [len(one.run) for one in splits if next(iter(one.signals.values())).shape[1] == rows]
+        return max([len(segments.run), *same])
 
 
 def _pieces(signals: Mapping[str, np.ndarray]):

@@ -149,7 +149,7 @@ class Discovery:
         bounds = np.tile([-5.0, 5.0], (count, 1))
         # Nobody looks before it is time.
         bounds[count - len(self.problem.timing) :, 0] = 0.0
-        return Free(directions, np.ones(count), bounds)
+        return Free(directions, np.ones(count), bounds, np.ones(count, bool))
 
     def residual(self, horizon: float, split: str):
         """Residuals [n, features] of vectors [n, axes]."""

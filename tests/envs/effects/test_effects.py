@@ -10,7 +10,7 @@ import rigs
 from envs import effects, models, sensing
 from envs.effects import LIBRARY, RESIDUAL
 from envs.effects.memory import LONGEST_S, delay_line, delayed
-from envs.rig import Now, Wrench
+from envs.rig import Now, Rig, Wrench
 
 DT = 0.001
 ROWS = (*LIBRARY.values(), RESIDUAL)
@@ -154,7 +154,7 @@ def test_undoing_what_is_not_there_changes_nothing(row):
 
 @pytest.fixture(scope="module")
 def pendulum():
-    return rigs.Player(models.spec("pendulum"), ("hinge",))
+    return rigs.Player(Rig(models.spec("pendulum"), ("hinge",), rigs.CONTROL_HZ))
 
 
 # 0.49 kg at 0.1 m: 0.0049. The sphere itself, 2/5 0.49 0.02^2: 0.0000784. The arm, 0.001 kg and 0.1 m long: 0.0000033.
@@ -206,8 +206,8 @@ def test_friction_of_the_load_is_a_share_of_it():
 def test_a_late_signal_is_the_one_of_so_many_steps_ago():
     targets = np.random.default_rng(2).normal(size=(80, JOINTS)).astype(np.float32)
     got = series("command_delay", targets, seconds=[0.003, LONGEST_S])
-    np.testing.assert_allclose(got[3:, 0], targets[:-3, 0], atol=1e-5)
-    np.testing.assert_allclose(got[40:, 1], targets[:-40, 1], atol=1e-5)
+    np.testing.assert_allclose(got[3:, 0], targets[:-3, 0], atol=1e-4)
+    np.testing.assert_allclose(got[40:, 1], targets[:-40, 1], atol=1e-4)
     # Before that, what has always been.
     np.testing.assert_allclose(got[:3, 0], targets[0, 0], atol=1e-5)
 
@@ -438,8 +438,8 @@ UPPER = '<geom type="capsule" size="0.03" fromto="0 0 0 0 0 -0.3" mass="1.2"/>'
 IN_THE_MODEL = {
     # 0.05 and 0.01 are everybody's.
     "viscous": (
-        {"shoulder": {"nm_s_per_rad": 0.15}},
-        [('name="shoulder"', 'name="shoulder" damping="0.2"')],
+        {"shoulder": {"nm_s_per_rad": 0.35}},
+        [('name="shoulder"', 'name="shoulder" damping="0.4"')],
     ),
     "armature": ({"elbow": {"kg_m2": 0.02}}, [('name="elbow"', 'name="elbow" armature="0.03"')]),
     "coulomb": ({"elbow": {"torque_nm": 0.2}}, [('name="elbow"', 'name="elbow" frictionloss="0.2"')]),
@@ -461,7 +461,7 @@ IN_THE_MODEL = {
 def swing(arm):
     """A step of both targets, from a posture with gravity torque."""
     start = np.array([0.5, -0.7])
-    return rigs.segment(arm.rig, start, start + [0.3, 0.5], kp=12.0, kd=0.3, limit=3.0)
+    return rigs.segment(arm.rig, start, start + np.array([0.3, 0.5]), kp=12.0, kd=0.3, limit=3.0)
 
 
 @pytest.mark.parametrize("name", IN_THE_MODEL)

@@ -44,6 +44,7 @@ def hypothesis(name, bounds, probes, family="friction"):
         directions=direction,
         probes=np.array(probes)[:, None],
         bounds=np.array([bounds]),
+        prior=np.array([1.0]),
         joints=(0,),
     )
 

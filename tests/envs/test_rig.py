@@ -1,0 +1,307 @@
+"""A robot on the rig moves as MuJoCo C moves it."""
+
+import mujoco
+import numpy as np
+import pytest
+import reference
+import rigs
+
+from envs import models
+from envs.biteno import constants
+from envs.effects import LIBRARY
+from envs.rig import Axis, Rig, hung
+
+START = np.array([0.5, -0.7])
+
+
+def agrees(read, expected):
+    # Single precision, over 150 steps.
+    np.testing.assert_allclose(read["q"], expected[:, 0], atol=5e-6)
+    np.testing.assert_allclose(read["dq"], expected[:, 1], atol=1e-4)
+
+
+@pytest.fixture(scope="module")
+def plain(arm):
+    """The arm as compiled from its file."""
+    return rigs.compiled(rigs.ARM, arm.rig)
+
+
+@pytest.fixture(scope="module")
+def pendulum():
+    return Rig(models.spec("pendulum"), ("hinge",), rigs.CONTROL_HZ)
+
+
+def steps_of(target):
+    """Every 30 steps another target, the same for the first joint the other way round."""
+    levels = np.repeat([0.0, 0.4, -0.3, 0.5, 0.1], rigs.STEPS // 5)[:, None]
+    return target + levels * np.array([-1.0, 1.0])
+
+
+# Against MuJoCo C.
+
+
+def test_an_arm_without_effects_moves_as_in_mujoco(arm, plain):
+    # Steps beyond what 1.2 Nm can do, and a gravity torque.
+    segment = rigs.segment(arm.rig, START, steps_of(START), kp=[12.0, 8.0], kd=[0.4, 0.2], limit=[1.2, 0.9], speed=1.5)
+    read = arm.play(segment)
+    agrees(read, rigs.in_mujoco(arm.rig, plain, segment))
+    assert np.ptp(read["q"], axis=0).min() > 0.05
+    # Both limits were reached, and no more; what the law says at a tick is held for five steps of the physics.
+    np.testing.assert_allclose(np.abs(read["tau"]).max(axis=0), [1.2, 0.9], rtol=1e-6)
+    np.testing.assert_array_equal(read["tau"].reshape(-1, 5, 2), read["tau"][::5, None] * np.ones((5, 1)))
+
+
+def test_a_hanging_biteno_moves_as_in_mujoco():
+    rig = Rig(models.spec("biteno"), constants.JOINTS, rigs.CONTROL_HZ)
+    start = np.array([0.0, -0.35, 0.7] * 2)
+    target = start + np.array([0.2, 0.3, -0.4, -0.1, -0.2, 0.3])
+    segment = rigs.segment(rig, start, target, kp=60.0, kd=2.0, limit=15.0)
+    model = hung(models.spec("biteno"))
+    model.opt.timestep = rig.dt
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION
+    read = rigs.Player(rig).play(segment)
+    agrees(read, rigs.in_mujoco(rig, model, segment))
+    assert np.ptp(read["q"], axis=0).min() > 0.05
+
+
+def test_a_robot_without_motors_swings_as_in_mujoco(arm, plain):
+    segment = rigs.segment(arm.rig, START, START, limit=0.0, speed=[2.0, -3.0])
+    agrees(arm.play(segment), rigs.in_mujoco(arm.rig, plain, segment))
+
+
+def test_a_robot_that_is_fed_torques_moves_as_in_mujoco(arm, plain):
+    segment = rigs.segment(arm.rig, START, START, feed=[1.0, -0.5], emf=[0.1, 0.05])
+    agrees(arm.play(segment), rigs.in_mujoco(arm.rig, plain, segment))
+
+
+def late(steps):
+    """What was `steps` ago; before the first, the first."""
+    seen = []
+
+    def past(now):
+        seen.append(now)
+        return seen[max(len(seen) - 1 - steps, 0)]
+
+    return past
+
+
+def shifted(target):
+    return target[np.maximum(np.arange(len(target)) - 7, 0)]
+
+
+BIAS = np.array([0.02, -0.03])
+SIGNALS = {
+    "torque_scale": ({"shoulder": {"ratio": 0.8}}, lambda: {"motor": lambda torque: torque * [0.8, 1.0]}),
+    # Of the motor's, so after that of the controller.
+    "torque_limit": (
+        {"elbow": {"torque_nm": 0.5}},
+        lambda: {"motor": lambda torque: np.clip(torque, [-9, -0.5], [9, 0.5])},
+    ),
+    "command_delay": ({name: {"seconds": 0.007} for name in rigs.ARM_JOINTS}, lambda: {"command": shifted}),
+    # Read by the log and by the controller alike.
+    "encoder_bias": (
+        {name: {"rad": bias} for name, bias in zip(rigs.ARM_JOINTS, BIAS, strict=True)},
+        lambda: {"sense": lambda seen: seen + np.array([BIAS, 0.0 * BIAS]), "start": [START - BIAS, [0.0, 0.0]]},
+    ),
+    "sensor_delay": ({name: {"seconds": 0.004} for name in rigs.ARM_JOINTS}, lambda: {"sense": late(4)}),
+}
+
+
+@pytest.mark.parametrize("name", SIGNALS)
+def test_effects_enter_where_they_belong(arm, plain, name):
+    places, there = SIGNALS[name]
+    segment = rigs.segment(arm.rig, START, steps_of(START), kp=[12.0, 8.0], kd=[0.4, 0.2], limit=3.0)
+    expected = rigs.in_mujoco(arm.rig, plain, segment, **there())
+    agrees(arm.play(segment, **{name: places}), expected)
+    assert np.abs(arm.play(segment)["q"] - expected[:, 0]).max() > 2e-3
+
+
+def test_a_wrong_gain_is_one_of_the_position_alone(arm, plain):
+    drive = {"kd": 0.3, "limit": 3.0}
+    segment = rigs.segment(arm.rig, START, steps_of(START), kp=10.0, **drive)
+    stiffer = rigs.segment(arm.rig, START, steps_of(START), kp=[14.0, 10.0], **drive)
+    read = arm.play(segment, gain_error={"shoulder": {"ratio": 1.4}})
+    agrees(read, rigs.in_mujoco(arm.rig, plain, stiffer))
+
+
+def test_a_robot_read_late_starts_where_it_is_and_not_where_it_was_read(arm, plain):
+    # Reads 10 ms old: having come with 2 and -1 rad/s, it is 0.02 and -0.01 rad further than what is read.
+    speed = np.array([2.0, -1.0])
+    segment = rigs.segment(arm.rig, START, START, limit=0.0, speed=speed)
+    read = arm.play(segment, sensor_delay={name: {"seconds": 0.01} for name in rigs.ARM_JOINTS})
+    expected = rigs.in_mujoco(arm.rig, plain, segment, start=[START + 0.01 * speed, speed])
+    np.testing.assert_allclose(read["q"][10:], expected[:-10, 0], atol=2e-5)
+    np.testing.assert_allclose(read["dq"][10:], expected[:-10, 1], atol=5e-4)
+    # Until then, what it came by.
+    np.testing.assert_allclose(read["q"][:10], START + 0.001 * np.arange(10)[:, None] * speed, atol=2e-5)
+
+
+def test_a_wound_up_arm_rests_where_its_springs_let_it(arm, plain):
+    # At rest the gears pass on the gravity torque g of the joint's posture; the motor is g / k ahead of it, the target
+    # g / kp ahead of the motor. Their history of 60 ms is enough to wind them up: kd / k is 3 and 5 ms.
+    joint, gears, gain = np.array([0.9, 0.4]), np.array([30.0, 20.0]), np.array([12.0, 8.0])
+    data = mujoco.MjData(plain)
+    data.qpos[:] = joint
+    mujoco.mj_forward(plain, data)
+    motor = joint + data.qfrc_bias / gears
+    segment = rigs.segment(arm.rig, motor, motor + data.qfrc_bias / gain, kp=gain, kd=0.1)
+    springs = {name: {"nm_per_rad": k} for name, k in zip(rigs.ARM_JOINTS, gears, strict=True)}
+    read = arm.play(segment, compliance=springs)
+    # Encoders are the motors'.
+    np.testing.assert_allclose(read["q"], motor + np.zeros_like(read["q"]), atol=1e-4)
+    np.testing.assert_allclose(read["tau"][-1], data.qfrc_bias, rtol=1e-3)
+    # Without them it is out of balance, by 0.1 rad of the shoulder's posture.
+    assert np.abs(arm.play(segment)["q"] - motor).max() > 2e-3
+
+
+def test_the_imu_reads_gravity_as_it_is_mounted(arm):
+    segment = rigs.segment(arm.rig, START, START)
+    np.testing.assert_allclose(arm.play(segment)["gravity"], [[0.0, 0.0, -1.0]] * rigs.STEPS, atol=1e-6)
+    # Pitched by 0.02 rad it sees the ground ahead, 0.02 along its x; rolled by 0.01, to its right.
+    tilted = arm.play(segment, imu_tilt={"robot": {"pitch_rad": 0.02, "roll_rad": 0.01}})
+    np.testing.assert_allclose(tilted["gravity"][0], [0.02, -0.01, -1.0], atol=3e-4)
+
+
+# The model.
+
+FIELDS = (*reference.FIELDS[:9], "body_inertia")
+INERTIAL = {
+    "link_mass": {"upper": {"ratio": 0.8}, "lower": {"ratio": 1.3}},
+    "com_offset": {"upper": {"x_m": 0.01, "y_m": -0.02, "z_m": 0.03}, "lower": {"x_m": -0.02, "z_m": 0.05}},
+    "payload": {"upper": {"kg": 0.3}, "lower": {"kg": 0.1}},
+    "armature": {"shoulder": {"kg_m2": 0.004}, "elbow": {"kg_m2": 0.03}},
+    "viscous": {"shoulder": {"nm_s_per_rad": 0.07}, "elbow": {"nm_s_per_rad": -0.02}},
+}
+
+
+@pytest.mark.parametrize("names", [*[(name,) for name in INERTIAL], tuple(INERTIAL)], ids="+".join)
+def test_effects_of_the_model_are_the_model_recompiled(arm, names):
+    wrong = {name: INERTIAL[name] for name in names}
+    spec = mujoco.MjSpec.from_string(rigs.ARM)
+    nominal = spec.compile()
+    for name, places in wrong.items():
+        for place, values in places.items():
+            change(spec, nominal, name, place, values)
+    expected, got = spec.compile(), arm.model(**wrong)
+    for field in FIELDS:
+        own = getattr(expected, field)
+        np.testing.assert_allclose(getattr(got, field), own, rtol=1e-5, atol=1e-7 * np.abs(own).max(), err_msg=field)
+    np.testing.assert_allclose(got.stat.meaninertia, expected.stat.meaninertia, rtol=1e-5)
+    assert any(np.abs(getattr(expected, field) - getattr(nominal, field)).max() > 1e-3 for field in FIELDS)
+
+
+def change(spec, nominal, effect, place, values):
+    """Writes an effect into an MJCF, by no means that the rig uses."""
+    if effect in ("armature", "viscous"):
+        joint = spec.joint(place)
+        if effect == "armature":
+            joint.armature += values["kg_m2"]
+        else:
+            joint.damping[0] += values["nm_s_per_rad"]
+        return
+    body, compiled = spec.body(place), nominal.body(place)
+    if not body.explicitinertial:
+        body.explicitinertial = True
+        body.mass, body.ipos, body.iquat = float(compiled.mass[0]), compiled.ipos, compiled.iquat
+        body.inertia = compiled.inertia
+    if effect == "link_mass":
+        body.mass *= values["ratio"]
+        body.inertia = body.inertia * values["ratio"]
+    elif effect == "payload":
+        body.mass += values["kg"]
+    else:
+        body.ipos = body.ipos + [values.get(f"{axis}_m", 0.0) for axis in "xyz"]
+
+
+def test_without_effects_the_model_is_the_robots(arm):
+    got, expected = arm.model(), arm.rig.mj_model
+    for field in FIELDS:
+        if field != "dof_frictionloss":
+            np.testing.assert_allclose(getattr(got, field), getattr(expected, field), rtol=1e-5, atol=1e-7)
+
+
+def test_a_pendulums_inertia_and_mass(pendulum):
+    # 0.49 kg at 0.1 m, the sphere's 2/5 0.49 0.02^2, the arm's 3.3e-6, and the motor's 0.0019 kg m^2.
+    mass, inertia = pendulum.inertias(np.array([0.7]))
+    np.testing.assert_allclose(mass, [0.491], rtol=1e-6)
+    np.testing.assert_allclose(inertia, [0.0049 + 7.84e-5 + 3.4e-6 + 0.0019], rtol=1e-4)
+
+
+def test_a_bent_arm_has_less_inertia_at_its_shoulder(arm):
+    def shoulder(elbow):
+        return arm.rig.inertias(np.array([0.3, elbow]))[1][0]
+
+    # The lower link's centre is 0.125 m from the elbow, that 0.3 m from the shoulder: 2 x 0.6 x 0.3 x 0.125 x cos.
+    np.testing.assert_allclose(shoulder(0.0) - shoulder(np.pi / 2), 0.045, rtol=1e-6)
+
+
+# Parameters.
+
+
+def test_nominal_parameters_are_those_that_the_model_has(pendulum):
+    # The pendulum's hinge has no viscous friction.
+    expected = {
+        Axis("coulomb", "torque_nm", "hinge", 0): 0.0019,
+        Axis("gain_error", "ratio", "hinge", 0): 0.1,
+        Axis("armature", "kg_m2", "hinge", 0): 0.00019,
+        Axis("link_mass", "ratio", "arm", 0): 0.1,
+    }
+    got = pendulum.nominal()
+    assert got.keys() == expected.keys()
+    for axis, share in expected.items():
+        np.testing.assert_allclose(got[axis], share, rtol=1e-6)
+
+
+def test_nominal_parameters_are_spread_in_coordinates(arm):
+    got = {(axis.effect, axis.place): spread for axis, spread in arm.rig.nominal().items()}
+    # A tenth of 0.01 kg m^2 and of 0.05 Nm s/rad, over what a coordinate stands for; the arm has no dry friction.
+    np.testing.assert_allclose(got["armature", "shoulder"], 0.001 / 0.11, rtol=1e-6)
+    np.testing.assert_allclose(got["armature", "elbow"], 0.001 / 0.03, rtol=1e-6)
+    np.testing.assert_allclose(got["viscous", "elbow"], 0.005 / 0.3, rtol=1e-6)
+    assert {effect for effect, _ in got} == {"armature", "viscous", "link_mass", "gain_error"}
+    assert {place for _, place in got} == {"shoulder", "elbow", "upper", "lower"}
+
+
+def test_a_vector_has_its_axes_by_effect_parameter_and_place(arm):
+    rig = arm.rig
+    tree = rig.tree(np.arange(len(rig.axes)))
+    for number, axis in enumerate(rig.axes):
+        assert tree[axis.effect][axis.parameter][axis.index] == number
+        assert rig.places[rig.effects[axis.effect].on][axis.index] == axis.place
+    assert sum(len(places) for effect in tree.values() for places in effect.values()) == len(rig.axes)
+    # A base that is held shows nothing of the ground.
+    assert set(LIBRARY) - set(rig.effects) == {"ground_friction", "ground_compliance", "ground_slope"}
+
+
+def test_physics_reads_values_in_their_units(arm):
+    values = arm.rig.values(arm.rig.tree(arm.vector(coulomb={"elbow": {"torque_nm": 0.3}})))
+    np.testing.assert_allclose(values["coulomb"]["torque_nm"], [0.0, 0.3], rtol=1e-6)
+    # What shapes an effect that is not there.
+    np.testing.assert_allclose(values["stribeck"]["speed_rad_s"], rigs.ARM_SCALES["slow"], rtol=1e-6)
+
+
+def test_links_show_in_the_joints_that_carry_them(arm):
+    assert arm.rig.moves("body", "upper") == {0}
+    assert arm.rig.moves("body", "lower") == {0, 1}
+    assert arm.rig.moves("joint", "elbow") == {1}
+    assert arm.rig.moves("robot", "robot") == set()
+
+
+# Hanging.
+
+
+def test_a_hung_robot_has_its_joints_and_no_base():
+    model = hung(models.spec("biteno"))
+    assert (model.nq, model.nv, model.nkey) == (6, 6, 0)
+    assert model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT
+    rig = Rig(models.spec("biteno"), constants.JOINTS, rigs.CONTROL_HZ)
+    # The trunk hangs still.
+    assert "trunk" not in rig.bodies
+    assert len(rig.bodies) == 6
+
+
+@pytest.mark.parametrize(("control_hz", "steps"), [(200.0, 5), (1000.0, 1), (60.0, 17), (2000.0, 1)])
+def test_a_step_divides_the_controllers_period_and_is_no_longer_than_a_millisecond(control_hz, steps):
+    rig = Rig(models.spec("pendulum"), ("hinge",), control_hz)
+    np.testing.assert_allclose(rig.dt, 1.0 / control_hz / steps, rtol=1e-9)
+    assert rig.mj_model.opt.timestep == rig.dt

@@ -1,0 +1,140 @@
+"""A corrected model is what it was, once saved and loaded."""
+
+import json
+
+import jax
+import mujoco
+import numpy as np
+import pytest
+import rigs
+
+from envs import domain, models
+from envs.biteno import constants
+from envs.rig import Rig
+from experiments import corrected
+
+WRONG = {
+    "link_mass": {"upper": {"ratio": 1.2}},
+    "com_offset": {"lower": {"x_m": 0.02, "y_m": -0.01}},
+    "payload": {"lower": {"kg": 0.2}},
+    "armature": {"elbow": {"kg_m2": 0.013}},
+    "viscous": {"shoulder": {"nm_s_per_rad": 0.11}},
+    "coulomb": {"elbow": {"torque_nm": 0.07}},
+    "stribeck": {"shoulder": {"torque_nm": 0.1, "speed_rad_s": 0.2}},
+    "command_delay": {"elbow": {"seconds": 0.0035}},
+    "torque_limit": {"shoulder": {"torque_nm": 2.5}},
+    "gain_error": {"elbow": {"ratio": 0.9}},
+    "backlash": {"elbow": {"rad": 0.01}},
+    "compliance": {"shoulder": {"nm_per_rad": 55.0}},
+    "encoder_bias": {"elbow": {"rad": 0.01}},
+    "drag": {"lower": {"n_s_per_m": 1.5}},
+    "imu_tilt": {"robot": {"pitch_rad": 0.02}},
+}
+IN_THE_MODEL = {"link_mass", "com_offset", "payload", "armature", "viscous", "coulomb"}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quick():
+    """Op by op, derived fields would take longer than all the rest."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(domain, "set_const", jax.jit(domain.set_const))
+        yield
+
+
+def save(folder, arm, vector):
+    corrected.save(folder, mujoco.MjSpec.from_string(rigs.ARM), arm.rig, vector)
+    return json.loads((folder / "effects.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def folder(arm, quick, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("corrected")
+    save(folder, arm, arm.vector(**WRONG))
+    return folder
+
+
+def test_saved_and_loaded_it_moves_the_same(arm, folder):
+    start = np.array([0.5, -0.7])
+    segment = rigs.segment(arm.rig, start, start + np.array([0.3, 0.5]), kp=12.0, kd=0.3, limit=3.0)
+    rig, vector = corrected.load(folder)
+    loaded = rigs.Player(rig)
+    got, expected = loaded.read(vector.astype(np.float32), segment), arm.play(segment, **WRONG)
+    for name in ("q", "dq", "tau", "gravity"):
+        # A file has six digits.
+        np.testing.assert_allclose(got[name], expected[name], rtol=1e-4, atol=2e-4, err_msg=name)
+    assert np.abs(expected["q"] - arm.play(segment)["q"]).max() > 0.05
+
+
+def test_what_mujoco_has_a_form_for_is_in_the_mjcf(folder):
+    model = mujoco.MjModel.from_xml_path(str(folder / "model.xml"))
+    # 1.2 kg x 1.2, and 0.6 + 0.2.
+    np.testing.assert_allclose(model.body_mass[1:], [1.44, 0.8], rtol=1e-5)
+    np.testing.assert_allclose(model.body("lower").ipos, [0.02, -0.01, -0.125], atol=1e-6)
+    np.testing.assert_allclose(model.dof_armature, [0.01, 0.023], rtol=1e-5)
+    np.testing.assert_allclose(model.dof_damping, [0.16, 0.05], rtol=1e-5)
+    np.testing.assert_allclose(model.dof_frictionloss, [0.0, 0.07], rtol=1e-5)
+
+
+def test_the_rest_is_said_in_its_units(folder):
+    said = json.loads((folder / "effects.json").read_text())
+    assert (said["joints"], said["control_hz"]) == (["shoulder", "elbow"], 200.0)
+    expected = {name: places for name, places in WRONG.items() if name not in IN_THE_MODEL}
+    assert said["effects"].keys() == expected.keys()
+    for name, places in expected.items():
+        assert said["effects"][name].keys() == places.keys()
+        for place, values in places.items():
+            assert said["effects"][name][place] == pytest.approx(values, rel=1e-5)
+
+
+def test_a_shape_that_is_its_scale_is_kept(arm, tmp_path):
+    # Nothing was fitted to the speed: its coordinate is zero, and it means 0.31 rad/s here.
+    stribeck = {"shoulder": {"torque_nm": 0.1, "speed_rad_s": float(rigs.ARM_SCALES["slow"][0])}}
+    vector = arm.vector(stribeck=stribeck)
+    save(tmp_path, arm, np.where(np.abs(vector) < 1e-6, 0.0, vector))
+    rig, loaded = corrected.load(tmp_path)
+    values = rig.values(rig.tree(loaded))["stribeck"]
+    np.testing.assert_allclose(values["torque_nm"], [0.1, 0.0], rtol=1e-5)
+    np.testing.assert_allclose(values["speed_rad_s"][0], 0.31, rtol=1e-5)
+
+
+def test_a_model_without_effects_is_the_nominal_one(arm, tmp_path):
+    assert save(tmp_path, arm, arm.vector())["effects"] == {}
+    model, nominal = mujoco.MjModel.from_xml_path(str(tmp_path / "model.xml")), arm.rig.mj_model
+    for field in ("body_mass", "body_inertia", "body_ipos", "dof_armature", "dof_damping", "dof_frictionloss"):
+        np.testing.assert_allclose(getattr(model, field), getattr(nominal, field), rtol=1e-5, atol=1e-9, err_msg=field)
+
+
+def test_a_walking_robot_keeps_its_base_and_its_trunk(tmp_path):
+    spec = models.spec("biteno")
+    rig = Rig(spec, constants.JOINTS, 200.0)
+    vector = np.array([float(axis == ("link_mass", "left_thigh")) for axis in names(rig)])
+    corrected.save(tmp_path, spec, rig, np.log(1.5) * vector)
+    model, nominal = mujoco.MjModel.from_xml_path(str(tmp_path / "model.xml")), spec.compile()
+    assert (model.nq, model.nu) == (nominal.nq, nominal.nu)
+    expected = nominal.body_mass.copy()
+    expected[nominal.body("left_thigh").id] *= 1.5
+    np.testing.assert_allclose(model.body_mass, expected, rtol=1e-5)
+    assert corrected.load(tmp_path)[0].bodies == rig.bodies
+
+
+def names(rig):
+    return [(axis.effect, axis.place) for axis in rig.axes]
+
+
+@pytest.mark.parametrize(
+    "effects",
+    [
+        {"warp": {"elbow": {"rad": 1.0}}},
+        {"backlash": {"knee": {"rad": 1.0}}},
+        {"backlash": {"elbow": {"seconds": 1.0}}},
+    ],
+)
+def test_what_the_rig_does_not_have_is_named(arm, effects):
+    ((effect, places),) = effects.items()
+    ((place, values),) = places.items()
+    with pytest.raises(ValueError, match=f"there is no '{next(iter(values))}' of '{effect}' at '{place}'"):
+        corrected.coordinates(arm.rig, effects)
+
+
+def test_coordinates_are_those_that_were_saved(arm):
+    np.testing.assert_allclose(corrected.coordinates(arm.rig, WRONG), arm.vector(**WRONG), rtol=1e-6, atol=1e-7)
