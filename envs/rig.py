@@ -285,7 +285,7 @@ class Rig:
         for stage, signal in signals.items():
             for row in self._rows(stage):
                 if row.start is not None:
-                    memory[row.name] = row.start(signal, self.dt)
+                    memory[row.name] = row.start(values[row.name], signal, self.dt)
         return memory
 
     @staticmethod

@@ -129,7 +129,7 @@ def cut(runs: Sequence[Run], horizon_s: float, dt: float, bin_s: float = 0.01) -
     if not pieces:
         longest = max(run.time[-1] - run.time[0] for run in runs)
         raise ValueError(f"runs: the longest has {longest:.3g} s, expected more than {horizon_s + HISTORY_S:.3g} s")
-    after = 1 + max(int(np.ceil((runs[n].time[i + rows] - runs[n].time[i]) / dt)) for n, i in pieces)
+    after = 1 + max(int(np.ceil((runs[n].time[i + rows] - runs[n].time[i]) / dt - 1e-6)) for n, i in pieces)
     prepared = [_Prepared(run, dt) for run in runs]
     segments = [prepared[number].segment(start, start + 1 + np.arange(rows), after) for number, start in pieces]
     names = [name for name in ("q", "dq", "tau", "gravity") if all(name in run.signals for run in runs)]
@@ -161,7 +161,9 @@ def whole(runs: Sequence[Run], dt: float) -> Cut:
             for run, start in zip(runs, first, strict=True)
         ]
     )
-    after = 1 + max(int(np.ceil((run.time[-1] - run.time[start]) / dt)) for run, start in zip(runs, first, strict=True))
+    after = 1 + max(
+        int(np.ceil((run.time[-1] - run.time[start]) / dt - 1e-6)) for run, start in zip(runs, first, strict=True)
+    )
     segments = [one.segment(start, row, after) for one, start, row in zip(prepared, first, rows, strict=True)]
     return Cut(
         segments=jax.tree.map(lambda *leaves: np.stack(leaves), *segments),

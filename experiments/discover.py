@@ -12,10 +12,10 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from envs import models, segments
+from envs import corrected, models, segments
 from envs.effects import LIBRARY
 from envs.logs import Log, read, read_xl330
-from experiments import checkpoint, corrected, discovery_report
+from experiments import checkpoint, discovery_report
 from experiments.checkpoint import as_json, write_json
 from experiments.question import HORIZONS_S, Question, ask
 from experiments.train import bars, console, run

@@ -128,7 +128,7 @@ class Effect:
     """The experiment that shows it, and tells it from its like."""
     act: Callable[..., Any] | None = None
     start: Callable[..., Any] | None = None
-    """`start(signal, dt) -> memory`, where it remembers."""
+    """`start(values, signal, dt) -> memory` of a robot that has been like this for ever, where it remembers."""
     undo: Callable[..., Any] | None = None
     """Of a sensor: `undo(values, readings, dt) -> truth`, [time, 2, joints] of positions and velocities."""
     needs: Literal["", "free", "gravity"] = ""

@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 
-from envs.effects.memory import delay_line, delayed, lagged
+from envs.effects.memory import as_it_is, delay_line, delayed, lagged
 from jaxtune.types import Effect, Parameter
 
 _ACTUATOR = {"family": "actuator", "on": "joint"}
@@ -23,7 +23,9 @@ def _torque_speed(values, torque, now, memory):
     """A motor's line: what it can give falls with speed by its back-EMF."""
     drop = values["nm_s_per_rad"] * now.speed
     low, high = -now.limit - drop, now.limit - drop
-    return jnp.where(values["nm_s_per_rad"] > 0, jnp.clip(torque, low, high), torque), memory
+    # A motor that is off gives nothing, at any speed.
+    there = (values["nm_s_per_rad"] > 0) & (now.limit > 0)
+    return jnp.where(there, jnp.clip(torque, low, high), torque), memory
 
 
 def _command_delay(values, target, now, memory):
@@ -70,7 +72,7 @@ ROWS = (
         parameters=(Parameter(name="rad_per_s", form="reciprocal", scale="speed", bounds=(0.0, 3.0), prior=0.5),),
         sizes=(0.2, 0.6),
         act=_target_slew,
-        start=lambda target, dt: target,
+        start=as_it_is,
         sentence="The controller follows its target no faster than at a certain speed.",
         excited_by="steps of two sizes",
         **_ACTUATOR,
@@ -121,7 +123,7 @@ ROWS = (
         parameters=(_SECONDS,),
         sizes=(0.001, 0.008),
         act=_torque_lag,
-        start=lambda torque, dt: torque,
+        start=as_it_is,
         sentence="The motor's torque follows what the controller asks with a lag.",
         excited_by="a chirp to 10 Hz at two controller gains",
         **_ACTUATOR,

@@ -6,8 +6,15 @@ import jax.numpy as jnp
 LONGEST_S = 0.04
 
 
-def delay_line(signal: jax.Array, dt: float) -> jax.Array:
+def as_it_is(values, signal: jax.Array, dt: float) -> jax.Array:
+    """The memory of a filter that has always been given this signal."""
+    del values, dt
+    return signal
+
+
+def delay_line(values, signal: jax.Array, dt: float) -> jax.Array:
     """A line [steps, ...] that has always held this signal, newest first."""
+    del values
     return jnp.broadcast_to(signal, (round(LONGEST_S / dt) + 1, *signal.shape))
 
 

@@ -7,7 +7,7 @@ so that a simulation can start where the robot was.
 import jax
 import jax.numpy as jnp
 
-from envs.effects.memory import delay_line, delayed, lagged
+from envs.effects.memory import as_it_is, delay_line, delayed, lagged
 from jaxtune.types import Effect, Parameter
 
 _SENSING = {"family": "sensing"}
@@ -87,7 +87,7 @@ ROWS = (
         parameters=(_SECONDS,),
         sizes=(0.001, 0.008),
         act=_sensor_lag,
-        start=lambda readings, dt: readings,
+        start=as_it_is,
         undo=_undo_lag,
         sentence="Positions are read through a filter.",
         excited_by="a chirp to 10 Hz at two controller gains",

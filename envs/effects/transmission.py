@@ -30,9 +30,15 @@ def _compliance(values, torque, now, offset):
     return passed, softness * passed
 
 
-def _no_offset(torque, dt):
+def _taken_up(values, torque, dt):
+    """The motor leans on the side of the play to which its torque drives it."""
     del dt
-    return jnp.zeros_like(torque)
+    return 0.5 * values["rad"] * jnp.sign(torque)
+
+
+def _wound_up(values, torque, dt):
+    del dt
+    return values["nm_per_rad"] * torque
 
 
 ROWS = (
@@ -42,7 +48,7 @@ ROWS = (
         parameters=(Parameter(name="rad", bounds=(0.0, 0.2), prior=0.02),),
         sizes=(0.003, 0.02),
         act=_backlash,
-        start=_no_offset,
+        start=_taken_up,
         sentence="The gears have play: the motor turns a little before the joint does.",
         excited_by="slow triangular reversals through the posture without gravity torque",
         **_TRANSMISSION,
@@ -53,7 +59,7 @@ ROWS = (
         parameters=(Parameter(name="nm_per_rad", form="reciprocal", scale="stiffness", bounds=(0.0, 20.0), prior=1.0),),
         sizes=(0.2, 2.0),
         act=_compliance,
-        start=_no_offset,
+        start=_wound_up,
         sentence="A spring sits between motor and joint.",
         excited_by="a chirp through its resonance, and postures of high gravity torque",
         **_TRANSMISSION,

@@ -72,7 +72,7 @@ def series(name, signals, at=None, **physical):
         signal, memory = row.act(values, signal, at, memory)
         return memory, signal
 
-    return np.asarray(jax.lax.scan(step, row.start(signals[0], DT), signals)[1])
+    return np.asarray(jax.lax.scan(step, row.start(values, signals[0], DT), signals)[1])
 
 
 # The library.
@@ -131,7 +131,7 @@ def test_what_is_not_there_changes_nothing(row):
         body_velocity=rng.uniform(-9, 9, (JOINTS, 3)),
     )
     first = signal_of(row, rng)
-    memory = None if row.start is None else row.start(first, DT)
+    memory = None if row.start is None else row.start(values, first, DT)
     for _ in range(3):
         signal = signal_of(row, rng)
         got, following = row.act(values, signal, at, memory)
@@ -291,7 +291,9 @@ def wound(name, targets, damping=0.0, stiffness=20.0, **physical):
         torque, offset = row.act(values, stiffness * (target - offset), at, offset)
         return offset, (torque, offset)
 
-    _, (torque, offset) = jax.lax.scan(step, row.start(jnp.zeros(JOINTS), DT), jnp.asarray(targets, jnp.float32))
+    _, (torque, offset) = jax.lax.scan(
+        step, row.start(values, jnp.zeros(JOINTS), DT), jnp.asarray(targets, jnp.float32)
+    )
     return np.asarray(torque)[:, 0], np.asarray(offset)[:, 0]
 
 

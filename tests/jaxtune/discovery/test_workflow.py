@@ -200,7 +200,7 @@ def test_residuals_compile_once_for_any_number_of_vectors_and_segments():
 
     measure = Residuals(Problem(**{**asked.__dict__, "simulate": counted}), width=16)
     segments = asked.data["train"][0.2]
-    few = Segments(**{**segments.__dict__, **{"inputs": {k: v[:7] for k, v in segments.inputs.items()}, "signals": {k: v[:7] for k, v in segments.signals.items()}, "run": segments.run[:7]}})  # fmt: skip
+    few = Segments(**{**segments.__dict__, "inputs": {k: v[:7] for k, v in segments.inputs.items()}, "signals": {k: v[:7] for k, v in segments.signals.items()}, "run": segments.run[:7]})  # fmt: skip
     vectors = 0.1 * np.random.default_rng(0).standard_normal((5, len(AXES))) * (np.arange(len(AXES)) < 6)
     many = measure(vectors, segments)
     count = len(traces)

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 import rigs
 
-from envs import domain, models
+from envs import corrected, domain, models
 from envs.biteno import constants
 from envs.rig import Rig
-from experiments import corrected
 
 WRONG = {
     "link_mass": {"upper": {"ratio": 1.2}},

@@ -4,13 +4,13 @@ import json
 from collections.abc import Mapping
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 
 from envs.effects import LIBRARY, RESIDUAL
 from envs.rig import Rig
-from experiments.checkpoint import write_json
 
 _MODEL, _EFFECTS = "model.xml", "effects.json"
 
@@ -19,7 +19,7 @@ def save(folder: Path, spec: mujoco.MjSpec, rig: Rig, vector: np.ndarray) -> Non
     """Writes `model.xml`, with what the vector [axes] changes of the model's own fields, and `effects.json`."""
     folder.mkdir(parents=True, exist_ok=True)
     values = rig.values(rig.tree(jnp.asarray(vector, jnp.float32)))
-    model, device = rig.mj_model, rig.model(values)
+    model, device = rig.mj_model, jax.jit(rig.model)(values)
     spec = spec.copy()
     for name in rig.bodies:
         body, number = spec.body(name), model.body(name).id
@@ -36,14 +36,18 @@ def save(folder: Path, spec: mujoco.MjSpec, rig: Rig, vector: np.ndarray) -> Non
     spec.compile()
     (folder / _MODEL).write_text(spec.to_xml())
     in_model = {name for name, row in rig.effects.items() if row.enters == "model"} | {"coulomb"}
+    # A parameter that is a shape means something at zero, where its effect is there.
+    there = {(axis.effect, axis.place) for axis, coordinate in zip(rig.axes, vector, strict=True) if coordinate}
     effects = {}
     for axis, coordinate in zip(rig.axes, vector, strict=True):
-        if axis.effect not in in_model and coordinate:
-            row = rig.effects[axis.effect]
-            parameter = next(p for p in row.parameters if p.name == axis.parameter)
+        row = rig.effects[axis.effect]
+        parameter = next(p for p in row.parameters if p.name == axis.parameter)
+        means = coordinate or (parameter.shape and (axis.effect, axis.place) in there)
+        if axis.effect not in in_model and means:
             value = parameter.value(float(coordinate), float(rig.scale(row, parameter)[axis.index]))
             effects.setdefault(axis.effect, {}).setdefault(axis.place, {})[axis.parameter] = float(value)
-    write_json(folder / _EFFECTS, {"joints": list(rig.joints), "control_hz": rig.control_hz, "effects": effects})
+    said = {"joints": list(rig.joints), "control_hz": rig.control_hz, "effects": effects}
+    (folder / _EFFECTS).write_text(json.dumps(said, indent=1) + "\n")
 
 
 def load(folder: Path) -> tuple[Rig, np.ndarray]:
@@ -58,7 +62,11 @@ def load(folder: Path) -> tuple[Rig, np.ndarray]:
 
 
 def coordinates(rig: Rig, effects: Mapping[str, Mapping[str, Mapping[str, float]]]) -> np.ndarray:
-    """Coordinates [axes] of physical values by effect, place and parameter."""
+    """Coordinates [axes] of physical values by effect, place and parameter.
+
+    Raises:
+      ValueError: an effect, a place or a parameter is none of the rig's.
+    """
     vector = np.zeros(len(rig.axes))
     index = {(axis.effect, axis.place, axis.parameter): number for number, axis in enumerate(rig.axes)}
     rows = {**LIBRARY, RESIDUAL.name: RESIDUAL}
