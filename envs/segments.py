@@ -161,9 +161,8 @@ def whole(runs: Sequence[Run], dt: float) -> Cut:
             for run, start in zip(runs, first, strict=True)
         ]
     )
-    after = 1 + max(
-        int(np.ceil((run.time[-1] - run.time[start]) / dt - 1e-6)) for run, start in zip(runs, first, strict=True)
-    )
+    lengths = [run.time[-1] - run.time[start] for run, start in zip(runs, first, strict=True)]
+    after = 1 + int(np.ceil(max(lengths) / dt - 1e-6))
     segments = [one.segment(start, row, after) for one, start, row in zip(prepared, first, rows, strict=True)]
     return Cut(
         segments=jax.tree.map(lambda *leaves: np.stack(leaves), *segments),

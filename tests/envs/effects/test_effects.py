@@ -220,7 +220,7 @@ def test_between_samples_a_late_signal_is_both_in_proportion():
 
 
 def test_a_line_is_no_longer_than_it_is():
-    line = delay_line(jnp.arange(2.0), DT)
+    line = delay_line({}, jnp.arange(2.0), DT)
     assert line.shape == (41, 2)
     got, line = delayed(line, jnp.ones(2), jnp.array([1.0, 0.0]), DT)
     np.testing.assert_array_equal(got, [0.0, 1.0])

@@ -1,6 +1,7 @@
 """Discovery on a slider whose truth is known: mass, damping, and whatever is hidden in it."""
 
 import json
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +17,7 @@ DT, NOISE = 0.01, 0.002
 
 
 def simulate(vector, segment):
-    """A slider of 1 kg pushed by a force [steps]; coordinates are what is added to 1 kg, 1 N s/m and to nothing else."""
+    """A slider of 1 kg and 1 N s/m pushed by a force [steps]; coordinates are what is added to them."""
     mass, damping, coulomb, push, _, cubic, wild = vector
 
     def step(state, force):
@@ -198,9 +199,14 @@ def test_residuals_compile_once_for_any_number_of_vectors_and_segments():
         traces.append(1)
         return simulate(vector, segment)
 
-    measure = Residuals(Problem(**{**asked.__dict__, "simulate": counted}), width=16)
+    measure = Residuals(replace(asked, simulate=counted), width=16)
     segments = asked.data["train"][0.2]
-    few = Segments(**{**segments.__dict__, "inputs": {k: v[:7] for k, v in segments.inputs.items()}, "signals": {k: v[:7] for k, v in segments.signals.items()}, "run": segments.run[:7]})  # fmt: skip
+    few = replace(
+        segments,
+        inputs={name: value[:7] for name, value in segments.inputs.items()},
+        signals={name: value[:7] for name, value in segments.signals.items()},
+        run=segments.run[:7],
+    )
     vectors = 0.1 * np.random.default_rng(0).standard_normal((5, len(AXES))) * (np.arange(len(AXES)) < 6)
     many = measure(vectors, segments)
     count = len(traces)
