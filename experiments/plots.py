@@ -214,7 +214,7 @@ def heat_map(cells: Sequence[dict]) -> plt.Figure:
     figure, axes = plt.subplots(
         1,
         len(signals),
-        figsize=(1.5 + 4.2 * len(signals), 1.4 + 0.45 * len(joints)),
+        figsize=(1.5 + 4.2 * len(signals), 2.4 + 0.45 * len(joints)),
         layout="constrained",
         squeeze=False,
         sharey=True,
@@ -266,14 +266,14 @@ def traces(runs: Sequence[dict], joints: Sequence[str], most: int = 6) -> plt.Fi
 
 def ladder(rungs: Sequence) -> plt.Figure:
     """Gain of every accepted effect beside what healthy logs gain by chance."""
-    figure, axis = plt.subplots(figsize=(8, 0.9 + 0.5 * len(rungs)), layout="constrained")
+    figure, axis = plt.subplots(figsize=(8, 1.5 + 0.5 * len(rungs)), layout="constrained")
     place = np.arange(len(rungs))
     axis.barh(place, [rung.evidence.gain for rung in rungs], color="tab:blue", height=0.5, label="gain")
     axis.plot([rung.thresholds.gain for rung in rungs], place, "|", color="black", ms=22, mew=2, label="threshold")
     axis.set(yticks=place, xscale="log", xlabel="fall of the loss on train")
     axis.set_yticklabels([rung.hypothesis.key for rung in rungs])
     axis.invert_yaxis()
-    axis.legend(fontsize=8)
+    axis.legend(fontsize=8, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2)
     return figure
 
 
