@@ -10,6 +10,7 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 
+from envs import sensing
 from envs.logs import Log, Run
 from envs.rig import hung
 from envs.segments import noise, quantum_of, smoothed
@@ -54,7 +55,9 @@ def replay(run: Run, model: mujoco.MjModel, joints, rng: np.random.Generator) ->
     data.qpos[qpos], data.qvel[dof] = smoothed(run)[0]
     gains, driven = run.controller.gains, "target" in run.signals
     on = run.signals.get("enabled", np.ones(len(run.time)))
-    steps = max(1, round(1.0 / run.controller.rate_hz / model.opt.timestep))
+    steps = int(np.ceil(1.0 / run.controller.rate_hz / _STEP_S - 1e-9))
+    model.opt.timestep = 1.0 / run.controller.rate_hz / steps
+    wrong = _factors(rng, len(joints))  # gains are nominal parameters too
     count = int(np.ceil((run.time[-1] - run.time[0]) * run.controller.rate_hz)) + 2
     # An early look one time is a late one the next.
     looks = np.cumsum(np.append(rng.integers(0, steps), steps + np.diff(rng.integers(0, 2, count))))
@@ -69,11 +72,12 @@ def replay(run: Run, model: mujoco.MjModel, joints, rng: np.random.Generator) ->
             torque = run.signals["tau"][row]
         elif run.controller.kind == "servo":
             stall = on[row] * run.signals["volts"][row] * gains["kt"] / gains["resistance_ohm"]
-            torque = stall * np.clip(gains["gain"] * (run.signals["target"][row] - q), -1, 1)
+            torque = stall * np.clip(wrong * gains["gain"] * (run.signals["target"][row] - q), -1, 1)
             model.dof_damping[dof] = damping + on[row] * gains["kt"] ** 2 / gains["resistance_ohm"]
         else:
             limit = gains["torque_limit_nm"]
-            torque = on[row] * np.clip(gains["kp"] * (run.signals["target"][row] - q) - gains["kd"] * dq, -limit, limit)
+            error = wrong * (run.signals["target"][row] - q)
+            torque = on[row] * np.clip(gains["kp"] * error - gains["kd"] * dq, -limit, limit)
         states[look, 0], states[look, 1], torques[look] = q, dq, torque
         data.qfrc_applied[dof] = torque
         if look + 1 < len(looks):
@@ -84,6 +88,9 @@ def replay(run: Run, model: mujoco.MjModel, joints, rng: np.random.Generator) ->
         if name in signals and (driven or name != "tau"):
             read = np.stack([np.interp(run.time, times, column) for column in values.T], axis=1)
             signals[name] = as_read(read, run.signals[name], rng)
+    if "gravity" in signals:
+        level = np.asarray(sensing.projected_gravity(model.body_quat[1]))
+        signals["gravity"] = as_read(np.tile(level, (len(run.time), 1)), run.signals["gravity"], rng)
     return replace(run, signals=signals)
 
 

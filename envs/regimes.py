@@ -40,7 +40,7 @@ def control_torque(run: Run, position: np.ndarray, speed: np.ndarray) -> tuple[n
     if run.controller.kind == "servo":
         limit = on * run.signals["volts"][:, None] * gains["kt"] / gains["resistance_ohm"] * np.ones_like(error)
         return limit * np.clip(gains["gain"] * error, -1, 1), limit
-    limit = on * gains["torque_limit_nm"] * np.ones_like(error)
+    limit = np.where(on > 0, gains["torque_limit_nm"] * np.ones_like(error), 0.0)
     return np.clip(on * (gains["kp"] * error - gains["kd"] * speed), -limit, limit), limit
 
 

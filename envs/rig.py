@@ -95,6 +95,10 @@ class Rig:
         self._bodies = np.array(moving)
         self.bodies = tuple(model.body(i).name for i in moving)
         self.mj_model = model
+        # Joints that move, and that nobody controls or reads.
+        self.others = tuple(
+            model.joint(i).name or f"joint {i}" for i in range(model.njnt) if model.jnt_qposadr[i] not in self.qpos
+        )
         # MJX solves for friction only in joints that had some when the model was put on the device.
         device = hung(spec)
         device.opt.timestep, device.opt.disableflags = self.dt, model.opt.disableflags

@@ -112,7 +112,7 @@ def cut(runs: Sequence[Run], horizon_s: float, dt: float, bin_s: float = 0.01) -
 
     Args:
       runs: of one robot.
-      horizon_s: length of a segment; the longest run's where it is longer.
+      horizon_s: length of a segment.
       dt: step of the simulation.
       bin_s: a segment's rows are a multiple of as many as are taken together later.
 

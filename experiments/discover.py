@@ -144,7 +144,9 @@ def _effect(question: Question, hypothesis: Hypothesis, fit: Fit, errors: np.nda
         value = fit.vector[axis]
         error = 1.96 * float(np.sqrt(sum((errors[i] * fit.free.directions[i][axis]) ** 2 for i in mine)))
         scale = float(rig.scale(row, parameter)[place])
-        ends = sorted(float(parameter.value(end, scale)) for end in (value - error, value + error))
+        # A limit or a stiffness that may as well not be there has no upper end.
+        least = max(value - error, 1e-12) if parameter.form == "reciprocal" else value - error
+        ends = sorted(float(parameter.value(end, scale)) for end in (least, value + error))
         parameters[parameter.name] = {"value": float(parameter.value(value, scale)), "low": ends[0], "high": ends[1]}
     return {
         "name": hypothesis.name,

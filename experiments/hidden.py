@@ -110,6 +110,8 @@ class _Robot:
         if truth.effect in ("armature", "viscous"):
             field = {"armature": model.dof_armature, "viscous": model.dof_damping}[truth.effect]
             field[self.dof] += truth.size * self._at
+        for name in truth.places if truth.effect == "com_offset" else ():
+            model.body_ipos[model.body(name).id, 0] += truth.size
         mujoco.mj_setConst(model, mujoco.MjData(model))
         self._model = model
         self._drag = [(model.body(name).id, truth.size) for name in truth.places if truth.effect == "drag"]
@@ -125,15 +127,12 @@ class _Robot:
                 )
                 loose.add_geom(size=[0.02, 0, 0], pos=[0, 0, -0.06], mass=truth.size, contype=0, conaffinity=0)
         for name in truth.places:
-            if truth.effect not in ("link_mass", "com_offset", "payload"):
+            if truth.effect not in ("link_mass", "payload"):
                 return
             body = spec.body(name)
             if truth.effect == "link_mass":
                 for geom in body.geoms:
                     geom.mass *= truth.size
-            elif truth.effect == "com_offset":
-                for geom in body.geoms:
-                    geom.pos = geom.pos + np.array([truth.size, 0.0, 0.0])
             else:
                 model = hung(spec)
                 body.add_geom(

@@ -18,6 +18,7 @@ from jaxtune.types import Effect
 
 HORIZONS_S = (0.05, 0.15, 0.45)
 _BIN_S = 0.01
+_LEAST_SEGMENTS = 3
 _LATE_S = 0.004  # a velocity that lags its position by more is a filter's, not a measurement
 
 
@@ -45,8 +46,20 @@ def ask(
     """
     log, notes = gate(log)
     rate = log.runs[0].controller.rate_hz
+    least_s = segments.HISTORY_S + min(horizons)
+    for run in log.runs:
+        if run.controller.rate_hz != rate:
+            raise ValueError(
+                f"{run.name}: controller.rate_hz: got {run.controller.rate_hz:g}, expected {rate:g} for all"
+            )
+        if run.controller.kind == "servo" and "target" in run.signals and "volts" not in run.signals:
+            raise ValueError(f"{run.name}: column 'volts' is missing, and the controller is a servo")
+        if run.time[-1] - run.time[0] < least_s:
+            raise ValueError(f"{run.name}: got {run.time[-1] - run.time[0]:.3g} s, expected {least_s:.3g} s or more")
     plain = Rig(spec, log.joints, rate)
-    rig = Rig(spec, log.joints, rate, measure_scales(plain, log))
+    if plain.others:
+        raise ValueError(f"joints: {', '.join(plain.others)} may move too, and the log does not have them")
+    rig = Rig(spec, log.joints, rate, measure_scales(plain, unsealed(log)))
     signals = tuple(name for name in ("dq", "gravity", "q") if all(name in run.signals for run in log.runs))
     nominal = rig.nominal()
     index = {(axis.effect, axis.place): number for number, axis in enumerate(rig.axes)}
@@ -75,10 +88,16 @@ def ask(
     return Question(problem, rig, {joint: index["constant_push", joint] for joint in rig.joints}, names, notes)
 
 
+def unsealed(log: Log) -> Log:
+    """The log without its sealed runs."""
+    parts = splits(log)
+    return replace(log, runs=(*parts["train"], *parts["select"]))
+
+
 def gate(log: Log) -> tuple[Log, tuple[str, ...]]:
     """Takes out what is no measurement, and says so."""
     notes = []
-    late = [segments.velocity_lag(run) for run in log.runs if "dq" in run.signals]
+    late = [segments.velocity_lag(run) for run in unsealed(log).runs if "dq" in run.signals]
     if late and np.median(late) > _LATE_S:
         notes.append(f"dq lags q by {1e3 * np.median(late):.0f} ms: it is filtered, and not used")
         runs = [replace(run, signals={k: v for k, v in run.signals.items() if k != "dq"}) for run in log.runs]
@@ -144,12 +163,23 @@ def hypotheses(rig: Rig, rows: Mapping[str, Effect]) -> tuple[Hypothesis, ...]:
                     places=places,
                     directions=directions,
                     probes=sizes,
-                    bounds=np.array([parameter.bounds for parameter in row.parameters]),
+                    bounds=_bounds(rig, row, places),
                     prior=np.array([parameter.prior for parameter in row.parameters]),
                     joints=tuple(sorted({joint for place in places for joint in rig.moves(row.on, place)})),
                 )
             )
     return tuple(found)
+
+
+def _bounds(rig: Rig, row: Effect, places: Sequence[str]) -> np.ndarray:
+    """Least and largest coordinates, [parameters, 2]; no less is taken from a model's field than there is."""
+    bounds = np.array([parameter.bounds for parameter in row.parameters], float)
+    for number, parameter in enumerate(row.parameters):
+        if parameter.form == "added" and row.on == "joint" and parameter.fields:
+            at = [rig.joints.index(place) for place in places]
+            there = getattr(rig.mj_model, parameter.fields[0])[rig.dof[at]] / rig.scale(row, parameter)[at]
+            bounds[number, 0] = max(bounds[number, 0], -0.9 * there.min())
+    return bounds
 
 
 def _timing(rig: Rig) -> np.ndarray:
@@ -176,8 +206,11 @@ def _cut(log: Log, rig: Rig, signals, horizons, wanted=("train", "select", "seal
         label = np.stack([labels[run][rows] for run, rows in zip(cut.run, cut.row, strict=True)])
         for split in wanted:
             mine = np.array([log.runs[run].name in names[split] for run in cut.run])
-            if not mine.any():
-                raise ValueError(f"runs: none of '{split}' is long enough for a segment of {horizon:g} s")
+            if mine.sum() < _LEAST_SEGMENTS:
+                raise ValueError(
+                    f"runs: '{split}' has {mine.sum()} segment(s) of {horizon:g} s, expected {_LEAST_SEGMENTS} or "
+                    "more: record longer runs, more of them, or ask for shorter horizons"
+                )
             data[split][horizon] = Segments(
                 inputs=jax.tree.map(lambda leaf, mine=mine: leaf[mine], cut.segments),
                 signals={name: cut.signals[name][mine] for name in signals},

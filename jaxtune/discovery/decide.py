@@ -19,13 +19,13 @@ class Evidence:
     floors: float
     """Root of the largest fall of a single component's mean square, in floor units."""
     interval: tuple[float, float]
-    """95 % interval of the first coordinate."""
+    """95 % interval of the coordinate that is clearest of zero."""
     inside: bool
     """Whether the coordinates are inside their bounds."""
     horizons: int
     """At how many horizons it is best, or within a standard error of it."""
     chosen: float
-    """Share of bagged refits that choose it or one that cannot be told from it."""
+    """How often it, or one that cannot be told from it, is best when segments are drawn again."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Thresholds:
     """What it takes."""
 
     t: float
-    """Over all hypotheses at once."""
+    """Over all hypotheses that were fitted, at once."""
     gain: float
     """What the best hypothesis gains on healthy logs, 95th percentile."""
     floors: float = 1.0

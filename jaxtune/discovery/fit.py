@@ -108,7 +108,11 @@ def _learn(fit: Fit, point: np.ndarray, residual: np.ndarray) -> Fit:
 
 
 def begin(
-    base: Fit, hypotheses: Sequence[Hypothesis], tried: Sequence[Sequence[np.ndarray]], evaluate: Evaluate
+    base: Fit,
+    hypotheses: Sequence[Hypothesis],
+    tried: Sequence[Sequence[np.ndarray]],
+    evaluate: Evaluate,
+    absolute: bool = False,
 ) -> list[Fit]:
     """Fits that are about to start: each hypothesis beside what is free in `base`, at the best of its points.
 
@@ -117,12 +121,13 @@ def begin(
       hypotheses: one for every fit.
       tried: points [parameters] for every hypothesis, seen from where the base has what the hypothesis takes over.
       evaluate: residuals of vectors.
+      absolute: points are seen from the nominal model instead.
     """
     kept, points = [], []
     for hypothesis, group in zip(hypotheses, tried, strict=True):
         fit, stood = without(base, given_up(base.free, hypothesis), hypothesis)
         kept.append(fit)
-        points.append([np.clip(stood + point, *hypothesis.bounds.T) for point in group])
+        points.append([np.clip(point if absolute else stood + point, *hypothesis.bounds.T) for point in group])
     places = list(zip(kept, hypotheses, points, strict=True))
     found = _dealt(evaluate, [[fit.vector + p @ h.directions for p in group] for fit, h, group in places])
     best = [_best_start(fit, residuals) for fit, residuals in zip(kept, found, strict=True)]

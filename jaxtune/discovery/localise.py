@@ -21,10 +21,10 @@ def cells(
       key: seed of the bootstrap.
     """
     rng = np.random.default_rng(key)
-    joints = list(dict.fromkeys(joint for _, joint in components))
+    joints = [joint for signal, joint in components if signal == "q"]
     found = []
     for index, (signal, joint) in enumerate(components):
-        column = regimes[..., min(joints.index(joint), regimes.shape[-1] - 1)]
+        column = regimes[..., joints.index(joint) if joint in joints else 0]
         for number, name in enumerate(regime_names):
             there = (column == number).astype(float)
             count = there.sum(axis=1)

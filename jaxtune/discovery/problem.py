@@ -39,11 +39,6 @@ class Hypothesis:
         """Name and places as one word."""
         return f"{self.name}@{'+'.join(self.places)}"
 
-    @property
-    def complexity(self) -> tuple[int, int]:
-        """Simpler ones are smaller: parameters first."""
-        return len(self.directions), -len(self.places)
-
 
 @dataclass(frozen=True, kw_only=True)
 class Segments:

@@ -77,7 +77,8 @@ def _free_residual(discovery) -> Fit | None:
     need, stand_in = discovery.result.needs_torque, discovery.problem.residual
     if not stand_in:
         return None
-    joint = max(need, key=need.get) if any(need.values()) else discovery.result.where[0]["joint"]
+    worst = [cell["joint"] for cell in discovery.result.where if cell["joint"] in stand_in]
+    joint = max(need, key=need.get) if any(need.values()) else next(iter(worst or stand_in))
     hypothesis = stand_in[joint]
     start = {hypothesis.key: [np.zeros(len(hypothesis.directions))]}
     return discovery.fit([hypothesis], start, discovery.main, discovery.settings.rounds)[0]

@@ -26,7 +26,7 @@ class Score:
     coordinates: np.ndarray
     """[parameters] at which it falls most."""
     visible: float
-    """How many standard deviations the smallest size of interest, or a larger one, would move the residuals."""
+    """How many standard deviations the smallest size of interest would move the residuals."""
 
     @property
     def testable(self) -> bool:
@@ -67,7 +67,8 @@ class Screen:
             )
             padding = np.zeros((len(value) - len(column), column.shape[1]))
             slope = project(np.concatenate([np.sqrt(self._fit.weight) * column, padding]))
-            visible = max(visible, float(np.abs(sizes * np.sqrt((slope**2).sum(axis=0))).max()))
+            # Of the smallest size of interest, which comes first.
+            visible = visible or float(np.abs(sizes * np.sqrt((slope**2).sum(axis=0))).max())
             normal = slope.T @ slope
             if np.trace(normal) < 1e-12:
                 continue

@@ -69,6 +69,8 @@ class Result:
     needs_torque: dict[str, float] = field(default_factory=dict)
     not_testable: list[str] = field(default_factory=list)
     not_finite: list[str] = field(default_factory=list)
+    dropped: list[str] = field(default_factory=list)
+    """What was accepted and no longer paid beside later effects."""
     rejected: dict[str, Any] = field(default_factory=dict)
     """The best that was not accepted, and its tests."""
     changed: dict[int, float] = field(default_factory=dict)
@@ -141,6 +143,8 @@ class Discovery:
                 weight=self.gauges[horizon].weight,
             )
             self.fits[horizon] = refine([start], self.residual(horizon, "train"), 3)[0]
+            if not np.isfinite(self.fits[horizon].residual).all():
+                raise ValueError(f"model: the nominal one breaks within {horizon:g} s of these logs")
         self.result.null = self.fits[self.main]
 
     def _nominal(self) -> Free:
@@ -218,11 +222,16 @@ class Discovery:
         return chosen
 
     def fit(
-        self, hypotheses: Sequence[Hypothesis], tried: Mapping[str, Sequence[np.ndarray]], horizon: float, rounds: int
+        self,
+        hypotheses: Sequence[Hypothesis],
+        tried: Mapping[str, Sequence[np.ndarray]],
+        horizon: float,
+        rounds: int,
+        absolute: bool = False,
     ) -> list[Fit]:
         """Fits hypotheses with everything that is free already, each from the best of the points that are tried."""
         evaluate = self.residual(horizon, "train")
-        fits = begin(self.fits[horizon], hypotheses, [tried[h.key] for h in hypotheses], evaluate)
+        fits = begin(self.fits[horizon], hypotheses, [tried[h.key] for h in hypotheses], evaluate, absolute)
         return refine(fits, evaluate, rounds)
 
     def healthy_gain(self, screen: Screen, hypotheses: Sequence[Hypothesis]) -> float:
@@ -236,8 +245,14 @@ class Discovery:
 
     def round(self) -> bool:
         """Looks for one more effect; whether one was accepted."""
-        problem, settings, base = self.problem, self.settings, self.fits[self.main]
-        taken = {rung.hypothesis.key for rung in self.result.rungs}
+        problem, settings = self.problem, self.settings
+        # As many rounds as the hypotheses get, so that what they gain is theirs.
+        for horizon, fit in self.fits.items():
+            self.fits[horizon] = refine([fit], self.residual(horizon, "train"), settings.rounds)[0]
+        base = self.fits[self.main]
+        if not self.result.rungs:
+            self.result.null = base
+        taken = {rung.hypothesis.key for rung in self.result.rungs} | set(self.result.dropped)
         hypotheses = [h for h in problem.hypotheses if h.key not in taken]
         joints = self.localise()
         screen = self.screen(hypotheses, base)
@@ -270,7 +285,7 @@ class Discovery:
         for horizon in problem.horizons:
             if horizon != self.main:
                 starts = {h.key: [fits[h.key].coordinates[-len(h.directions) :]] for h in short}
-                found = self.fit(short, starts, horizon, _ROUNDS_MORE)
+                found = self.fit(short, starts, horizon, _ROUNDS_MORE, absolute=True)
                 everywhere[horizon] = dict(zip([h.key for h in short], found, strict=True))
         return self._decide(short, everywhere, base)
 
@@ -291,22 +306,24 @@ class Discovery:
                 train = {h.key: decide.losses(self.shaped(fits[h.key].residual, horizon)) for h in short}
                 losses = {key: np.concatenate([train[key], select[key]]) for key in select}
         close = decide.alike(losses, 2.0)
-        complexity = {h.key: h.complexity[0] for h in short}
+        complexity = {h.key: len(h.directions) for h in short}
         key = decide.simplest(decide.alike(losses, 1.0), complexity)
         chosen = decide.bagged(losses)
         fit = everywhere[self.main][key]
         hypothesis = next(h for h in short if h.key == key)
-        count = len(hypothesis.directions)
-        errors = self.errors(fit)
-        value, error = fit.coordinates[-count], errors[-count]
-        low, high = fit.free.bounds[-count]
+        errors = self.errors(fit)[-len(hypothesis.directions) :]
+        values = fit.coordinates[-len(errors) :]
+        low, high = hypothesis.bounds.T
+        # Of several directions one must be clear of zero; what has no meaning alone cannot be.
+        clear = np.where((hypothesis.probes != 0).any(axis=0), np.abs(values) / errors, 0.0).argmax()
+        value, error = values[clear], errors[clear]
         drop = (before**2).mean(axis=(0, 1)) - (after[key] ** 2).mean(axis=(0, 1))
         evidence = decide.Evidence(
             gain=base.linear.loss - fit.linear.loss,
             t=decide.t_statistic(gains[key]),
             floors=float(np.sqrt(max(drop.max(), 0.0))),
             interval=(float(value - 1.96 * error), float(value + 1.96 * error)),
-            inside=bool(low < value < high or (low == 0 and 0 < value < high)),
+            inside=bool(((low < values) & (values < high)).all()),
             horizons=best_at[key],
             chosen=sum(chosen[other] for other in close),
         )
@@ -342,15 +359,25 @@ class Discovery:
             if decide.t_statistic(gains) < 1.0:
                 self.say(f"drop {rung.hypothesis.key}")
                 self.result.rungs.remove(rung)
+                self.result.dropped.append(rung.hypothesis.key)
                 self.fits = without
 
     def ablated(self, horizon: float, hypothesis: Hypothesis) -> Fit:
         """The fit without an accepted effect, everything else fitted again."""
         fit = self.fits[horizon]
         own = np.array([any((d == mine).all() for mine in hypothesis.directions) for d in fit.free.directions])
-        free = Free(*(part[~own] for part in fit.free.parts()))
         evaluate = self.residual(horizon, "train")
-        start = replace(fit, free=free, coordinates=fit.coordinates[~own], jacobian=fit.jacobian[:, ~own])
+        # What the hypothesis had taken over is a nominal parameter again.
+        nominal, slopes = self._nominal(), self.gauges[horizon].jacobian.reshape(len(fit.residual), -1)
+        kept = fit.free.directions[fit.free.nominal & ~own]
+        back = np.array([not any((row == mine).all() for mine in kept) for row in nominal.directions])
+        free = Free(*(part[~own] for part in fit.free.parts()))
+        start = replace(
+            fit,
+            free=free.and_then(Free(*(part[back] for part in nominal.parts()))),
+            coordinates=np.concatenate([fit.coordinates[~own], np.zeros(back.sum())]),
+            jacobian=np.concatenate([fit.jacobian[:, ~own], slopes[:, back]], axis=1),
+        )
         start = replace(start, residual=evaluate(start.vector[None])[0])
         return refine([start], evaluate, 3)[0]
 
@@ -410,7 +437,9 @@ class Discovery:
             "where": result.where,
             "not_testable": result.not_testable,
             "not_finite": result.not_finite,
+            "dropped": result.dropped,
             "healthy_gain": self._healthy_gain,
+            "penalty": self._penalty,
         }
 
     def resume(self, state: Mapping[str, Any]) -> None:
@@ -420,7 +449,7 @@ class Discovery:
             hypothesis = by_key[saved["key"]]
             for horizon, coordinates in zip(self.problem.horizons, saved["coordinates"], strict=True):
                 starts = {hypothesis.key: [np.array(coordinates)]}
-                self.fits[horizon] = self.fit([hypothesis], starts, horizon, _ROUNDS_MORE)[0]
+                self.fits[horizon] = self.fit([hypothesis], starts, horizon, _ROUNDS_MORE, absolute=True)[0]
             evidence = {**saved["evidence"], "interval": tuple(saved["evidence"]["interval"])}
             self.result.rungs.append(
                 Rung(
@@ -432,6 +461,7 @@ class Discovery:
             )
         self.result.where, self.result.not_testable = state["where"], state["not_testable"]
         self.result.not_finite, self._healthy_gain = state["not_finite"], state["healthy_gain"]
+        self.result.dropped, self._penalty = state["dropped"], state["penalty"]
         self._looked = True
 
 

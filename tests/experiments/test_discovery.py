@@ -1,6 +1,7 @@
 """Motions, hidden robots and scores of the blind benchmark; what the command refuses."""
 
 import json
+from dataclasses import replace
 
 import mujoco
 import numpy as np
@@ -12,7 +13,7 @@ from experiments import discover, discovery_bench
 from experiments.discovery_bench import ARM, SIZES, score, tally, wilson
 from experiments.excite import excitation
 from experiments.hidden import OUTSIDE, Truth, record
-from experiments.question import gate, hypotheses, measure_scales, place_sets
+from experiments.question import ask, gate, hypotheses, measure_scales, place_sets
 
 JOINTS = ("shoulder", "elbow")
 GAINS = {"kp": np.array([40.0, 20.0]), "kd": np.array([2.0, 0.8]), "torque_limit_nm": np.array([15.0, 15.0])}
@@ -70,6 +71,7 @@ def test_too_few_runs_to_split_are_refused(spec):
         ("torque_scale", 0.7),
         ("encoder_bias", 0.05),
         ("backlash", 0.05),
+        ("com_offset", 0.02),
         ("compliance", 60.0),
         ("cogging", 0.5),
         ("temperature_fade", 0.5),
@@ -79,8 +81,9 @@ def test_too_few_runs_to_split_are_refused(spec):
 )
 def test_what_is_hidden_moves_the_robot_and_more_of_it_further(spec, motions, plain, effect, size):
     far = {"torque_scale": 0.4, "compliance": 20.0}.get(effect, 2.0 * size)
+    places = ("lower",) if effect == "com_offset" else ("elbow",)
     moved = [
-        np.abs(hidden(spec, motions[:1], effect, value).runs[0].signals["q"] - plain.runs[0].signals["q"]).max()
+        np.abs(hidden(spec, motions[:1], effect, value, places).runs[0].signals["q"] - plain.runs[0].signals["q"]).max()
         for value in (size, far)
     ]
     assert 1e-3 < moved[0] < moved[1] < 3.0
@@ -245,3 +248,26 @@ def test_horizons_that_do_not_rise_are_refused_before_anything_is_computed(tmp_p
         with pytest.raises(ValueError, match="horizons: got"):
             discover.main(discover.Args(logs=(folder,), out=tmp_path / "out", horizons=horizons))
     assert not (tmp_path / "out").exists()
+
+
+def changed(log, **changes):
+    """A log whose last run is otherwise."""
+    return replace(log, runs=(*log.runs[:-1], replace(log.runs[-1], **changes)))
+
+
+def test_logs_that_cannot_be_simulated_are_refused_with_the_run_named(spec, plain):
+    last = plain.runs[-1]
+    servo = Controller(kind="servo", rate_hz=1000.0, gains=dict.fromkeys(("gain", "kt", "resistance_ohm"), np.ones(2)))
+    short = {"time": last.time[:40], "signals": {name: values[:40] for name, values in last.signals.items()}}
+    slow = replace(last.controller, rate_hz=500.0)
+    for log, message in [
+        (changed(plain, controller=slow), "run_003: controller.rate_hz: got 500, expected 1000"),
+        (changed(plain, controller=servo), "run_003: column 'volts' is missing"),
+        (changed(plain, **short), "run_003: got 0.078 s, expected 0.11 s or more"),
+        (replace(plain, joints=("elbow",)), "joints: shoulder may move too"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            ask(log, spec, healthy_logs=0)
+    # One second has two segments of 0.45 s, less what comes before the first.
+    with pytest.raises(ValueError, match=r"'train' has 2 segment\(s\) of 0.45 s, expected 3 or more"):
+        ask(plain, spec, healthy_logs=0)
