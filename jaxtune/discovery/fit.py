@@ -17,6 +17,7 @@ Evaluate = Callable[[np.ndarray], np.ndarray]
 
 _SCALES = (1.0, 0.35)
 _DAMPING = 1e-3
+_SHORTEST = 0.03  # of a step that slopes are learnt from
 
 
 @dataclass(frozen=True)
@@ -60,6 +61,10 @@ class Fit:
         """[axes]"""
         return self.coordinates @ self.free.directions
 
+    def along(self, hypothesis: Hypothesis) -> np.ndarray:
+        """Which coordinates [coordinates] are those of a hypothesis that is in it."""
+        return np.array([any((row == mine).all() for mine in hypothesis.directions) for row in self.free.directions])
+
     @property
     def linear(self) -> Linear:
         """Residuals near the point."""
@@ -101,7 +106,8 @@ def _learn(fit: Fit, point: np.ndarray, residual: np.ndarray) -> Fit:
     """Slopes that would have foreseen the residual at a point."""
     step = point - fit.coordinates
     length = step @ step
-    if length < 1e-12:
+    # A short step teaches nothing but the rounding of single precision.
+    if length < _SHORTEST**2:
         return fit
     surprise = residual - fit.residual - fit.jacobian @ step
     return replace(fit, jacobian=fit.jacobian + np.outer(surprise, step) / length)

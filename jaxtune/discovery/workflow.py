@@ -365,7 +365,7 @@ class Discovery:
     def ablated(self, horizon: float, hypothesis: Hypothesis) -> Fit:
         """The fit without an accepted effect, everything else fitted again."""
         fit = self.fits[horizon]
-        own = np.array([any((d == mine).all() for mine in hypothesis.directions) for d in fit.free.directions])
+        own = fit.along(hypothesis)
         evaluate = self.residual(horizon, "train")
         # What the hypothesis had taken over is a nominal parameter again.
         nominal, slopes = self._nominal(), self.gauges[horizon].jacobian.reshape(len(fit.residual), -1)
@@ -418,11 +418,10 @@ class Discovery:
     def state(self) -> dict:
         """What a run that goes on needs to know."""
         result = self.result
-        own = lambda fit, hypothesis: [  # noqa: E731
-            float(c)
-            for c, direction in zip(fit.coordinates, fit.free.directions, strict=True)
-            if any((direction == mine).all() for mine in hypothesis.directions)
-        ]
+
+        def own(fit: Fit, hypothesis: Hypothesis) -> list[float]:
+            return fit.coordinates[fit.along(hypothesis)].tolist()
+
         return {
             "rungs": [
                 {
