@@ -57,7 +57,6 @@ def replay(run: Run, model: mujoco.MjModel, joints, rng: np.random.Generator) ->
     on = run.signals.get("enabled", np.ones(len(run.time)))
     steps = int(np.ceil(1.0 / run.controller.rate_hz / _STEP_S - 1e-9))
     model.opt.timestep = 1.0 / run.controller.rate_hz / steps
-    wrong = _factors(rng, len(joints))  # gains are nominal parameters too
     count = int(np.ceil((run.time[-1] - run.time[0]) * run.controller.rate_hz)) + 2
     # An early look one time is a late one the next.
     looks = np.cumsum(np.append(rng.integers(0, steps), steps + np.diff(rng.integers(0, 2, count))))
@@ -72,11 +71,11 @@ def replay(run: Run, model: mujoco.MjModel, joints, rng: np.random.Generator) ->
             torque = run.signals["tau"][row]
         elif run.controller.kind == "servo":
             stall = on[row] * run.signals["volts"][row] * gains["kt"] / gains["resistance_ohm"]
-            torque = stall * np.clip(wrong * gains["gain"] * (run.signals["target"][row] - q), -1, 1)
+            torque = stall * np.clip(gains["gain"] * (run.signals["target"][row] - q), -1, 1)
             model.dof_damping[dof] = damping + on[row] * gains["kt"] ** 2 / gains["resistance_ohm"]
         else:
             limit = gains["torque_limit_nm"]
-            error = wrong * (run.signals["target"][row] - q)
+            error = run.signals["target"][row] - q
             torque = on[row] * np.clip(gains["kp"] * error - gains["kd"] * dq, -limit, limit)
         states[look, 0], states[look, 1], torques[look] = q, dq, torque
         data.qfrc_applied[dof] = torque
