@@ -29,16 +29,16 @@ class Linear:
         """Loss at the point."""
         return float(self.weight * self.residual @ self.residual + ((self.offset / self.sd) ** 2).sum())
 
-    def rows(self, features: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    def rows(self) -> tuple[np.ndarray, np.ndarray]:
         """Value [n] and slope [n, coordinates] of what is squared, the prior's rows last."""
-        root = np.sqrt(self.weight) * (1.0 if features is None else np.sqrt(features))
+        root = np.sqrt(self.weight)
         value = np.concatenate([root * self.residual, self.offset / self.sd])
-        slope = np.concatenate([(root * self.jacobian.T).T, np.diag(1.0 / self.sd)])
+        slope = np.concatenate([root * self.jacobian, np.diag(1.0 / self.sd)])
         return value, slope
 
-    def step(self, damping: float = 0.0, features: np.ndarray | None = None) -> np.ndarray:
-        """The step [coordinates] to the least loss, each of the features weighed if given."""
-        value, slope = self.rows(features)
+    def step(self, damping: float = 0.0) -> np.ndarray:
+        """The step [coordinates] to the least loss."""
+        value, slope = self.rows()
         normal = slope.T @ slope
         diagonal = np.diag(normal).copy()
         diagonal[diagonal <= 0] = 1.0

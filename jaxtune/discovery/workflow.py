@@ -340,14 +340,9 @@ class Discovery:
 
     def errors(self, fit: Fit) -> np.ndarray:
         """Standard errors of a fit's coordinates."""
-        return decide.sandwich(
-            self.shaped(fit.residual, self.main).reshape(-1, fit_features(self.gauges[self.main])),
-            self.shaped(fit.jacobian, self.main).reshape(
-                -1, fit_features(self.gauges[self.main]), fit.jacobian.shape[-1]
-            ),
-            fit.weight,
-            fit.free.sd,
-        )
+        features = self.gauges[self.main].floor.size  # of a segment
+        jacobian_ = fit.jacobian.reshape(-1, features, fit.jacobian.shape[-1])
+        return decide.sandwich(fit.residual.reshape(-1, features), jacobian_, fit.weight, fit.free.sd)
 
     def drop(self) -> None:
         """Takes out earlier effects that no longer pay beside the last one."""
@@ -462,11 +457,6 @@ class Discovery:
         self.result.not_finite, self._healthy_gain = state["not_finite"], state["healthy_gain"]
         self.result.dropped, self._penalty = state["dropped"], state["penalty"]
         self._looked = True
-
-
-def fit_features(gauge_: Gauge) -> int:
-    """Features of a segment."""
-    return gauge_.floor.size
 
 
 def _starts(hypothesis: Hypothesis, found: np.ndarray) -> list[np.ndarray]:
