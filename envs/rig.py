@@ -4,6 +4,7 @@ An effect that is not there has coordinates of zero and changes nothing, so one 
 what is missing is a vector.
 """
 
+import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -39,6 +40,8 @@ class Now:
     limit: jax.Array  # [joints] Nm, the controller's
     stiffness: jax.Array  # [joints] Nm/rad
     damping: jax.Array  # [joints] Nm s/rad
+    rotor: jax.Array  # [joints] kg m^2, inertia of the motor on its side of the gears
+    carried: jax.Array  # [joints] Nm that the rotor takes to keep up with the joint
     body_velocity: jax.Array  # [bodies, 3] m/s of the centres of mass
 
 
@@ -67,7 +70,6 @@ class Rig:
     Args:
       spec: the robot; free joints are taken away, contacts and its own actuators switched off.
       joints: those that are controlled and read, in the log's order.
-      scales: what a coordinate stands for, [places] by name (`measure_scales`); where left out, its unit.
       control_hz: the controller's rate; a simulation step divides its period.
     """
 
@@ -76,7 +78,6 @@ class Rig:
         spec: mujoco.MjSpec,
         joints: Sequence[str],
         control_hz: float,
-        scales: Mapping[str, np.ndarray] | None = None,
     ):
         model = hung(spec)
         self.control_hz = control_hz
@@ -109,7 +110,7 @@ class Rig:
         self._data = mjx.make_data(self._model)
         # The IMU sits on the body that holds the others.
         self._gravity = sensing.projected_gravity(jnp.asarray(model.body_quat[1], jnp.float32))
-        self._scales = dict(scales or {})
+        self._scales: Mapping[str, np.ndarray] = {}
         self.places = {"joint": self.joints, "body": self.bodies, "foot": (), "robot": ("robot",)}
         rows = (*LIBRARY.values(), RESIDUAL)
         self.effects = {row.name: row for row in rows if self.places[row.on] and row.needs != "free"}
@@ -120,8 +121,14 @@ class Rig:
             for index, place in enumerate(self.places[row.on])
         )
 
+    def scaled(self, scales: Mapping[str, np.ndarray]) -> "Rig":
+        """The same robot, where coordinates stand for `scales`, [places] by name, instead of their units."""
+        other = copy.copy(self)
+        other._scales = dict(scales)
+        return other
+
     def tree(self, vector: jax.Array) -> dict[str, dict[str, jax.Array]]:
-        """A vector [axes] of coordinates by effect and parameter."""
+        """A vector [axes] by effect and parameter."""
         tree, start = {}, 0
         for name, row in self.effects.items():
             count = len(self.places[row.on])
@@ -195,21 +202,13 @@ class Rig:
                 params[key] = jnp.exp(inner) if parameter.form == "ratio" else inner
         return domain.apply(self._model, params, entries)
 
-    def simulate(self, coordinates: Coordinates, segment: Segment) -> dict[str, jax.Array]:
-        """Moves the robot through a segment.
-
-        Args:
-          coordinates: of all effects, one hypothesis.
-          segment: what was sent, and what was measured before it.
-
-        Returns:
-          What is read at the rows, [rows, joints] by signal; of `gravity` [rows, 3].
-        """
-        values = self.values(coordinates)
-        return self._play(values, self.model(values), segment)
+    def inner(self, vectors: np.ndarray) -> np.ndarray:
+        """What the physics reads of coordinates [n, axes], [n, axes]."""
+        trees = [self.values(self.tree(vector)) for vector in vectors]
+        return np.array([np.concatenate([leaf for row in tree.values() for leaf in row.values()]) for tree in trees])
 
     def values(self, coordinates: Coordinates) -> dict:
-        """What the physics reads of the coordinates."""
+        """What the physics reads of coordinates."""
         return {
             name: {
                 parameter.name: parameter.inner(coordinates[name][parameter.name], self.scale(row, parameter))
@@ -218,7 +217,17 @@ class Rig:
             for name, row in self.effects.items()
         }
 
-    def _play(self, values, model, segment: Segment) -> dict[str, jax.Array]:
+    def simulate(self, values: Coordinates, segment: Segment) -> dict[str, jax.Array]:
+        """Moves the robot through a segment.
+
+        Args:
+          values: what the physics reads of all effects, one hypothesis.
+          segment: what was sent, and what was measured before it.
+
+        Returns:
+          What is read at the rows, [rows, joints] by signal; of `gravity` [rows, 3].
+        """
+        model = self.model(values)
         before = len(segment.measured) - 1 - round(LONGEST_S / self.dt)
         drive = {
             name: getattr(segment, name)
@@ -230,26 +239,28 @@ class Rig:
         for row in self._rows("sensor"):
             if row.undo is not None:
                 truth = row.undo(values[row.name], truth, self.dt)
+        rotor, acceleration = model.dof_armature[self.dof], jnp.gradient(truth[:, 1], self.dt, axis=0)
         # What is read of the motor stands still for what is read of the joint until play and wind-up are known.
         memory = self._start(values, truth[0], jax.tree.map(lambda x: x[0], drive))
 
         def remember(memory, inputs):
-            state, x = inputs
-            return self._drive(values, memory, state, x)[0], None
+            state, carried, x = inputs
+            return self._drive(values, memory, state, x, carried)[0], None
 
-        memory, _ = jax.lax.scan(remember, memory, (truth[:before], past))
-        start = truth[before]
+        memory, _ = jax.lax.scan(remember, memory, (truth[:before], rotor * acceleration[:before], past))
+        start = truth[before] - self._ahead(memory)
         data = self._data.replace(
-            qpos=self._data.qpos.at[self.qpos].set(start[0] - self._offset(memory)),
+            qpos=self._data.qpos.at[self.qpos].set(start[0]),
             qvel=self._data.qvel.at[self.dof].set(start[1]),
+            qacc=self._data.qacc.at[self.dof].set(acceleration[before]),
         )
 
         def move(carry, x):
             memory, data = carry
             joint = jnp.stack([data.qpos[self.qpos], data.qvel[self.dof]])
             bias = data.qfrc_bias[self.dof]
-            motor = joint.at[0].add(self._offset(memory))
-            memory, (torque, read) = self._drive(values, memory, motor, x)
+            motor = joint.at[0].add(self._ahead(memory)[0])
+            memory, (torque, read) = self._drive(values, memory, motor, x, rotor * data.qacc[self.dof], rotor)
             now = self._now(x, joint, load=jnp.maximum(jnp.abs(torque), jnp.abs(bias)), data=data)
             friction, _ = self._stage("friction", values, self._friction, now, memory)
             wrench, _ = self._stage("wrench", values, self._calm(), now, memory)
@@ -297,8 +308,13 @@ class Rig:
         torque = x["stiffness"] * error - x["damping"] * speed
         return jnp.clip(torque, -x["limit"], x["limit"]) + x["feed"]
 
-    def _drive(self, values, memory, motor, x):
-        """From what is true of the motors [2, joints] to the torque on the joints, and what is read."""
+    def _drive(self, values, memory, motor, x, carried, rotor=None):
+        """From what is true of the motors [2, joints] to the torque on the joints, and what is read.
+
+        Args:
+          carried: torque [joints] that the motors' inertia takes to keep up with the joints.
+          rotor: inertia of the motors [joints]; None where they were measured, and went where they went.
+        """
         now = self._now(x, motor)
         readings, memory = self._stage("sensor", values, motor, now, memory)
         target, memory = self._stage("command", values, x["target"], now, memory)
@@ -306,11 +322,17 @@ class Rig:
         held = jnp.where(x["sample"], self._law(x, error, readings[1]), memory["held"])
         memory["held"] = held
         torque, memory = self._stage("torque", values, held, now, memory)
-        torque, memory = self._stage("transmission", values, torque - x["emf"] * motor[1], now, memory)
-        return memory, (torque, {"q": readings[0], "dq": readings[1], "tau": torque})
+        none = jnp.zeros_like(held)
+        free = {"stiffness": none, "damping": none} if rotor is None else {"rotor": rotor}
+        before = self._ahead(memory)[0]
+        torque, memory = self._stage(
+            "transmission", values, torque - x["emf"] * motor[1], now.replace(carried=carried, **free), memory
+        )
+        running = (self._ahead(memory)[0] - before) / self.dt
+        return memory, (torque, {"q": readings[0], "dq": readings[1] + running, "tau": torque})
 
-    def _offset(self, memory) -> jax.Array:
-        """How far the motors are ahead of the joints, [joints] rad."""
+    def _ahead(self, memory) -> jax.Array:
+        """How far and how fast the motors run ahead of the joints, [2, joints] rad and rad/s."""
         return sum(memory[row.name] for row in self._rows("transmission"))
 
     def _now(self, x, state, load=0.0, data=None) -> Now:
@@ -323,6 +345,8 @@ class Rig:
             limit=x["limit"],
             stiffness=x["stiffness"],
             damping=x["damping"] + x["emf"],
+            rotor=jnp.zeros_like(state[1]),
+            carried=jnp.zeros_like(state[1]),
             body_velocity=velocity,
         )
 

@@ -116,7 +116,8 @@ def summarise(question: Question, result: Result) -> dict:
         named = question.rig.axes[axis]
         hypothesis = singles[f"{named.effect}@{named.place}"]
         if not any(change["name"] == named.effect and named.place in change["places"] for change in changes):
-            changes.append(_effect(question, hypothesis, result.fit, result.errors, ()))
+            alike = tuple(name for name in result.changed_alike[axis] if name != named.effect)
+            changes.append(_effect(question, hypothesis, result.fit, result.errors, alike))
     not_there = [name for name in LIBRARY if name not in question.rig.effects]
     return {
         "verdict": result.verdict,
@@ -162,13 +163,14 @@ def free_runs(log: Log, question: Question, result: Result) -> dict:
     """Every run simulated from its first state to its end, before and after: errors in rad, and the traces."""
     rig = question.rig
     cut = segments.whole(log.runs, rig.dt)
-    play = jax.jit(jax.vmap(lambda vector, inputs: rig.simulate(rig.tree(vector), inputs)["q"], (None, 0)))
+    play = jax.jit(jax.vmap(lambda value, inputs: rig.simulate(rig.tree(value), inputs)["q"], (None, 0)))
     vectors = {
         "before": np.zeros(len(rig.axes)),
         "null": result.null.vector,
         "after": (result.residual or result.fit).vector,
     }
-    found = {name: np.asarray(play(np.asarray(vector, np.float32), cut.segments)) for name, vector in vectors.items()}
+    values = np.asarray(rig.inner(np.stack(list(vectors.values()))), np.float32)
+    found = {name: np.asarray(play(value, cut.segments)) for name, value in zip(vectors, values, strict=True)}
     splits = {name: split for split, names in question.splits.items() for name in names}
     runs = []
     for piece, recorded in enumerate(log.runs):

@@ -22,12 +22,13 @@ from envs import models
 from envs.biteno import constants
 from envs.effects import LIBRARY
 from envs.logs import Controller, Log, read, write
+from envs.rig import Rig
 from experiments import checkpoint, plots
 from experiments.checkpoint import write_json
 from experiments.discover import summarise
 from experiments.excite import Motion, excitation
 from experiments.hidden import OUTSIDE, Truth, record
-from experiments.question import ask
+from experiments.question import HORIZONS_S, Question, ask
 from experiments.train import console, run
 from jaxtune.discovery.measure import gauge, refitted
 from jaxtune.discovery.problem import Residuals
@@ -150,6 +151,7 @@ class Bench:
         names = ("kp", "kd", "torque_limit_nm")
         gains = {name: np.array(values) for name, values in zip(names, self.size.gains, strict=True)}
         self.controller = Controller(kind="pd", rate_hz=1000.0, gains=gains)
+        self.rig = Rig(self.spec, self.size.joints, self.controller.rate_hz)
         self.motions: list[Motion] = excitation(
             self.spec, self.size.joints, self.size.runs, self.size.seconds, 500.0, args.seed
         )
@@ -168,12 +170,16 @@ class Bench:
         )
         return replace(log, robot=self.size.model)
 
+    def ask(self, log: Log, horizons: Sequence[float] = HORIZONS_S, healthy_logs: int = 0) -> Question:
+        """The question to discovery, about the nominal model."""
+        return ask(log, self.spec, horizons, healthy_logs, plain=self.rig)
+
     @cached_property
     def calibration(self) -> Calibration:
         """What healthy logs of this robot and motion say: found once, and kept."""
         path = self.args.out / "calibration.npz"
         if not path.exists():
-            question = ask(self.record(Truth(None), 10_000), self.spec, healthy_logs=self.size.healthy)
+            question = self.ask(self.record(Truth(None), 10_000), healthy_logs=self.size.healthy)
             discovery = Discovery(question.problem, push=question.push)
             discovery.prepare()
             discovery.calibrate()
@@ -216,7 +222,7 @@ class Bench:
         """
         main = sorted(self.calibration.floors)[len(self.calibration.floors) // 2]
         known, seed = self.calibration.floors[main], self.seed(case)
-        problem = ask(self.record(Truth(None), seed, noise=False), self.spec, (main,), healthy_logs=0).problem
+        problem = self.ask(self.record(Truth(None), seed, noise=False), (main,)).problem
         measure, zero = Residuals(problem), np.zeros(problem.axes)
         slope = gauge(problem, measure, main, known).jacobian
         plain = measure(zero, problem.data["train"][main])[0]
@@ -224,7 +230,7 @@ class Bench:
 
         def severity(size: float) -> float:
             log = self.record(Truth(case.effect, places, size), seed, noise=False)
-            segments = ask(log, self.spec, (main,), healthy_logs=0).problem.data["train"][main]
+            segments = self.ask(log, (main,)).problem.data["train"][main]
             moved = (measure(zero, segments)[0] - plain) / known[0]
             if not np.isfinite(moved).all():
                 return np.inf
@@ -263,7 +269,7 @@ class Bench:
             folder = self.write(case)
             began = time.monotonic()
             log = read(folder)
-            question = ask(log, models.spec(log.robot), healthy_logs=0)
+            question = self.ask(log)
             result = Discovery(question.problem, push=question.push, calibration=self.calibration).run()
             path.parent.mkdir(parents=True, exist_ok=True)
             answer = summarise(question, result) | {"seconds": time.monotonic() - began, "rejected": result.rejected}
@@ -302,6 +308,7 @@ def score(truth: dict, answer: dict) -> dict:
         "family": bool(first) and first["family"] == family,
         "in_set": effect in reported,
         "place": bool(first) and set(first["places"]) == set(truth["truth"]["places"]),
+        "where": answer["where"][0]["joint"] if answer["where"] else None,
         "before": gap["null"],
         "nominal": gap["before"],
         "after": gap["after"],
@@ -341,6 +348,8 @@ def tally(rows: Sequence[dict]) -> list[dict]:
         _rate("names something where nothing is hidden", [row["named"] is not None for row in empty], "<= 0.05")
     )
     lines.append(_rate("`unnamed` outside the library", [row["verdict"] == "unnamed" for row in outside], ">= 0.80"))
+    blamed = [row["where"] in row["places"] for row in outside if row["verdict"] == "unnamed"]
+    lines.append(_rate("joint of the largest gap right where `unnamed`", blamed, ""))
     sizes = [len(row["set"]) for row in plain if row["set"]]
     strong = [row for row in hidden if row["asked"] == 15.0 and row["name"]]
     lines.append(_mean("mean size of the reported set", sizes, "<= 2.5"))
@@ -386,11 +395,41 @@ def main(args: Args) -> None:
     write_json(args.out / "scores.json", {"cases": rows, "table": lines, "versions": checkpoint.versions()})
     plots.confusion(args.out / "confusion.png", rows)
     table = Table("measure", "value", "95 % interval", "cases", "to reach")
-    for line in lines:
-        shown = "-" if line["value"] is None else f"{line['value']:.2f}"
-        interval = "" if line["low"] is None else f"{line['low']:.2f} to {line['high']:.2f}"
-        table.add_row(line["measure"], shown, interval, str(line["count"]), line["goal"])
+    for cells in shown(lines):
+        table.add_row(*cells)
     console.print(table)
+    (args.out / "README.md").write_text(page(args, len(rows), len(bench.cases), lines))
+
+
+def shown(lines: Sequence[dict]) -> list[tuple[str, ...]]:
+    """Measure, value, interval, number of cases and goal as text."""
+    return [
+        (
+            line["measure"],
+            "-" if line["value"] is None else f"{line['value']:.2f}",
+            "" if line["low"] is None else f"{line['low']:.2f} to {line['high']:.2f}",
+            str(line["count"]),
+            line["goal"],
+        )
+        for line in lines
+    ]
+
+
+def page(args: Args, done: int, count: int, lines: Sequence[dict]) -> str:
+    """The results as a page."""
+    table = "\n".join(f"| {' | '.join(cells)} |" for cells in shown(lines))
+    options = f"--size {args.size} --seed {args.seed} --nominal-error {args.nominal_error}"
+    return f"""# Blind benchmark of discovery, size `{args.size}`
+
+`python -m experiments.discovery_bench {options}`, {done} of {count} robots.
+Intervals are Wilson's; what was hidden and what was said of every robot is in `scores.json`.
+
+| measure | value | 95 % interval | cases | to reach |
+|---|---|---|---|---|
+{table}
+
+![what was hidden against what was named](confusion.png)
+"""
 
 
 if __name__ == "__main__":

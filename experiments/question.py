@@ -36,10 +36,35 @@ class Question:
     """What the gate left out, and why."""
 
 
+@dataclass(frozen=True)
+class _Simulator:
+    """What a rig reads of some signals; equal where the rig is the same."""
+
+    rig: Rig
+    signals: tuple[str, ...]
+
+    def __call__(self, values, inputs):
+        read = self.rig.simulate(self.rig.tree(values), inputs)
+        return {name: read[name] for name in self.signals}
+
+
 def ask(
-    log: Log, spec: mujoco.MjSpec, horizons: Sequence[float] = HORIZONS_S, healthy_logs: int = 20, seed: int = 0
+    log: Log,
+    spec: mujoco.MjSpec,
+    horizons: Sequence[float] = HORIZONS_S,
+    healthy_logs: int = 20,
+    seed: int = 0,
+    plain: Rig | None = None,
 ) -> Question:
     """Builds the question.
+
+    Args:
+      log: what was measured.
+      spec: the nominal model.
+      horizons: lengths of the segments in s.
+      healthy_logs: simulated logs in which nothing is missing.
+      seed: of those.
+      plain: the same robot and controller rate on the rig, if it was asked about before: programs are shared.
 
     Raises:
       ValueError: the runs cannot be split, or are too short for a horizon.
@@ -56,20 +81,17 @@ def ask(
             raise ValueError(f"{run.name}: column 'volts' is missing, and the controller is a servo")
         if run.time[-1] - run.time[0] < least_s:
             raise ValueError(f"{run.name}: got {run.time[-1] - run.time[0]:.3g} s, expected {least_s:.3g} s or more")
-    plain = Rig(spec, log.joints, rate)
+    plain = plain or Rig(spec, log.joints, rate)
     if plain.others:
         raise ValueError(f"joints: {', '.join(plain.others)} may move too, and the log does not have them")
-    rig = Rig(spec, log.joints, rate, measure_scales(plain, unsealed(log)))
+    rig = plain.scaled(measure_scales(plain, unsealed(log)))
     signals = tuple(name for name in ("dq", "gravity", "q") if all(name in run.signals for run in log.runs))
     nominal = rig.nominal()
     index = {(axis.effect, axis.place): number for number, axis in enumerate(rig.axes)}
 
-    def simulate(vector, inputs):
-        read = rig.simulate(rig.tree(vector), inputs)
-        return {name: read[name] for name in signals}
-
     problem = Problem(
-        simulate=simulate,
+        simulate=_Simulator(plain, signals),
+        values=rig.inner,
         axes=len(rig.axes),
         hypotheses=hypotheses(rig, {name: row for name, row in rig.effects.items() if name in LIBRARY}),
         prior=np.array([nominal.get(axis, 0.0) for axis in rig.axes]),

@@ -33,7 +33,9 @@ class Player:
 
     def __init__(self, rig):
         self.rig = rig
-        self._simulate = jax.jit(lambda vector, segment: self.rig.simulate(self.rig.tree(vector), segment))
+        self._simulate = jax.jit(
+            lambda vector, segment: self.rig.simulate(self.rig.values(self.rig.tree(vector)), segment)
+        )
         self._model = jax.jit(lambda vector: self.rig.model(self.rig.values(self.rig.tree(vector))))
 
     def vector(self, **effects):
@@ -66,7 +68,7 @@ def cells(places):
 
 
 def arm():
-    return Player(Rig(mujoco.MjSpec.from_string(ARM), ARM_JOINTS, CONTROL_HZ, ARM_SCALES))
+    return Player(Rig(mujoco.MjSpec.from_string(ARM), ARM_JOINTS, CONTROL_HZ).scaled(ARM_SCALES))
 
 
 def segment(rig, start, target, kp=0.0, kd=0.0, limit=np.inf, feed=0.0, emf=0.0, speed=0.0, steps=STEPS):

@@ -1,44 +1,64 @@
 """Between the motor and the joint.
 
-The motor is massless here (its inertia is the joint's armature): what backlash or a spring lets it run ahead of the
-joint follows from the balance of its torques over one step, where the controller answers with its stiffness and
-damping. The memory is that offset [joints] in rad; encoders sit on the motor and read it.
+Encoders sit on the motor. Its rotor is part of the joint's armature, so play and springs let it run ahead of the joint
+while the joint goes on without it: how far follows from the balance of torques on the rotor over one step, where the
+controller answers with its stiffness and damping. The memory is that offset in rad and its rate in rad/s, [2, joints].
 """
 
 import jax.numpy as jnp
 
 from jaxtune.types import Effect, Parameter
 
+_SLOPE_S = 0.006
 _TRANSMISSION = {"family": "transmission", "on": "joint"}
 
 
 def _resistance(now):
-    """Torque that the controller takes back for every rad that the motor runs ahead within a step."""
-    return now.stiffness + now.damping / now.dt
+    """Torque that a motor loses for every rad that it runs ahead within a step."""
+    return jnp.maximum(now.stiffness + (now.damping + now.rotor / now.dt) / now.dt, 1e-9)
 
 
-def _backlash(values, torque, now, offset):
+def _pressing(torque, now, rate):
+    """What would press on the gears if the motor kept up with the joint."""
+    return torque - now.carried + now.rotor * rate / now.dt
+
+
+def _passed(torque, now, memory, following):
+    """What moves the joint, of whose inertia the rotor is a part."""
+    offset, rate = memory
+    return torque + now.rotor * rate / now.dt - _resistance(now) * (following - offset)
+
+
+def _backlash(values, torque, now, memory):
+    offset, rate = memory
     half = 0.5 * values["rad"]
-    resistance = jnp.maximum(_resistance(now), 1e-9)
-    following = jnp.clip(offset + torque / resistance, -half, half)
-    return torque - resistance * (following - offset), following
+    following = jnp.clip(offset + _pressing(torque, now, rate) / _resistance(now), -half, half)
+    # Of a motor that was measured nobody knows when it let go.
+    rate = jnp.where(now.rotor > 0, (following - offset) / now.dt, 0.0)
+    return _passed(torque, now, memory, following), jnp.stack([following, rate])
 
 
-def _compliance(values, torque, now, offset):
-    softness, resistance = values["nm_per_rad"], _resistance(now)
-    passed = (torque + resistance * offset) / (1.0 + softness * resistance)
-    return passed, softness * passed
+def _compliance(values, torque, now, memory):
+    offset, rate = memory
+    softness = values["nm_per_rad"]
+    resistance = _resistance(now)
+    following = softness * (_pressing(torque, now, rate) + resistance * offset) / (1.0 + softness * resistance)
+    fresh = (following - offset) / now.dt
+    # Of a motor that was measured the torque is known row by row: its slope takes a few.
+    rate = jnp.where(now.rotor > 0, fresh, rate + now.dt / _SLOPE_S * (fresh - rate))
+    return _passed(torque, now, memory, following), jnp.stack([following, rate])
 
 
 def _taken_up(values, torque, dt):
     """The motor leans on the side of the play to which its torque drives it."""
     del dt
-    return 0.5 * values["rad"] * jnp.sign(torque)
+    offset = 0.5 * values["rad"] * jnp.sign(torque)
+    return jnp.stack([offset, jnp.zeros_like(offset)])
 
 
 def _wound_up(values, torque, dt):
     del dt
-    return values["nm_per_rad"] * torque
+    return jnp.stack([values["nm_per_rad"] * torque, jnp.zeros_like(torque)])
 
 
 ROWS = (

@@ -1,11 +1,15 @@
 """Whether a hypothesis is accepted, and under which name (step 7)."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
-_DRAWS = 1000
+from jaxtune.discovery.least_squares import Linear
+from jaxtune.discovery.resample import blocks, standard_error
+
+_REFITS = 200
+_TIE = 0.03  # of what is left: less is nobody's victory, however significant
 
 
 @dataclass(frozen=True)
@@ -25,7 +29,7 @@ class Evidence:
     horizons: int
     """At how many horizons it is best, or within a standard error of it."""
     chosen: float
-    """How often it, or one that cannot be told from it, is best when segments are drawn again."""
+    """How often it, or one that cannot be told from it, is best when it is fitted to segments that are drawn again."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +37,7 @@ class Thresholds:
     """What it takes."""
 
     t: float
-    """Over all hypotheses that were fitted, at once."""
+    """Over all hypotheses that are compared on `select`, at once."""
     gain: float
     """What the best hypothesis gains on healthy logs, 95th percentile."""
     floors: float = 1.0
@@ -69,53 +73,65 @@ def losses(residual: np.ndarray) -> np.ndarray:
     return np.sqrt((residual**2).mean(axis=(1, 2)))
 
 
-def t_statistic(gains: np.ndarray) -> float:
+def t_statistic(gains: np.ndarray, run: np.ndarray) -> float:
     """Mean over standard error of [segments]."""
-    return float(gains.mean() / max(_standard_error(gains), 1e-12))
+    return float(gains.mean() / standard_error(gains, run))
 
 
-def max_t(gains: Mapping[str, np.ndarray], level: float, seed: int = 0) -> float:
+def max_t(gains: Mapping[str, np.ndarray], run: np.ndarray, level: float) -> float:
     """The t that the best of hypotheses without an effect exceeds with probability `level`.
 
-    Bootstrap over segments of gains [segments] with their means taken off, the same draws for every hypothesis.
+    Bootstrap of gains [segments] with their means taken off, the same draws for every hypothesis. These are all that
+    are ever looked at on `select`; which of the library they are was settled on `train`.
     """
-    values = np.stack(list(gains.values()))
-    centred = values - values.mean(axis=1, keepdims=True)
-    count = values.shape[1]
-    draws = np.random.default_rng(seed).integers(count, size=(_DRAWS, count))
-    drawn = centred[:, draws]
-    error = drawn.std(axis=2, ddof=1) / np.sqrt(count)
-    return float(np.quantile((drawn.mean(axis=2) / np.maximum(error, 1e-12)).max(axis=0), 1.0 - level))
+    draws, found = blocks(run), []
+    for values in gains.values():
+        found.append((values[draws].mean(axis=1) - values.mean()) / standard_error(values, run))
+    return float(np.quantile(np.max(found, axis=0), 1.0 - level))
 
 
-def alike(lost: Mapping[str, np.ndarray], errors: float) -> list[str]:
+def alike(lost: Mapping[str, np.ndarray], run: np.ndarray, errors: float) -> list[str]:
     """Those that cannot be told from the best, best first.
 
     Args:
       lost: what every segment counts for, [segments] by hypothesis.
+      run: [segments] index of each segment's run.
       errors: how many standard errors of the paired difference count as a difference.
     """
     order = sorted(lost, key=lambda key: lost[key].mean())
     worse = {key: lost[key] - lost[order[0]] for key in order}
-    return [key for key in order if worse[key].mean() <= errors * _standard_error(worse[key])]
+    tie = _TIE * lost[order[0]].mean()
+    return [key for key in order if worse[key].mean() <= max(errors * standard_error(worse[key], run), tie)]
 
 
-def bagged(lost: Mapping[str, np.ndarray], seed: int = 0) -> dict[str, float]:
-    """How often each is best when segments are drawn with repetition."""
-    values = np.stack(list(lost.values()))
-    count = values.shape[1]
-    draws = np.random.default_rng(seed).integers(count, size=(_DRAWS, count))
-    winners = values[:, draws].mean(axis=2).argmin(axis=0)
-    return {key: float((winners == index).mean()) for index, key in enumerate(lost)}
+def bagged(fits: Mapping[str, Linear], run: np.ndarray) -> dict[str, float]:
+    """How often each is best where it was not fitted, when segments are drawn with repetition and it is fitted again.
 
+    Near its fit a hypothesis is linear; so a draw costs the solution of one small system, and no simulation.
 
-def simplest(keys: Sequence[str], complexity: Mapping[str, int]) -> str:
-    """The first of the least complex."""
-    return min(keys, key=lambda key: complexity[key])
-
-
-def _standard_error(values: np.ndarray) -> float:
-    return float(values.std(ddof=1) / np.sqrt(len(values)))
+    Args:
+      fits: residuals and slopes of all segments, flat, at each hypothesis' fit.
+      run: [segments] index of each segment's run.
+    """
+    draws = blocks(run, _REFITS)
+    times = np.stack([np.bincount(draw, minlength=len(run)) for draw in draws])
+    lost = []
+    for fit in fits.values():
+        residual = fit.residual.reshape(len(run), -1)
+        slope = fit.jacobian.reshape(*residual.shape, -1)
+        # |r + J u|^2 of every segment, as a quadratic in u.
+        square = np.einsum("sf,sf->s", residual, residual)
+        pull = np.einsum("sfi,sf->si", slope, residual)
+        normal = np.einsum("sfi,sfj->sij", slope, slope, optimize=True)
+        prior = np.diag(1.0 / fit.sd**2)
+        steps = -np.linalg.solve(
+            fit.weight * np.einsum("ds,sij->dij", times, normal, optimize=True) + prior + 1e-9 * np.eye(len(prior)),
+            (fit.weight * times @ pull + fit.offset @ prior)[..., None],
+        )[..., 0]
+        there = square + 2 * steps @ pull.T + np.einsum("di,sij,dj->ds", steps, normal, steps, optimize=True)
+        lost.append(np.where(times == 0, np.sqrt(np.maximum(there, 0.0)), 0.0).sum(axis=1))
+    winners = np.argmin(lost, axis=0)
+    return {key: float((winners == index).mean()) for index, key in enumerate(fits)}
 
 
 def sandwich(residual: np.ndarray, jacobian: np.ndarray, weight: float, sd: np.ndarray) -> np.ndarray:

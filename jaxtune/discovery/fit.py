@@ -87,6 +87,29 @@ def refine(fits: Sequence[Fit], evaluate: Evaluate, rounds: int) -> list[Fit]:
     return fits
 
 
+def polish(fits: Sequence[Fit], evaluate: Evaluate, rounds: int) -> list[Fit]:
+    """Finds all slopes anew where fits stand, one simulation for each, and goes on from there."""
+    steps = [_own_step(fit) for fit in fits]
+    found = _dealt(
+        evaluate,
+        [
+            [(fit.coordinates + step) @ fit.free.directions for step in np.diag(size)]
+            for fit, size in zip(fits, steps, strict=True)
+        ],
+    )
+    fresh = [
+        replace(fit, jacobian=np.where(np.isfinite(moved), (moved - fit.residual) / size[:, None], 0.0).T)
+        for fit, size, moved in zip(fits, steps, found, strict=True)
+    ]
+    return refine(fresh, evaluate, rounds)
+
+
+def _own_step(fit: Fit) -> np.ndarray:
+    """How far to go for slopes, [coordinates], inwards from a bound."""
+    size = np.maximum(0.3 * fit.free.sd * np.where(fit.free.nominal, 1.0, 0.1), 0.1 * np.abs(fit.coordinates))
+    return np.where(fit.coordinates + size > fit.free.bounds[:, 1], -size, size)
+
+
 def _best(fit: Fit, points: Sequence[np.ndarray], residuals: np.ndarray) -> Fit:
     """The better of the trials, if one is better than where it is; what they taught in any case."""
     best, learnt = None, fit
@@ -119,6 +142,7 @@ def begin(
     tried: Sequence[Sequence[np.ndarray]],
     evaluate: Evaluate,
     absolute: bool = False,
+    like: Sequence[Fit] | None = None,
 ) -> list[Fit]:
     """Fits that are about to start: each hypothesis beside what is free in `base`, at the best of its points.
 
@@ -128,10 +152,13 @@ def begin(
       tried: points [parameters] for every hypothesis, seen from where the base has what the hypothesis takes over.
       evaluate: residuals of vectors.
       absolute: points are seen from the nominal model instead.
+      like: fits of the same hypotheses to other segments, where everything else starts.
     """
     kept, points = [], []
-    for hypothesis, group in zip(hypotheses, tried, strict=True):
+    for number, (hypothesis, group) in enumerate(zip(hypotheses, tried, strict=True)):
         fit, stood = without(base, given_up(base.free, hypothesis), hypothesis)
+        if like:
+            fit = replace(fit, coordinates=like[number].coordinates[: len(fit.coordinates)])
         kept.append(fit)
         points.append([np.clip(point if absolute else stood + point, *hypothesis.bounds.T) for point in group])
     places = list(zip(kept, hypotheses, points, strict=True))

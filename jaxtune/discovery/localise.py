@@ -4,13 +4,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from jaxtune.discovery.resample import blocks
+
 
 def cells(
     residual: np.ndarray,
     regimes: np.ndarray,
     regime_names: Sequence[str],
     components: Sequence[tuple[str, str]],
-    key: int,
+    run: np.ndarray,
 ) -> list[dict]:
     """Energy above the floor by component and regime, largest first, with bootstrap intervals over segments.
 
@@ -18,9 +20,9 @@ def cells(
       residual: [segments, bins, components] in floor units.
       regimes: [segments, bins, joints] index of each joint's regime.
       components: (signal, joint) of every component.
-      key: seed of the bootstrap.
+      run: [segments] index of each segment's run.
     """
-    rng = np.random.default_rng(key)
+    draws = blocks(run, 200)
     joints = [joint for signal, joint in components if signal == "q"]
     found = []
     for index, (signal, joint) in enumerate(components):
@@ -31,7 +33,6 @@ def cells(
             if (count > 0).sum() < 3:
                 continue
             energy = (residual[..., index] ** 2 * there).sum(axis=1)
-            draws = rng.integers(len(count), size=(200, len(count)))
             resampled = energy[draws].sum(axis=1) / np.maximum(count[draws].sum(axis=1), 1.0)
             low, high = (excess(bound) for bound in np.quantile(resampled, (0.025, 0.975)))
             found.append(

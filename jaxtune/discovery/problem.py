@@ -6,6 +6,7 @@ nominal model; the simulator is a function of that vector and of segments.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import jax
@@ -13,7 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 
 Simulate = Callable[[jax.Array, Any], Mapping[str, jax.Array]]
-"""`simulate(coordinates [axes], inputs) -> {signal: [rows, components]}`, of one segment."""
+"""`simulate(values [axes], inputs) -> {signal: [rows, components]}`, of one segment.
+
+Programs are compiled once for every simulator that is equal to no other, and length of segments.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,6 +80,8 @@ class Problem:
     """Names of the regimes."""
     components: Mapping[str, tuple[str, ...]]
     """Names of the components of every signal."""
+    values: Callable[[np.ndarray], np.ndarray] = lambda vectors: vectors
+    """What the simulator is given for coordinates [n, axes], [n, axes]."""
     residual: Mapping[str, Hypothesis] = field(default_factory=dict)
     """A torque without a name, by joint: what stands in where nothing fits."""
 
@@ -106,24 +112,12 @@ class Residuals:
 
     def __init__(self, problem: Problem, width: int = 128):
         self._problem, self._width = problem, width
-        self._compiled = jax.jit(self._loop)
-
-    def _loop(self, count, vectors, which, piece, inputs):
-        def simulate(vector, segment):
-            return binned(self._problem.simulate(vector, segment), self._problem.bin_rows)
-
-        shape = jax.eval_shape(simulate, vectors[0], jax.tree.map(lambda leaf: leaf[0], inputs))
-
-        def work(index, found):
-            mine = jax.tree.map(lambda leaf: leaf[piece[index]], inputs)
-            return found.at[index].set(jax.vmap(simulate)(vectors[which[index]], mine))
-
-        return jax.lax.fori_loop(0, count, work, jnp.zeros((*which.shape, *shape.shape), shape.dtype))
 
     def __call__(self, vectors: np.ndarray, segments: Segments) -> np.ndarray:
         """Residuals of vectors [hypotheses, axes]; those that are not finite come back as they are."""
-        vectors = np.atleast_2d(np.asarray(vectors, np.float32))
-        measured = np.stack([binned(piece, self._problem.bin_rows) for piece in _pieces(segments.signals)])
+        problem = self._problem
+        vectors = np.asarray(problem.values(np.atleast_2d(vectors)), np.float32)
+        measured = np.stack([binned(piece, problem.bin_rows) for piece in _pieces(segments.signals)])
         # Splits of other sizes are filled up.
         filled = np.arange(self._largest(segments)) % len(measured)
         inputs = jax.tree.map(lambda leaf: jnp.asarray(leaf[filled]), segments.inputs)
@@ -135,7 +129,8 @@ class Residuals:
             mine = (start + np.arange(once) % count).reshape(shape)
             used, which = np.unique(each[mine], return_inverse=True)
             some = vectors[used[np.arange(once) % len(used)]]
-            out = self._compiled(-(-count // self._width), some, which.reshape(shape), piece[mine], inputs)
+            chunks = -(-count // self._width)
+            out = _moved(problem.simulate, problem.bin_rows, chunks, some, which.reshape(shape), piece[mine], inputs)
             found.append(np.asarray(out).reshape(once, *measured.shape[1:])[:count])
         predicted = np.concatenate(found).reshape(len(vectors), *measured.shape)
         return measured[None] - predicted
@@ -146,6 +141,22 @@ class Residuals:
         splits = [one for split in self._problem.data.values() for one in split.values()]
         same = [len(one.run) for one in splits if next(iter(one.signals.values())).shape[1] == rows]
         return max([len(segments.run), *same])
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _moved(simulate: Simulate, bin_rows: int, count, values, which, piece, inputs):
+    """`count` chunks of values [n, axes] and segments, which of either by [chunks, width]."""
+
+    def one(mine, segment):
+        return binned(simulate(mine, segment), bin_rows)
+
+    shape = jax.eval_shape(one, values[0], jax.tree.map(lambda leaf: leaf[0], inputs))
+
+    def work(index, found):
+        mine = jax.tree.map(lambda leaf: leaf[piece[index]], inputs)
+        return found.at[index].set(jax.vmap(one)(values[which[index]], mine))
+
+    return jax.lax.fori_loop(0, count, work, jnp.zeros((*which.shape, *shape.shape), shape.dtype))
 
 
 def _pieces(signals: Mapping[str, np.ndarray]):

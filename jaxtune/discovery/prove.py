@@ -1,11 +1,8 @@
 """The verdict, and the proof on sealed segments (steps 9 and 10)."""
 
-from collections.abc import Sequence
-
 import numpy as np
 
-from jaxtune.discovery.fit import Fit
-from jaxtune.discovery.problem import Hypothesis
+from jaxtune.discovery.fit import Fit, polish
 
 
 def judge(discovery) -> None:
@@ -25,6 +22,7 @@ def judge(discovery) -> None:
     error = np.sqrt((result.errors[:, None] ** 2 * fit.free.directions**2).sum(axis=0))
     moved = (np.abs(deviations) > settings.changed) & (np.abs(fit.vector) > 1.96 * error)
     result.changed = {int(axis): float(deviations[axis]) for axis in np.flatnonzero(moved)}
+    result.changed_alike = {axis: discovery.mistaken_for(axis) for axis in result.changed}
     if any(not discovery.problem.is_nominal(rung.hypothesis) for rung in result.rungs):
         result.verdict = "named"
     else:
@@ -34,6 +32,11 @@ def judge(discovery) -> None:
 def gap(discovery, vector: np.ndarray, split: str = "select") -> float:
     """Root mean square of the worst component of the positions, in floor units, at the main horizon."""
     return float(_rms(discovery, vector[None], split)[0][_positions(discovery)].max())
+
+
+def worst(discovery, vector: np.ndarray) -> float:
+    """Root mean square of the worst component of all signals on `select`, in floor units."""
+    return float(_rms(discovery, vector[None], "select")[0].max())
 
 
 def prove(discovery) -> None:
@@ -85,22 +88,21 @@ def _free_residual(discovery) -> Fit | None:
 
 
 def _placebos(discovery) -> dict[str, np.ndarray]:
-    """The first effect at a wrong place, and a wrong effect at its place, with the same budget."""
+    """The first effect at a wrong place, and a wrong effect at its place: the best of each kind, fitted like it."""
     if not discovery.result.rungs:
         return {}
     truth, hypotheses = discovery.result.rungs[0].hypothesis, discovery.problem.hypotheses
-    elsewhere = [h for h in hypotheses if h.name == truth.name and not set(h.places) & set(truth.places)]
-    beside = [h for h in hypotheses if h.places == truth.places and h.family != truth.family]
-    return _fitted(discovery, {"wrong place": elsewhere, "wrong effect": beside})
-
-
-def _fitted(discovery, options: dict[str, Sequence[Hypothesis]]) -> dict[str, np.ndarray]:
-    """The first of each kind, fitted from the null."""
+    kinds = {
+        "wrong place": [h for h in hypotheses if h.name == truth.name and not set(h.places) & set(truth.places)],
+        "wrong effect": [h for h in hypotheses if h.places == truth.places and h.family != truth.family],
+    }
     kept, discovery.fits = discovery.fits, {discovery.main: discovery.result.null}
     found = {}
-    for label, (first, *_) in {label: some for label, some in options.items() if some}.items():
-        start = {first.key: list(first.probes)}
-        fit = discovery.fit([first], start, discovery.main, discovery.settings.rounds)[0]
-        found[f"{label}: {first.key}"] = fit.vector
+    for label, options in kinds.items():
+        if options:
+            best = max(options, key=lambda h: discovery.promise.get(h.key, 0.0))
+            fit = discovery.fit([best], {best.key: list(best.probes)}, discovery.main, discovery.settings.rounds)
+            (fit,) = polish(fit, discovery.residual(discovery.main, "train"), discovery.settings.rounds)
+            found[f"{label}: {best.key}"] = fit.vector
     discovery.fits = kept
     return found

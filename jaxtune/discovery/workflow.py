@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 
 from jaxtune.discovery import decide, localise
-from jaxtune.discovery.fit import Fit, Free, begin, refine
+from jaxtune.discovery.fit import Fit, Free, begin, polish, refine
 from jaxtune.discovery.measure import Gauge, gauge, jacobian, nominal_directions, refitted
 from jaxtune.discovery.problem import Hypothesis, Problem, Residuals
-from jaxtune.discovery.prove import judge, prove
+from jaxtune.discovery.prove import judge, prove, worst
 from jaxtune.discovery.screen import Score, Screen, probes
 
 _ROUNDS_MORE = 2  # where a fit starts from another one
@@ -29,6 +29,8 @@ class Settings:
     """Hypotheses that are fitted beside the best of each family."""
     finalists: int = 6
     """Of those, how many are fitted at every horizon."""
+    polished: int = 2
+    """Of those, how many are fitted with fresh slopes before they are compared."""
     most: int = 4
     """Effects that are accepted at most."""
     level: float = 0.05
@@ -37,6 +39,12 @@ class Settings:
     """Of the energy above the floor that the named effects must explain together; else it is `unnamed`."""
     at_floor: float = 1.5
     """Floor units up to which a gap is none."""
+    quiet: float = 1.2
+    """Floor units in any signal up to which nothing more is looked for."""
+    promising: float = 0.3
+    """Share of the gain it takes that the screen must see for a fit."""
+    same: float = 0.8
+    """Share of what is explained from which on another name may as well be right: effects have more forms than one."""
     changed: float = 3.0
     """Prior standard deviations beyond which a nominal parameter is another one."""
     rounds: int = 4
@@ -75,6 +83,8 @@ class Result:
     """The best that was not accepted, and its tests."""
     changed: dict[int, float] = field(default_factory=dict)
     """Nominal axes that moved too far to be the same parameter, with their standard deviations from the prior."""
+    changed_alike: dict[int, tuple[str, ...]] = field(default_factory=dict)
+    """Names of effects that these logs could not tell from such a change."""
     residual: Fit | None = None
     """With a free torque at one joint, where something has no name."""
     gap: dict[str, float] = field(default_factory=dict)
@@ -120,6 +130,8 @@ class Discovery:
         self.fits: dict[float, Fit] = {}
         self.result = Result()
         self._calibration, self._looked = calibration, False
+        self._screen: Screen | None = None
+        self.promise: dict[str, float] = {}
         self._healthy_gain = calibration.gain if calibration else 0.0
         self._penalty = calibration.penalty if calibration else 0.0
 
@@ -160,6 +172,10 @@ class Discovery:
         floor, segments = self.gauges[horizon].floor, self.problem.data[split][horizon]
         return lambda vectors: (self.measure(vectors, segments) / floor).reshape(len(vectors), -1)
 
+    def _runs(self, split: str) -> np.ndarray:
+        """Index of the run of every segment of the main horizon, [segments]."""
+        return self.problem.data[split][self.main].run
+
     def shaped(self, residual: np.ndarray, horizon: float) -> np.ndarray:
         """[segments, bins, components, ...] again."""
         return residual.reshape(-1, *self.gauges[horizon].floor.shape, *residual.shape[1:])
@@ -173,7 +189,7 @@ class Discovery:
         segments = problem.data["train"][self.main]
         regimes = segments.regimes[:, :: problem.bin_rows][:, : residual.shape[1]]
         if not self.result.where:
-            self.result.where = localise.cells(residual, regimes, problem.regimes, problem.cells, 0)
+            self.result.where = localise.cells(residual, regimes, problem.regimes, problem.cells, segments.run)
         if not self._push:
             return []
         unit = np.zeros((len(self._push), problem.axes))
@@ -228,10 +244,11 @@ class Discovery:
         horizon: float,
         rounds: int,
         absolute: bool = False,
+        like: Sequence[Fit] | None = None,
     ) -> list[Fit]:
         """Fits hypotheses with everything that is free already, each from the best of the points that are tried."""
         evaluate = self.residual(horizon, "train")
-        fits = begin(self.fits[horizon], hypotheses, [tried[h.key] for h in hypotheses], evaluate, absolute)
+        fits = begin(self.fits[horizon], hypotheses, [tried[h.key] for h in hypotheses], evaluate, absolute, like)
         return refine(fits, evaluate, rounds)
 
     def healthy_gain(self, screen: Screen, hypotheses: Sequence[Hypothesis]) -> float:
@@ -252,13 +269,16 @@ class Discovery:
         base = self.fits[self.main]
         if not self.result.rungs:
             self.result.null = base
+        if self._looked and worst(self, base.vector) <= settings.quiet:
+            return False
         taken = {rung.hypothesis.key for rung in self.result.rungs} | set(self.result.dropped)
         hypotheses = [h for h in problem.hypotheses if h.key not in taken]
         joints = self.localise()
-        screen = self.screen(hypotheses, base)
+        screen = self._screen = self.screen(hypotheses, base)
         scores = screen.scores(hypotheses)
         if not self._looked:
             self._looked = True
+            self.promise = {key: score.gain for key, score in scores.items()}
             names = dict.fromkeys(h.name for h in hypotheses)
             shown = {h.name for h in hypotheses if scores[h.key].testable}
             self.result.not_testable = [name for name in names if name not in shown]
@@ -269,6 +289,8 @@ class Discovery:
         near = [h for h in hypotheses if not needing or not h.joints or needing & set(h.joints)]
         # What is larger than the smallest size of interest may show where that would not.
         near = [h for h in near if scores[h.key].testable or scores[h.key].gain > self._healthy_gain]
+        # A fit finds more than its first step does, but not many times as much.
+        near = [h for h in near if scores[h.key].gain > settings.promising * self._healthy_gain]
         short = self.shortlist(scores, near)
         self.say(f"fit {len(short)}")
         if not short:
@@ -281,34 +303,47 @@ class Discovery:
         short = short[: settings.finalists]
         if not short:
             return False
+        best = [h.key for h in short[: settings.polished]]
+        evaluate = self.residual(self.main, "train")
+        # The model without them too, so that what they gain is theirs.
+        base, *polished = polish([base, *(fits[key] for key in best)], evaluate, settings.rounds)
+        self.fits[self.main] = base
+        if not self.result.rungs:
+            self.result.null = base
+        fits |= dict(zip(best, polished, strict=True))
         everywhere = {self.main: {h.key: fits[h.key] for h in short}}
         for horizon in problem.horizons:
             if horizon != self.main:
                 starts = {h.key: [fits[h.key].coordinates[-len(h.directions) :]] for h in short}
-                found = self.fit(short, starts, horizon, _ROUNDS_MORE, absolute=True)
+                like = [fits[h.key] for h in short]
+                found = self.fit(short, starts, horizon, _ROUNDS_MORE, absolute=True, like=like)
                 everywhere[horizon] = dict(zip([h.key for h in short], found, strict=True))
         return self._decide(short, everywhere, base)
 
     def _decide(self, short, everywhere, base) -> bool:
         settings = self.settings
         losses, gains, best_at = {}, {}, {h.key: 0 for h in short}
+        fitted, runs = everywhere[self.main], self._runs("train")
         for horizon, fits in everywhere.items():
-            residual = self.residual(horizon, "select")
+            residual, run = self.residual(horizon, "select"), self.problem.data["select"][horizon].run
             found = residual(np.stack([self.fits[horizon].vector, *(fits[h.key].vector for h in short)]))
             shaped = [self.shaped(r, horizon) for r in found]
             select = {h.key: decide.losses(r) for h, r in zip(short, shaped[1:], strict=True)}
-            for key in decide.alike(select, 1.0):
+            for key in decide.alike(select, run, 1.0):
                 best_at[key] += 1
             if horizon == self.main:
                 before = shaped[0]
                 after = {h.key: r for h, r in zip(short, shaped[1:], strict=True)}
                 gains = {key: decide.paired(before, r) for key, r in after.items()}
-                train = {h.key: decide.losses(self.shaped(fits[h.key].residual, horizon)) for h in short}
+                train = {key: decide.losses(self.shaped(fit.residual, horizon)) for key, fit in fitted.items()}
                 losses = {key: np.concatenate([train[key], select[key]]) for key in select}
-        close = decide.alike(losses, 2.0)
+        both = np.concatenate([runs, self._runs("select")])
+        gained = {key: base.linear.loss - fit.linear.loss for key, fit in fitted.items()}
+        close = decide.alike(losses, both, 2.0)
+        close += [key for key in gained if key not in close and gained[key] > settings.same * max(gained.values())]
         complexity = {h.key: len(h.directions) for h in short}
-        key = decide.simplest(decide.alike(losses, 1.0), complexity)
-        chosen = decide.bagged(losses)
+        key = min(decide.alike(losses, both, 1.0), key=lambda key: (complexity[key], fitted[key].linear.loss))
+        chosen = decide.bagged({key: fit.linear for key, fit in fitted.items()}, runs)
         fit = everywhere[self.main][key]
         hypothesis = next(h for h in short if h.key == key)
         errors = self.errors(fit)[-len(hypothesis.directions) :]
@@ -319,15 +354,22 @@ class Discovery:
         value, error = values[clear], errors[clear]
         drop = (before**2).mean(axis=(0, 1)) - (after[key] ** 2).mean(axis=(0, 1))
         evidence = decide.Evidence(
-            gain=base.linear.loss - fit.linear.loss,
-            t=decide.t_statistic(gains[key]),
+            gain=gained[key],
+            t=decide.t_statistic(gains[key], self._runs("select")),
             floors=float(np.sqrt(max(drop.max(), 0.0))),
             interval=(float(value - 1.96 * error), float(value + 1.96 * error)),
             inside=bool(((low < values) & (values < high)).all()),
             horizons=best_at[key],
-            chosen=sum(chosen[other] for other in close),
+            # Its own name at some of its places is the same finding.
+            chosen=sum(
+                chosen[h.key]
+                for h in short
+                if h.key in close or (h.name == hypothesis.name and set(h.places) & set(hypothesis.places))
+            ),
         )
-        thresholds = decide.Thresholds(t=decide.max_t(gains, settings.level), gain=self._healthy_gain)
+        thresholds = decide.Thresholds(
+            t=decide.max_t(gains, self._runs("select"), settings.level), gain=self._healthy_gain
+        )
         tests = decide.passes(evidence, thresholds)
         self.say(f"{key} {evidence} {thresholds} {tests} alike {close}")
         if not all(tests.values()):
@@ -351,7 +393,7 @@ class Discovery:
             residual = self.residual(self.main, "select")
             found = residual(np.stack([without[self.main].vector, self.fits[self.main].vector]))
             gains = decide.paired(*(self.shaped(one, self.main) for one in found))
-            if decide.t_statistic(gains) < 1.0:
+            if decide.t_statistic(gains, self._runs("select")) < 1.0:
                 self.say(f"drop {rung.hypothesis.key}")
                 self.result.rungs.remove(rung)
                 self.result.dropped.append(rung.hypothesis.key)
@@ -396,6 +438,11 @@ class Discovery:
         self.result.not_testable = [name for name in self.result.not_testable if name not in named]
         prove(self)
         return self.result
+
+    def mistaken_for(self, axis: int) -> tuple[str, ...]:
+        """Names of the effects that look like a change of a nominal parameter."""
+        axes = self._screen.like(axis, self.problem.hypotheses, self.settings.same) if self._screen else ()
+        return tuple(dict.fromkeys(axes))
 
     def calibrate(self) -> None:
         """Finds what healthy logs gain and need, without asking anything of the measured ones."""

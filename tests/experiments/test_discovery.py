@@ -134,7 +134,7 @@ def test_a_size_at_two_places_is_the_same_physical_size(spec, plain):
     from envs.rig import Rig
 
     rig = Rig(spec, JOINTS, 1000.0)
-    rig = Rig(spec, JOINTS, 1000.0, measure_scales(rig, plain))
+    rig = rig.scaled(measure_scales(rig, plain))
     for hypothesis in hypotheses(
         rig, {name: rig.effects[name] for name in ("coulomb", "torque_limit", "torque_scale")}
     ):

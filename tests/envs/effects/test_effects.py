@@ -30,6 +30,8 @@ def now(speed=0.0, **fields):
         "limit": 5.0 * joints,
         "stiffness": 20.0 * joints,
         "damping": 0.0 * joints,
+        "rotor": 0.0 * joints,
+        "carried": 0.0 * joints,
         "body_velocity": np.zeros((JOINTS, 3), np.float32),
     }
     return Now(**(standard | {"speed": speed * joints} | fields))
@@ -127,6 +129,8 @@ def test_what_is_not_there_changes_nothing(row):
         speed=rng.uniform(-9, 9, JOINTS),
         load=rng.uniform(0, 9, JOINTS),
         damping=rng.uniform(0, 1, JOINTS),
+        rotor=np.full(JOINTS, 0.01, np.float32),
+        carried=rng.uniform(-1, 1, JOINTS),
         limit=np.full(JOINTS, 0.1),  # less than the torque, which a controller without a limit of its own may have
         body_velocity=rng.uniform(-9, 9, (JOINTS, 3)),
     )
@@ -281,15 +285,15 @@ def test_a_lagging_torque_rises_as_an_exponential():
 # Transmission: a joint that is held, so that what the motor does is all there is.
 
 
-def wound(name, targets, damping=0.0, stiffness=20.0, **physical):
+def wound(name, targets, damping=0.0, stiffness=20.0, rotor=0.0, feed=0.0, **physical):
     """Torque on the held joint and how far the motor is ahead of it, [time] each, as a controller turns the motor."""
     row = LIBRARY[name]
     values = values_of(row, **physical)
-    at = now(stiffness=jnp.full(JOINTS, stiffness), damping=jnp.full(JOINTS, damping))
+    at = now(stiffness=jnp.full(JOINTS, stiffness), damping=jnp.full(JOINTS, damping), rotor=jnp.full(JOINTS, rotor))
 
-    def step(offset, target):
-        torque, offset = row.act(values, stiffness * (target - offset), at, offset)
-        return offset, (torque, offset)
+    def step(memory, target):
+        torque, memory = row.act(values, stiffness * (target - memory[0]) + feed, at, memory)
+        return memory, (torque, memory[0])
 
     _, (torque, offset) = jax.lax.scan(
         step, row.start(values, jnp.zeros(JOINTS), DT), jnp.asarray(targets, jnp.float32)
@@ -323,6 +327,37 @@ def test_torque_comes_back_once_the_motor_has_crossed_the_gap():
     np.testing.assert_allclose(crossing, 0.0508, atol=0.002)
     np.testing.assert_allclose(back[-1], -20.0 * 0.3, rtol=1e-4)
     np.testing.assert_allclose(offset[-1], -0.2, rtol=1e-5)
+
+
+def test_in_the_gap_a_motor_gathers_speed_and_gives_it_to_the_joint_at_its_end():
+    # 0.01 kg m^2 under 0.5 Nm gain 0.05 rad/s a step of 1 ms, so after n steps they are 2.5e-5 rad x n (n + 1) ahead.
+    torque, offset = wound("backlash", np.zeros(60), stiffness=0.0, rotor=0.01, feed=0.5, rad=0.02)
+    steps = np.arange(1, 20)
+    np.testing.assert_allclose(offset[:19], 2.5e-5 * steps * (steps + 1), rtol=1e-4)
+    np.testing.assert_allclose(torque[:19], 0.0, atol=1e-4)
+    # The end of the gap, 0.01 rad away, is reached in step 20; all that the motor was given the joint gets by then.
+    np.testing.assert_allclose(torque[:40].sum(), 0.5 * 40, rtol=1e-3)
+    np.testing.assert_allclose(torque[40:], 0.5, rtol=1e-4)
+
+
+def test_a_motor_on_a_spring_swings_at_its_own_pace():
+    # 0.01 kg m^2 on 20 + 60 Nm/rad: 89 rad/s, half a period is 35 ms; the swing goes to twice where it would rest, less
+    # what steps that are taken by their end lose.
+    _, offset = wound("compliance", np.full(70, 0.1), rotor=0.01, nm_per_rad=60.0)
+    np.testing.assert_allclose(np.argmax(offset), 34, atol=1)
+    assert 0.025 * 1.8 < offset.max() < 0.025 * 2.0
+
+
+def test_a_joint_that_goes_on_without_its_motor_has_no_rotor():
+    # MJX has the rotor in the joint's inertia: what it takes to carry it is given back in the gap, where the motor,
+    # which nobody drives, stays behind.
+    row = LIBRARY["backlash"]
+    values = values_of(row, rad=0.4)
+    rotor, carried = jnp.full(JOINTS, 0.01), jnp.full(JOINTS, 0.3)
+    at = now(stiffness=jnp.zeros(JOINTS), rotor=rotor, carried=carried)
+    torque, memory = row.act(values, jnp.zeros(JOINTS), at, jnp.zeros((2, JOINTS)))
+    np.testing.assert_allclose(torque, 0.3, rtol=1e-5)
+    np.testing.assert_allclose(memory[1], -0.3 / 0.01 * DT, rtol=1e-5)
 
 
 def test_a_spring_winds_up_by_torque_over_stiffness():
