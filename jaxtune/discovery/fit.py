@@ -15,6 +15,7 @@ from jaxtune.discovery.problem import Hypothesis
 Evaluate = Callable[[np.ndarray], np.ndarray]
 """`evaluate(vectors [n, axes]) -> residuals [n, features]` in floor units."""
 
+ROUNDS_MORE = 2  # of a fit that starts from another one
 _SCALES = (1.0, 0.35)
 _DAMPING = 1e-3
 _SHORTEST = 0.03  # of a step that slopes are learnt from

@@ -125,6 +125,23 @@ class Screen:
         return self._projections[key]
 
 
+def shortlist(scores: Mapping[str, Score], hypotheses: Sequence[Hypothesis], count: int) -> list[Hypothesis]:
+    """The best `count`, and the best of each family."""
+    ranked = sorted(hypotheses, key=lambda h: -scores[h.key].gain)
+    ranked = [h for h in ranked if scores[h.key].gain > 4.0]
+    chosen, seen, names = [], set(), {}
+    for hypothesis in ranked:
+        first = hypothesis.family not in seen
+        # Three places of one name tell where; more would crowd out other names.
+        if names.get(hypothesis.name, 0) >= 3:
+            continue
+        if first or len(chosen) < count:
+            chosen.append(hypothesis)
+            seen.add(hypothesis.family)
+            names[hypothesis.name] = names.get(hypothesis.name, 0) + 1
+    return chosen
+
+
 def groups(hypothesis: Hypothesis):
     """For every size at which it is looked for: sizes [k], and its (axis, size) and shares for each of k directions."""
     free = [index for index in range(len(hypothesis.directions)) if (hypothesis.probes[:, index] != 0).any()]

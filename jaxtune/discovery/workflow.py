@@ -6,19 +6,20 @@ A round ends the ladder where nothing passes. Sealed segments are simulated by `
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from jaxtune.discovery import decide, localise
-from jaxtune.discovery.fit import Fit, Free, begin, polish, refine
+from jaxtune.discovery.accept import Rung, accept, drop
+from jaxtune.discovery.fit import ROUNDS_MORE, Fit, Free, begin, polish, refine
 from jaxtune.discovery.measure import Gauge, gauge, jacobian, nominal_directions, refitted
 from jaxtune.discovery.problem import Hypothesis, Problem, Residuals
 from jaxtune.discovery.prove import judge, prove, worst
-from jaxtune.discovery.screen import Score, Screen, probes
-
-_ROUNDS_MORE = 2  # where a fit starts from another one
+from jaxtune.discovery.saved import resume
+from jaxtune.discovery.saved import state as state_of
+from jaxtune.discovery.screen import Screen, probes, shortlist
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,17 +50,6 @@ class Settings:
     """Prior standard deviations beyond which a nominal parameter is another one."""
     rounds: int = 4
     """Of a fit."""
-
-
-@dataclass(frozen=True)
-class Rung:
-    """One accepted effect."""
-
-    hypothesis: Hypothesis
-    evidence: decide.Evidence
-    thresholds: decide.Thresholds
-    alike: tuple[str, ...]
-    """Names that could not be told from it."""
 
 
 @dataclass
@@ -129,11 +119,11 @@ class Discovery:
         self.gauges: dict[float, Gauge] = {}
         self.fits: dict[float, Fit] = {}
         self.result = Result()
-        self._calibration, self._looked = calibration, False
+        self._calibration, self.looked = calibration, False
         self._screen: Screen | None = None
         self.promise: dict[str, float] = {}
-        self._healthy_gain = calibration.gain if calibration else 0.0
-        self._penalty = calibration.penalty if calibration else 0.0
+        self.least_gain = calibration.gain if calibration else 0.0
+        self.penalty = calibration.penalty if calibration else 0.0
 
     # --- what is there before the first question
 
@@ -172,7 +162,7 @@ class Discovery:
         floor, segments = self.gauges[horizon].floor, self.problem.data[split][horizon]
         return lambda vectors: (self.measure(vectors, segments) / floor).reshape(len(vectors), -1)
 
-    def _runs(self, split: str) -> np.ndarray:
+    def runs(self, split: str) -> np.ndarray:
         """Index of the run of every segment of the main horizon, [segments]."""
         return self.problem.data[split][self.main].run
 
@@ -196,13 +186,13 @@ class Discovery:
         unit[np.arange(len(unit)), list(self._push.values())] = 0.05
         slopes = jacobian(self.measure, fit.vector, unit, segments) / gauge_.floor[..., None]
         flat = slopes.reshape(len(residual), -1, len(unit))
-        if not self._penalty:
+        if not self.penalty:
             slope = gauge_.jacobian
-            self._penalty = max(
+            self.penalty = max(
                 localise.least_penalty(refitted(values, slope, gauge_.weight).reshape(len(residual), -1), flat)
                 for values in gauge_.healthy
             )
-        need = localise.free_torque(residual.reshape(len(residual), -1), flat, self._penalty)
+        need = localise.free_torque(residual.reshape(len(residual), -1), flat, self.penalty)
         self.result.needs_torque = dict(zip(self._push, need.tolist(), strict=True))
         return [joint for joint, value in self.result.needs_torque.items() if value > 0]
 
@@ -220,22 +210,6 @@ class Discovery:
             for key, residual in zip(asked[start : start + 32], found, strict=True):
                 columns[key] = np.nan_to_num((residual - fit.residual) / key[1], posinf=0.0, neginf=0.0)
         return Screen(fit, columns)
-
-    def shortlist(self, scores: Mapping[str, Score], hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
-        """The best, and the best of each family."""
-        ranked = sorted(hypotheses, key=lambda h: -scores[h.key].gain)
-        ranked = [h for h in ranked if scores[h.key].gain > 4.0]
-        chosen, seen, names = [], set(), {}
-        for hypothesis in ranked:
-            first = hypothesis.family not in seen
-            # Three places of one name tell where; more would crowd out other names.
-            if names.get(hypothesis.name, 0) >= 3:
-                continue
-            if first or len(chosen) < self.settings.shortlist:
-                chosen.append(hypothesis)
-                seen.add(hypothesis.family)
-                names[hypothesis.name] = names.get(hypothesis.name, 0) + 1
-        return chosen
 
     def fit(
         self,
@@ -269,29 +243,29 @@ class Discovery:
         base = self.fits[self.main]
         if not self.result.rungs:
             self.result.null = base
-        if self._looked and worst(self, base.vector) <= settings.quiet:
+        if self.looked and worst(self, base.vector) <= settings.quiet:
             return False
         taken = {rung.hypothesis.key for rung in self.result.rungs} | set(self.result.dropped)
         hypotheses = [h for h in problem.hypotheses if h.key not in taken]
         joints = self.localise()
         screen = self._screen = self.screen(hypotheses, base)
         scores = screen.scores(hypotheses)
-        if not self._looked:
-            self._looked = True
+        if not self.looked:
+            self.looked = True
             self.promise = {key: score.gain for key, score in scores.items()}
             names = dict.fromkeys(h.name for h in hypotheses)
             shown = {h.name for h in hypotheses if scores[h.key].testable}
             self.result.not_testable = [name for name in names if name not in shown]
             self.say(f"these logs cannot show: {', '.join(self.result.not_testable) or 'nothing is beyond them'}")
-            self._healthy_gain = self._healthy_gain or self.healthy_gain(screen, hypotheses)
+            self.least_gain = self.least_gain or self.healthy_gain(screen, hypotheses)
         index = {joint: number for number, joint in enumerate(self._push)}
         needing = {index[joint] for joint in joints}
         near = [h for h in hypotheses if not needing or not h.joints or needing & set(h.joints)]
         # What is larger than the smallest size of interest may show where that would not.
-        near = [h for h in near if scores[h.key].testable or scores[h.key].gain > self._healthy_gain]
+        near = [h for h in near if scores[h.key].testable or scores[h.key].gain > self.least_gain]
         # A fit finds more than its first step does, but not many times as much.
-        near = [h for h in near if scores[h.key].gain > settings.promising * self._healthy_gain]
-        short = self.shortlist(scores, near)
+        near = [h for h in near if scores[h.key].gain > settings.promising * self.least_gain]
+        short = shortlist(scores, near, settings.shortlist)
         self.say(f"fit {len(short)}")
         if not short:
             return False
@@ -316,88 +290,15 @@ class Discovery:
             if horizon != self.main:
                 starts = {h.key: [fits[h.key].coordinates[-len(h.directions) :]] for h in short}
                 like = [fits[h.key] for h in short]
-                found = self.fit(short, starts, horizon, _ROUNDS_MORE, absolute=True, like=like)
+                found = self.fit(short, starts, horizon, ROUNDS_MORE, absolute=True, like=like)
                 everywhere[horizon] = dict(zip([h.key for h in short], found, strict=True))
-        return self._decide(short, everywhere, base)
-
-    def _decide(self, short, everywhere, base) -> bool:
-        settings = self.settings
-        losses, gains, best_at = {}, {}, {h.key: 0 for h in short}
-        fitted, runs = everywhere[self.main], self._runs("train")
-        for horizon, fits in everywhere.items():
-            residual, run = self.residual(horizon, "select"), self.problem.data["select"][horizon].run
-            found = residual(np.stack([self.fits[horizon].vector, *(fits[h.key].vector for h in short)]))
-            shaped = [self.shaped(r, horizon) for r in found]
-            select = {h.key: decide.losses(r) for h, r in zip(short, shaped[1:], strict=True)}
-            for key in decide.alike(select, run, 1.0):
-                best_at[key] += 1
-            if horizon == self.main:
-                before = shaped[0]
-                after = {h.key: r for h, r in zip(short, shaped[1:], strict=True)}
-                gains = {key: decide.paired(before, r) for key, r in after.items()}
-                train = {key: decide.losses(self.shaped(fit.residual, horizon)) for key, fit in fitted.items()}
-                losses = {key: np.concatenate([train[key], select[key]]) for key in select}
-        both = np.concatenate([runs, self._runs("select")])
-        gained = {key: base.linear.loss - fit.linear.loss for key, fit in fitted.items()}
-        close = decide.alike(losses, both, 2.0)
-        close += [key for key in gained if key not in close and gained[key] > settings.same * max(gained.values())]
-        complexity = {h.key: len(h.directions) for h in short}
-        key = min(decide.alike(losses, both, 1.0), key=lambda key: (complexity[key], fitted[key].linear.loss))
-        chosen = decide.bagged({key: fit.linear for key, fit in fitted.items()}, runs)
-        fit = everywhere[self.main][key]
-        hypothesis = next(h for h in short if h.key == key)
-        errors = self.errors(fit)[-len(hypothesis.directions) :]
-        values = fit.coordinates[-len(errors) :]
-        low, high = hypothesis.bounds.T
-        # Of several directions one must be clear of zero; what has no meaning alone cannot be.
-        clear = np.where((hypothesis.probes != 0).any(axis=0), np.abs(values) / errors, 0.0).argmax()
-        value, error = values[clear], errors[clear]
-        drop = (before**2).mean(axis=(0, 1)) - (after[key] ** 2).mean(axis=(0, 1))
-        evidence = decide.Evidence(
-            gain=gained[key],
-            t=decide.t_statistic(gains[key], self._runs("select")),
-            floors=float(np.sqrt(max(drop.max(), 0.0))),
-            interval=(float(value - 1.96 * error), float(value + 1.96 * error)),
-            inside=bool(((low < values) & (values < high)).all()),
-            horizons=best_at[key],
-            # Its own name at some of its places is the same finding.
-            chosen=sum(
-                chosen[h.key]
-                for h in short
-                if h.key in close or (h.name == hypothesis.name and set(h.places) & set(hypothesis.places))
-            ),
-        )
-        thresholds = decide.Thresholds(
-            t=decide.max_t(gains, self._runs("select"), settings.level), gain=self._healthy_gain
-        )
-        tests = decide.passes(evidence, thresholds)
-        self.say(f"{key} {evidence} {thresholds} {tests} alike {close}")
-        if not all(tests.values()):
-            self.result.rejected = {"hypothesis": key, "tests": tests, "evidence": evidence}
-            return False
-        names = tuple(dict.fromkeys(k.partition("@")[0] for k in close if k.partition("@")[0] != hypothesis.name))
-        self.result.rungs.append(Rung(hypothesis, evidence, thresholds, names))
-        self.fits = {horizon: fits[key] for horizon, fits in everywhere.items()}
-        return True
+        return accept(self, short, everywhere)
 
     def errors(self, fit: Fit) -> np.ndarray:
         """Standard errors of a fit's coordinates."""
         features = self.gauges[self.main].floor.size  # of a segment
         jacobian_ = fit.jacobian.reshape(-1, features, fit.jacobian.shape[-1])
         return decide.sandwich(fit.residual.reshape(-1, features), jacobian_, fit.weight, fit.free.sd)
-
-    def drop(self) -> None:
-        """Takes out earlier effects that no longer pay beside the last one."""
-        for rung in self.result.rungs[:-1]:
-            without = {horizon: self.ablated(horizon, rung.hypothesis) for horizon in self.fits}
-            residual = self.residual(self.main, "select")
-            found = residual(np.stack([without[self.main].vector, self.fits[self.main].vector]))
-            gains = decide.paired(*(self.shaped(one, self.main) for one in found))
-            if decide.t_statistic(gains, self._runs("select")) < 1.0:
-                self.say(f"drop {rung.hypothesis.key}")
-                self.result.rungs.remove(rung)
-                self.result.dropped.append(rung.hypothesis.key)
-                self.fits = without
 
     def ablated(self, horizon: float, hypothesis: Hypothesis) -> Fit:
         """The fit without an accepted effect, everything else fitted again."""
@@ -429,10 +330,10 @@ class Discovery:
         """
         self.prepare()
         if state:
-            self.resume(state)
+            resume(self, state)
         while len(self.result.rungs) < self.settings.most and self.round():
-            self.drop()
-            save(self.state())
+            drop(self)
+            save(state_of(self))
         judge(self)
         named = {rung.hypothesis.name for rung in self.result.rungs}
         self.result.not_testable = [name for name in self.result.not_testable if name not in named]
@@ -447,7 +348,7 @@ class Discovery:
     def calibrate(self) -> None:
         """Finds what healthy logs gain and need, without asking anything of the measured ones."""
         self.localise()
-        self._healthy_gain = self.healthy_gain(
+        self.least_gain = self.healthy_gain(
             self.screen(self.problem.hypotheses, self.fits[self.main]), self.problem.hypotheses
         )
 
@@ -455,55 +356,7 @@ class Discovery:
     def calibration(self) -> Calibration:
         """What another log of the same robot and motion may be judged by."""
         floors = {horizon: (gauge_.floor, gauge_.weight) for horizon, gauge_ in self.gauges.items()}
-        return Calibration(floors, self._healthy_gain, self._penalty)
-
-    def state(self) -> dict:
-        """What a run that goes on needs to know."""
-        result = self.result
-
-        def own(fit: Fit, hypothesis: Hypothesis) -> list[float]:
-            return fit.coordinates[fit.along(hypothesis)].tolist()
-
-        return {
-            "rungs": [
-                {
-                    "key": rung.hypothesis.key,
-                    "evidence": asdict(rung.evidence),
-                    "thresholds": asdict(rung.thresholds),
-                    "alike": list(rung.alike),
-                    "coordinates": [own(self.fits[horizon], rung.hypothesis) for horizon in self.problem.horizons],
-                }
-                for rung in result.rungs
-            ],
-            "where": result.where,
-            "not_testable": result.not_testable,
-            "not_finite": result.not_finite,
-            "dropped": result.dropped,
-            "healthy_gain": self._healthy_gain,
-            "penalty": self._penalty,
-        }
-
-    def resume(self, state: Mapping[str, Any]) -> None:
-        """Stands where another run stood when it said this."""
-        by_key = {hypothesis.key: hypothesis for hypothesis in self.problem.hypotheses}
-        for saved in state["rungs"]:
-            hypothesis = by_key[saved["key"]]
-            for horizon, coordinates in zip(self.problem.horizons, saved["coordinates"], strict=True):
-                starts = {hypothesis.key: [np.array(coordinates)]}
-                self.fits[horizon] = self.fit([hypothesis], starts, horizon, _ROUNDS_MORE, absolute=True)[0]
-            evidence = {**saved["evidence"], "interval": tuple(saved["evidence"]["interval"])}
-            self.result.rungs.append(
-                Rung(
-                    hypothesis,
-                    decide.Evidence(**evidence),
-                    decide.Thresholds(**saved["thresholds"]),
-                    tuple(saved["alike"]),
-                )
-            )
-        self.result.where, self.result.not_testable = state["where"], state["not_testable"]
-        self.result.not_finite, self._healthy_gain = state["not_finite"], state["healthy_gain"]
-        self.result.dropped, self._penalty = state["dropped"], state["penalty"]
-        self._looked = True
+        return Calibration(floors, self.least_gain, self.penalty)
 
 
 def _starts(hypothesis: Hypothesis, found: np.ndarray) -> list[np.ndarray]:
