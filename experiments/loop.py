@@ -9,8 +9,9 @@ import jax
 import jax.numpy as jnp
 from brax.envs.base import State
 
-from envs import domain
-from envs.biteno import Biteno, BraxBiteno, constants
+from envs import biteno, domain
+from envs.biteno import BraxBiteno, constants
+from envs.corrected import Correction
 from envs.targets.mjx import MjxTarget, simulate
 from envs.targets.protocol import Act, Target
 from experiments.config import Preset
@@ -38,6 +39,7 @@ class Loop:
       preset: sizes.
       entries: what is tuned.
       hidden: what is not, but may be other than nominal where a policy trains.
+      correction: the model as discovery left it; the nominal one where None.
     """
 
     def __init__(
@@ -45,12 +47,14 @@ class Loop:
         preset: Preset,
         entries: Mapping[str, domain.Entry],
         hidden: Mapping[str, domain.Entry] = MappingProxyType({}),
+        correction: Correction | None = None,
     ):
         self.preset = preset
         self.entries = entries
         self._hidden = hidden
-        self.robot = Biteno(preset.task, {**entries, **hidden})
-        self._env = BraxBiteno(Biteno(replace(preset.task, push_mps=preset.push_mps), self.robot.entries))
+        self.robot = biteno.make(preset.task, {**entries, **hidden}, correction)
+        pushed = replace(preset.task, push_mps=preset.push_mps)
+        self._env = BraxBiteno(biteno.make(pushed, self.robot.entries, correction))
         self._ppo = PPO(preset.ppo, self.robot.observation_size, self.robot.action_size)
         # One program for all methods: what they differ in is an argument.
         self._train = jax.jit(lambda key, policy, dist: self.train(key, policy, dist, preset.epochs))

@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from envs import domain
+from envs.corrected import correction
 from experiments import checkpoint, plots
 from experiments.checkpoint import write_json
 from experiments.config import WALK, chosen, preset
@@ -21,7 +22,7 @@ console = Console()
 
 @dataclass(frozen=True, kw_only=True)
 class Args:
-    """Trains BITeno to walk in the nominal simulator."""
+    """Trains BITeno to walk, from scratch."""
 
     out: Path
     """Folder of the policy: orbax checkpoint, config.json, curve.json, curve.png."""
@@ -29,6 +30,8 @@ class Args:
     """Sizes: smoke, cpu or gpu."""
     parameters: str = "legs6"
     """Parameters that vary in training, within the preset's policy_radius: a set's name or names joined by commas."""
+    model: Path | None = None
+    """Folder of a corrected model that discovery wrote (`OUT/model`), to train in instead of the nominal one."""
     updates: int | None = None
     """PPO updates; the preset's scratch_updates where not given."""
     seed: int = 0
@@ -92,7 +95,7 @@ def main(args: Args) -> None:
     updates = sizes.scratch_updates if args.updates is None else args.updates
     if updates < 1:
         raise ValueError(f"updates: got {updates}, expected 1 or more")
-    loop = Loop(sizes, entries)
+    loop = Loop(sizes, entries, correction=args.model and correction(args.model))
     with bars() as progress:
         policy, curve = walk(jax.random.PRNGKey(args.seed), loop, updates, progress)
     checkpoint.save(args.out, policy.learner, policy_config(loop))

@@ -9,6 +9,7 @@ The sum of Table I can be negative, and then falling early pays. The remedy is a
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Literal
 
 import chex
@@ -20,10 +21,10 @@ from mujoco import mjx
 
 from envs import domain, sensing
 from envs.biteno import constants, gait, rewards
+from envs.chain import MIN_FRICTION_NM
 
 _ACTION_LIMIT = 10.0
 _MIN_HEIGHT_M = 0.35
-_MIN_FRICTION_NM = 1e-6
 _MAX_TILT_COS = np.cos(np.pi / 4)
 
 _BASES = ("stand", "raibert")
@@ -83,6 +84,7 @@ class State:
     steps: jax.Array  # policy steps since the reset
     terms: dict  # unweighted terms of Table I, and of the shaping that has a weight
     key: jax.Array
+    memory: dict = field(default_factory=dict)  # of motors and sensors that are not ideal
 
 
 @chex.dataclass(frozen=True)
@@ -104,6 +106,7 @@ class Motion:
     qacc_warmstart: jax.Array  # [12]; zeros where the engine keeps its own
     torque: jax.Array  # [6] Nm, of the last sub-step
     foot_force: jax.Array  # [2, 3] N, world frame, of the floor on each foot in the last sub-step
+    memory: dict = field(default_factory=dict)  # of motors and sensors that are not ideal
 
 
 class Biteno:
@@ -112,12 +115,18 @@ class Biteno:
     Args:
       config: the task.
       entries: the parameters that a step may be given; joint friction costs time even where it is zero.
+      path: of the model.
     """
 
     observation_size = 40
     action_size = 6
 
-    def __init__(self, config: TaskConfig, entries: Mapping[str, domain.Entry] = constants.ENTRIES):
+    def __init__(
+        self,
+        config: TaskConfig,
+        entries: Mapping[str, domain.Entry] = constants.ENTRIES,
+        path: Path = constants.MODEL_PATH,
+    ):
         if set(config.weights) != set(constants.TABLE_ONE):
             raise ValueError(f"weights: got {sorted(config.weights)}, expected {sorted(constants.TABLE_ONE)}")
         if not set(config.shaping) <= set(constants.SHAPING):
@@ -127,23 +136,29 @@ class Biteno:
                 raise ValueError(f"{name}: got '{getattr(config, name)}', expected one of {', '.join(allowed)}")
         self.config = config
         self.entries = entries
-        model = mujoco.MjModel.from_xml_path(str(constants.MODEL_PATH))
+        model = mujoco.MjModel.from_xml_path(str(path))
         model.opt.timestep, self.substeps, model.opt.iterations, model.opt.ls_iterations = _PHYSICS[config.physics]
         joints = [model.joint(name) for name in constants.JOINTS]
         self.joint_qpos = np.array([joint.qposadr[0] for joint in joints])
         self.joint_dof = np.array([joint.dofadr[0] for joint in joints])
         self._shanks = np.array([model.body(f"{side}_shank").id for side in constants.SIDES])
         self._home = jnp.array(model.keyframe("home").qpos, jnp.float32)
-        for entry in entries.values():
-            if "dof_frictionloss" in entry.fields:
-                # MJX solves for friction only in joints that had some when the model was put on the device. Its kinks
-                # take twice the iterations: at 2 Nm three are off by 2e-4 rad after 10 ms, six by nothing.
-                model.dof_frictionloss[entry.rows(model)] = _MIN_FRICTION_NM
-                model.opt.iterations *= 2
-                model.opt.ls_iterations *= 2
+        self._prepare(model)
         self.mj_model = model
         self._model = mjx.put_model(model)
         self._data = mjx.make_data(model)
+
+    def _prepare(self, model: mujoco.MjModel) -> None:
+        """What a model needs before it goes on the device."""
+        for entry in self.entries.values():
+            if "dof_frictionloss" in entry.fields:
+                # MJX solves for friction only in joints that had some when the model was put on the device.
+                rows = entry.rows(model)
+                model.dof_frictionloss[rows] = np.maximum(model.dof_frictionloss[rows], MIN_FRICTION_NM)
+        if (model.dof_frictionloss > 0).any():
+            # Its kinks take twice the iterations: at 2 Nm three are off by 2e-4 rad after 10 ms, six by nothing.
+            model.opt.iterations *= 2
+            model.opt.ls_iterations *= 2
 
     def model(self, params: domain.Params) -> mjx.Model:
         """The robot with these parameters."""
@@ -196,7 +211,7 @@ class Biteno:
         reference = gait.joint_reference(state.phase, state.command)
         base = reference if self.config.base == "raibert" else jnp.asarray(constants.STAND_RAD)
         target = base + self.config.action_scale * action
-        held = state.joint_error + state.qpos[self.joint_qpos]
+        held = state.joint_error + self.perceive(state)["joint"]
         delay = params.get("action_delay_s", 0.0) / self.mj_model.opt.timestep
         # A sub-step in which the target changes has the mean of both.
         arrived = jnp.clip(jnp.arange(1, self.substeps + 1) - delay, 0.0, 1.0)
@@ -213,9 +228,12 @@ class Biteno:
             qvel=data.qvel,
             qacc_warmstart=data.qacc_warmstart,
             torque=data.qfrc_actuator[self.joint_dof],
-            # Nothing but the floor touches a shank.
-            foot_force=mjx.rne_postconstraint(model, data)._impl.cfrc_ext[self._shanks, 3:],
+            foot_force=self._foot_force(model, data),
         )
+
+    def _foot_force(self, model: mjx.Model, data: mjx.Data) -> jax.Array:
+        # Nothing but the floor touches a shank.
+        return mjx.rne_postconstraint(model, data)._impl.cfrc_ext[self._shanks, 3:]
 
     def settle(self, state: State, drive: Drive, motion: Motion) -> State:
         """What the robot perceives, earns and is asked for after it moved."""
@@ -228,7 +246,8 @@ class Biteno:
         )
         key, key_command, key_noise, key_push = jax.random.split(state.key, 4)
         steps = state.steps + 1
-        moved = state.replace(qpos=qpos, qvel=self._push(key_push, qvel, steps))
+        memory = jax.tree.map(lambda new, old: jnp.where(finite, new, old), motion.memory, state.memory)
+        moved = state.replace(qpos=qpos, qvel=self._push(key_push, qvel, steps), memory=memory)
         readings = self._readings(moved)
         values = rewards.terms(
             **readings,
@@ -253,7 +272,7 @@ class Biteno:
             command=jnp.where(redraw, self._draw_command(key_command), state.command),
             phase=phase,
             action=action,
-            joint_error=target - readings["joint"],
+            joint_error=target - self.perceive(moved)["joint"],
             reward=trained - self.config.termination_cost * done,
             score=rewards.weigh(values, constants.TABLE_ONE),
             done=done,
@@ -274,8 +293,12 @@ class Biteno:
             "joint_velocity": state.qvel[self.joint_dof],
         }
 
+    def perceive(self, state: State) -> dict[str, jax.Array]:
+        """What the sensors say, by signal; here they are ideal."""
+        return self._readings(state)
+
     def _observe(self, state: State, key: jax.Array) -> jax.Array:
-        readings = self._readings(state)
+        readings = self.perceive(state)
         if self.config.noise > 0.0:
             readings = sensing.disturb(key, readings, self.config.noise)
         return sensing.observe(

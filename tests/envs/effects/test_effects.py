@@ -8,9 +8,10 @@ import pytest
 import rigs
 
 from envs import effects, models, sensing
+from envs.chain import Now, Wrench
 from envs.effects import LIBRARY, RESIDUAL
 from envs.effects.memory import LONGEST_S, delay_line, delayed
-from envs.rig import Now, Rig, Wrench
+from envs.rig import Rig
 
 DT = 0.001
 ROWS = (*LIBRARY.values(), RESIDUAL)

@@ -1,0 +1,108 @@
+"""BITeno as discovery left it: effects of the library between its targets, its joints and its readings."""
+
+from collections.abc import Mapping
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from mujoco import mjx
+
+from envs import domain
+from envs.biteno import constants
+from envs.biteno.env import Biteno, Drive, Motion, State, TaskConfig
+from envs.chain import MIN_FRICTION_NM, Chain
+from envs.corrected import Correction
+
+
+class CorrectedBiteno(Biteno):
+    """One robot with the effects of a corrected model.
+
+    Torques come from the effects' own controller, at every sub-step, in the stead of MuJoCo's actuators, whose gains
+    and limits it takes.
+
+    Args:
+      config: the task.
+      entries: the parameters that a step may be given, relative to the corrected model.
+      correction: model and effects.
+    """
+
+    def __init__(self, config: TaskConfig, entries: Mapping[str, domain.Entry], correction: Correction):
+        self._rows = correction.rows
+        super().__init__(config, entries, correction.path)
+        model = self.mj_model
+        bodies = [i for i in range(1, model.nbody) if model.body_mass[i] > 0]
+        places = {
+            "joint": constants.JOINTS,
+            "body": tuple(model.body(i).name for i in bodies),
+            "foot": constants.FEET,
+            "robot": ("robot",),
+        }
+        self._values = correction.values(places)
+        step = float(model.opt.timestep)
+        self._chain = Chain(step, self._rows, self.joint_qpos, self.joint_dof, np.array(bodies))
+
+    def _prepare(self, model: mujoco.MjModel) -> None:
+        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION
+        if any(row.enters == "friction" for row in self._rows):
+            dof = self.joint_dof
+            model.dof_frictionloss[dof] = np.maximum(model.dof_frictionloss[dof], MIN_FRICTION_NM)
+        super()._prepare(model)
+
+    def reset(self, params: domain.Params, key: jax.Array) -> State:
+        """Starts an episode of a robot that has been standing."""
+        state = super().reset(params, key)
+        joint = state.qpos[self.joint_qpos]
+        still = jnp.stack([joint, jnp.zeros_like(joint)])
+        state = state.replace(memory=self._chain.start(self._values, still, self._asked(self._model, joint)))
+        return state.replace(obs=self._observe(state, key))
+
+    def simulate(self, params: domain.Params, state: State, drive: Drive) -> Motion:
+        """Physics in MJX, through the effects."""
+        model = self.model(params)
+        data = self._data.replace(
+            qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.qacc_warmstart, qacc=state.qacc_warmstart
+        )
+
+        def step(carry, target):
+            data, memory, read = self._chain.step(model, *carry, self._values, self._asked(model, target))
+            return (data, memory), read["tau"]
+
+        (data, memory), torque = jax.lax.scan(step, (data, state.memory), drive.targets)
+        return Motion(
+            qpos=data.qpos,
+            qvel=data.qvel,
+            qacc_warmstart=data.qacc_warmstart,
+            torque=torque[-1],
+            foot_force=self._foot_force(model, data),
+            memory=memory,
+        )
+
+    def perceive(self, state: State) -> dict[str, jax.Array]:
+        """What the sensors say, by signal."""
+        readings = super().perceive(state)
+        if not state.memory:
+            return readings
+        joint = jnp.stack([readings["joint"], readings["joint_velocity"]])
+        read = self._chain.read(self._values, state.memory, joint, self._asked(self._model, readings["joint"]))
+        gravity, _ = self._chain.stage("gravity", self._values, readings["gravity"], None, {})
+        return readings | {"joint": read[0], "joint_velocity": read[1], "gravity": gravity}
+
+    @staticmethod
+    def _asked(model: mjx.Model, target: jax.Array) -> dict[str, jax.Array]:
+        """What MuJoCo's actuators would be asked."""
+        none = jnp.zeros_like(target)
+        return {
+            "target": target,
+            "feed": none,
+            "stiffness": model.actuator_gainprm[:, 0],
+            "damping": -model.actuator_biasprm[:, 2],
+            "limit": model.actuator_forcerange[:, 1],
+            "emf": none,
+            "sample": jnp.ones((), bool),
+        }
+
+
+def make(config: TaskConfig, entries: Mapping[str, domain.Entry], correction: Correction | None = None) -> Biteno:
+    """The nominal robot, or the one that a correction describes."""
+    return Biteno(config, entries) if correction is None else CorrectedBiteno(config, entries, correction)
