@@ -107,10 +107,10 @@ class Residuals:
     length is an argument. So it compiles once for every length of segments, whatever their number and the vectors'.
     """
 
-    _CHUNKS = 16
+    _CHUNKS = 32
     """Chunks that are handed over at once."""
 
-    def __init__(self, problem: Problem, width: int = 128):
+    def __init__(self, problem: Problem, width: int = 64):
         self._problem, self._width = problem, width
 
     def __call__(self, vectors: np.ndarray, segments: Segments) -> np.ndarray:

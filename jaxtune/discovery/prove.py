@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jaxtune.discovery.fit import Fit, polish
+from jaxtune.discovery.fit import Fit
 
 
 def judge(discovery) -> None:
@@ -101,8 +101,8 @@ def _placebos(discovery) -> dict[str, np.ndarray]:
     for label, options in kinds.items():
         if options:
             best = max(options, key=lambda h: discovery.promise.get(h.key, 0.0))
-            fit = discovery.fit([best], {best.key: list(best.probes)}, discovery.main, discovery.settings.rounds)
-            (fit,) = polish(fit, discovery.residual(discovery.main, "train"), discovery.settings.rounds)
+            rounds = 2 * discovery.settings.rounds  # as many as an accepted one had
+            (fit,) = discovery.fit([best], {best.key: list(best.probes)}, discovery.main, rounds)
             found[f"{label}: {best.key}"] = fit.vector
     discovery.fits = kept
     return found
