@@ -1,8 +1,7 @@
 """A model as discovery leaves it: an MJCF where MuJoCo has the form, and a JSON of effects for the rest."""
 
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
 
 import jax
@@ -10,11 +9,9 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from envs.correction import EFFECTS, MODEL
 from envs.effects import LIBRARY, RESIDUAL
 from envs.rig import Rig
-from jaxtune.types import Effect, Parameter
-
-_MODEL, _EFFECTS = "model.xml", "effects.json"
 
 
 def save(folder: Path, spec: mujoco.MjSpec, rig: Rig, vector: np.ndarray) -> None:
@@ -36,7 +33,7 @@ def save(folder: Path, spec: mujoco.MjSpec, rig: Rig, vector: np.ndarray) -> Non
         joint.damping = [float(device.dof_damping[dof]), *np.ravel(joint.damping)[1:]]
         joint.frictionloss = max(float(model.dof_frictionloss[dof] + values["coulomb"]["torque_nm"][number]), 0.0)
     spec.compile()
-    (folder / _MODEL).write_text(spec.to_xml())
+    (folder / MODEL).write_text(spec.to_xml())
     in_model = {name for name, row in rig.effects.items() if row.enters == "model"} | {"coulomb"}
     # A parameter that is a shape means something at zero, where its effect is there.
     there = {(axis.effect, axis.place) for axis, coordinate in zip(rig.axes, vector, strict=True) if coordinate}
@@ -49,67 +46,7 @@ def save(folder: Path, spec: mujoco.MjSpec, rig: Rig, vector: np.ndarray) -> Non
             value = parameter.value(float(coordinate), float(rig.scale(row, parameter)[axis.index]))
             effects.setdefault(axis.effect, {}).setdefault(axis.place, {})[axis.parameter] = float(value)
     said = {"joints": list(rig.joints), "control_hz": rig.control_hz, "effects": effects}
-    (folder / _EFFECTS).write_text(json.dumps(said, indent=1) + "\n")
-
-
-@dataclass(frozen=True)
-class Correction:
-    """A corrected model, for whatever moves it."""
-
-    path: Path
-    """Of the MJCF."""
-    effects: Mapping[str, Mapping[str, Mapping[str, float]]]
-    """Physical values by effect, place and parameter, of what MuJoCo has no form for."""
-
-    @property
-    def rows(self) -> tuple[Effect, ...]:
-        """Its effects, in the library's order: the order in which they act."""
-        return tuple(row for row in (*LIBRARY.values(), RESIDUAL) if row.name in self.effects)
-
-    def values(self, places: Mapping[str, Sequence[str]]) -> dict[str, dict[str, np.ndarray]]:
-        """What the physics reads of every effect, by effect and parameter, [places].
-
-        Args:
-          places: names by what an effect may be on.
-
-        Raises:
-          ValueError: a place is not there.
-        """
-        found = {}
-        for row in self.rows:
-            there = self.effects[row.name]
-            for place in there:
-                if place not in places[row.on]:
-                    raise ValueError(
-                        f"effects: '{row.name}' is on '{place}', expected one of {', '.join(places[row.on])}"
-                    )
-            found[row.name] = {
-                parameter.name: np.array(
-                    [_inner(parameter, there.get(place, {}).get(parameter.name)) for place in places[row.on]],
-                    np.float32,
-                )
-                for parameter in row.parameters
-            }
-        return found
-
-
-def _inner(parameter: Parameter, value: float | None) -> float:
-    """What the physics reads of a value; of none, what leaves the robot as it is."""
-    return float(parameter.inner(0.0 if value is None else parameter.coordinate(value, 1.0), 1.0))
-
-
-def correction(folder: Path) -> Correction:
-    """Reads what `save` wrote.
-
-    Raises:
-      ValueError: an effect is not in the library.
-    """
-    effects = json.loads((folder / _EFFECTS).read_text())["effects"]
-    known = {**LIBRARY, RESIDUAL.name: RESIDUAL}
-    for name in effects:
-        if name not in known:
-            raise ValueError(f"{folder / _EFFECTS}: there is no effect '{name}'")
-    return Correction(folder / _MODEL, effects)
+    (folder / EFFECTS).write_text(json.dumps(said, indent=1) + "\n")
 
 
 def load(folder: Path) -> tuple[Rig, np.ndarray]:
@@ -118,8 +55,8 @@ def load(folder: Path) -> tuple[Rig, np.ndarray]:
     Raises:
       ValueError: an effect or a place is none of the rig's.
     """
-    said = json.loads((folder / _EFFECTS).read_text())
-    rig = Rig(mujoco.MjSpec.from_file(str(folder / _MODEL)), said["joints"], said["control_hz"])
+    said = json.loads((folder / EFFECTS).read_text())
+    rig = Rig(mujoco.MjSpec.from_file(str(folder / MODEL)), said["joints"], said["control_hz"])
     return rig, coordinates(rig, said["effects"])
 
 

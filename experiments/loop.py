@@ -11,7 +11,7 @@ from brax.envs.base import State
 
 from envs import biteno, domain
 from envs.biteno import BraxBiteno, constants
-from envs.corrected import Correction
+from envs.correction import Correction
 from envs.targets.mjx import MjxTarget, simulate
 from envs.targets.protocol import Act, Target
 from experiments.config import Preset

@@ -10,8 +10,7 @@ import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from envs import domain
-from envs.corrected import correction
+from envs import correction, domain
 from experiments import checkpoint, plots
 from experiments.checkpoint import write_json
 from experiments.config import WALK, chosen, preset
@@ -95,7 +94,7 @@ def main(args: Args) -> None:
     updates = sizes.scratch_updates if args.updates is None else args.updates
     if updates < 1:
         raise ValueError(f"updates: got {updates}, expected 1 or more")
-    loop = Loop(sizes, entries, correction=args.model and correction(args.model))
+    loop = Loop(sizes, entries, correction=args.model and correction.read(args.model))
     with bars() as progress:
         policy, curve = walk(jax.random.PRNGKey(args.seed), loop, updates, progress)
     checkpoint.save(args.out, policy.learner, policy_config(loop))

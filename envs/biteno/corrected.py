@@ -12,7 +12,7 @@ from envs import domain
 from envs.biteno import constants
 from envs.biteno.env import Biteno, Drive, Motion, State, TaskConfig
 from envs.chain import MIN_FRICTION_NM, Chain
-from envs.corrected import Correction
+from envs.correction import Correction
 
 
 class CorrectedBiteno(Biteno):

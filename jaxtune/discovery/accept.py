@@ -58,15 +58,13 @@ def accept(discovery, short: Sequence[Hypothesis], everywhere: Mapping[float, Ma
     errors = discovery.errors(fit)[-len(hypothesis.directions) :]
     values = fit.coordinates[-len(errors) :]
     low, high = hypothesis.bounds.T
-    # Of several directions one must be clear of zero; what has no meaning alone cannot be.
-    clear = np.where((hypothesis.probes != 0).any(axis=0), np.abs(values) / errors, 0.0).argmax()
-    value, error = values[clear], errors[clear]
+    parts = hypothesis.parts or (hypothesis,)
     drop = (before**2).mean(axis=(0, 1)) - (after[key] ** 2).mean(axis=(0, 1))
     evidence = decide.Evidence(
         gain=gained[key],
         t=decide.t_statistic(gains[key], discovery.runs("select")),
         floors=float(np.sqrt(max(drop.max(), 0.0))),
-        interval=(float(value - 1.96 * error), float(value + 1.96 * error)),
+        interval=_interval(parts, values, errors),
         inside=bool(((low < values) & (values < high)).all()),
         horizons=best_at[key],
         # Its own name at some of its places is the same finding.
@@ -77,17 +75,34 @@ def accept(discovery, short: Sequence[Hypothesis], everywhere: Mapping[float, Ma
         ),
     )
     thresholds = decide.Thresholds(
-        t=decide.max_t(gains, discovery.runs("select"), settings.level), gain=discovery.least_gain
+        t=decide.max_t(gains, discovery.runs("select"), settings.level),
+        gain=len(parts) * discovery.least_gain,
     )
     tests = decide.passes(evidence, thresholds)
     discovery.say(f"{key} {evidence} {thresholds} {tests} alike {close}")
     if not all(tests.values()):
         result.rejected = {"hypothesis": key, "tests": tests, "evidence": evidence}
         return False
-    names = tuple(dict.fromkeys(k.partition("@")[0] for k in close if k.partition("@")[0] != hypothesis.name))
-    result.rungs.append(Rung(hypothesis, evidence, thresholds, names))
+    others = [part.name for h in short if h.key in close for part in h.parts or (h,)]
+    for part in parts:
+        alike = tuple(dict.fromkeys(name for name in others if name not in {one.name for one in parts}))
+        result.rungs.append(Rung(part, evidence, thresholds, alike))
     discovery.fits = {horizon: fits[key] for horizon, fits in everywhere.items()}
     return True
+
+
+def _interval(parts: Sequence[Hypothesis], values: np.ndarray, errors: np.ndarray) -> tuple[float, float]:
+    """95 % interval of the coordinate that tells whether all parts are there.
+
+    Of several directions of one part one must be clear of zero; what has no meaning alone cannot be.
+    """
+    clear, start = [], 0
+    for part in parts:
+        mine = slice(start, start := start + len(part.directions))
+        distance = np.where((part.probes != 0).any(axis=0), np.abs(values[mine]) / errors[mine], 0.0)
+        clear.append((distance.max(), mine.start + int(distance.argmax())))
+    _, index = min(clear)
+    return float(values[index] - 1.96 * errors[index]), float(values[index] + 1.96 * errors[index])
 
 
 def drop(discovery) -> None:

@@ -37,11 +37,34 @@ class Hypothesis:
     """[parameters] standard deviation of the coordinates, before anything was measured."""
     joints: tuple[int, ...]
     """Components of the signals beside which it sits; empty where it may show in any."""
+    parts: tuple["Hypothesis", ...] = ()
+    """What it is made of, where it is two at once."""
 
     @property
     def key(self) -> str:
         """Name and places as one word."""
         return f"{self.name}@{'+'.join(self.places)}"
+
+
+def apart(one: Hypothesis, two: Hypothesis) -> bool:
+    """Whether two hypotheses are two: of other names, or at other places."""
+    return one.name != two.name or not set(one.places) & set(two.places)
+
+
+def together(one: Hypothesis, two: Hypothesis) -> Hypothesis:
+    """Two at once."""
+    parts, zero = (one, two), np.zeros((len(one.probes), len(two.directions)))
+    return Hypothesis(
+        name=f"{one.name} and {two.name}",
+        family=f"{one.family} and {two.family}",
+        places=(*one.places, *two.places),
+        directions=np.concatenate([part.directions for part in parts]),
+        probes=np.block([[one.probes, zero], [np.zeros((len(two.probes), len(one.directions))), two.probes]]),
+        bounds=np.concatenate([part.bounds for part in parts]),
+        prior=np.concatenate([part.prior for part in parts]),
+        joints=tuple(sorted({*one.joints, *two.joints})),
+        parts=parts,
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

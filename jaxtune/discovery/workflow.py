@@ -1,12 +1,13 @@
 """The driver: floor, null, localise, screen, fit, decide, accept and look again, abstain, prove.
 
-    floor -> null -> [ localise -> screen -> fit -> decide -> accept ] up to four times -> prove
+    floor -> null -> [ localise -> screen -> fit (alone, then in pairs) -> decide -> accept ] up to four times -> prove
 
 A round ends the ladder where nothing passes. Sealed segments are simulated by `prove` alone, once.
 """
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from jaxtune.discovery import decide, localise
 from jaxtune.discovery.accept import Rung, accept, drop
 from jaxtune.discovery.fit import ROUNDS_MORE, Fit, Free, begin, polish, refine
 from jaxtune.discovery.measure import Gauge, gauge, jacobian, nominal_directions, refitted
-from jaxtune.discovery.problem import Hypothesis, Problem, Residuals
+from jaxtune.discovery.problem import Hypothesis, Problem, Residuals, apart, together
 from jaxtune.discovery.prove import judge, prove, worst
 from jaxtune.discovery.saved import resume
 from jaxtune.discovery.saved import state as state_of
@@ -32,6 +33,8 @@ class Settings:
     """Of those, how many are fitted at every horizon."""
     polished: int = 2
     """Of those, how many are fitted with fresh slopes before they are compared."""
+    paired: int = 4
+    """How many of the best are tried two by two where none pays alone."""
     most: int = 4
     """Effects that are accepted at most."""
     level: float = 0.05
@@ -270,29 +273,49 @@ class Discovery:
         if not short:
             return False
         tried = {h.key: _starts(h, scores[h.key].coordinates) for h in short}
-        fits = dict(zip([h.key for h in short], self.fit(short, tried, self.main, settings.rounds), strict=True))
-        self.result.not_finite += [key for key, fit in fits.items() if not fit.finite]
-        short = [h for h in short if fits[h.key].finite]
-        short.sort(key=lambda h: fits[h.key].linear.loss)
-        short = short[: settings.finalists]
-        if not short:
-            return False
+        short, everywhere = self._compete(short, tried)
+        return bool(short) and (accept(self, short, everywhere) or self._pair(short, everywhere[self.main]))
+
+    def _compete(self, hypotheses: Sequence[Hypothesis], tried: Mapping[str, Sequence[np.ndarray]]):
+        """Fits hypotheses; the finalists, best first, and their fits by horizon and hypothesis."""
+        settings, evaluate = self.settings, self.residual(self.main, "train")
+        fits = self.fit(hypotheses, tried, self.main, settings.rounds)
+        found = {h.key: fit for h, fit in zip(hypotheses, fits, strict=True) if fit.finite}
+        self.result.not_finite += [h.key for h in hypotheses if h.key not in found]
+        order = sorted((h for h in hypotheses if h.key in found), key=lambda h: found[h.key].linear.loss)
+        short = order[: settings.finalists]
         best = [h.key for h in short[: settings.polished]]
-        evaluate = self.residual(self.main, "train")
         # The model without them too, so that what they gain is theirs.
-        base, *polished = polish([base, *(fits[key] for key in best)], evaluate, settings.rounds)
+        base, *polished = polish(
+            [self.fits[self.main], *(found[key] for key in best)], evaluate, settings.rounds if best else 0
+        )
         self.fits[self.main] = base
         if not self.result.rungs:
             self.result.null = base
-        fits |= dict(zip(best, polished, strict=True))
-        everywhere = {self.main: {h.key: fits[h.key] for h in short}}
-        for horizon in problem.horizons:
+        found |= dict(zip(best, polished, strict=True))
+        everywhere = {self.main: {h.key: found[h.key] for h in short}}
+        starts, like = {h.key: [own(found[h.key], h)] for h in short}, [found[h.key] for h in short]
+        for horizon in self.problem.horizons if short else ():
             if horizon != self.main:
-                starts = {h.key: [fits[h.key].coordinates[-len(h.directions) :]] for h in short}
-                like = [fits[h.key] for h in short]
-                found = self.fit(short, starts, horizon, ROUNDS_MORE, absolute=True, like=like)
-                everywhere[horizon] = dict(zip([h.key for h in short], found, strict=True))
-        return accept(self, short, everywhere)
+                there = self.fit(short, starts, horizon, ROUNDS_MORE, absolute=True, like=like)
+                everywhere[horizon] = dict(zip([h.key for h in short], there, strict=True))
+        return short, everywhere
+
+    def _pair(self, short: Sequence[Hypothesis], fits: Mapping[str, Fit]) -> bool:
+        """Tries the best two by two where something is missing and none pays alone; whether two were accepted."""
+        if self.result.rungs or worst(self, self.fits[self.main].vector) <= self.settings.at_floor:
+            return False
+        couples = [(one, two) for one, two in combinations(short[: self.settings.paired], 2) if apart(one, two)]
+        self.say(f"fit {len(couples)} pairs")
+        pairs = [together(one, two) for one, two in couples]
+        tried = {
+            pair.key: [np.concatenate([own(fits[one.key], one), own(fits[two.key], two)])]
+            for pair, (one, two) in zip(pairs, couples, strict=True)
+        }
+        if not pairs:
+            return False
+        pairs, everywhere = self._compete(pairs, tried)
+        return bool(pairs) and accept(self, pairs, everywhere)
 
     def errors(self, fit: Fit) -> np.ndarray:
         """Standard errors of a fit's coordinates."""
@@ -363,3 +386,8 @@ def _starts(hypothesis: Hypothesis, found: np.ndarray) -> list[np.ndarray]:
     """Points to try: what the screen found, less and more of it; the sizes that were looked at, where these matter."""
     others = list(hypothesis.probes) if len(hypothesis.probes) > 1 and hypothesis.bounds[0, 0] >= 0 else []
     return [found, 0.4 * found, 2.5 * found, *others]
+
+
+def own(fit: Fit, hypothesis: Hypothesis) -> np.ndarray:
+    """Coordinates [parameters] of the hypothesis that a fit was begun for."""
+    return fit.coordinates[-len(hypothesis.directions) :]

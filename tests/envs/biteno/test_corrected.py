@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from envs import corrected, models
+from envs import corrected, correction, models
 from envs.biteno import Biteno, BraxBiteno, CorrectedBiteno, TaskConfig, constants
-from envs.corrected import Correction
+from envs.correction import Correction
 from envs.domain import select
 
 ENTRIES = select(constants.ENTRIES, ("torque_scale",))
@@ -95,9 +95,9 @@ def test_what_discovery_wrote_is_read(tmp_path):
     rig = Rig(models.spec("biteno"), constants.JOINTS, 1000.0)
     effects = {"command_delay": {"right_hip": {"seconds": 0.004}}, "coulomb": {"left_knee": {"torque_nm": 0.7}}}
     corrected.save(tmp_path, models.spec("biteno"), rig, corrected.coordinates(rig, effects))
-    correction = corrected.correction(tmp_path)
-    assert set(correction.effects) == {"command_delay"}
-    biteno = CorrectedBiteno(TaskConfig(), ENTRIES, correction)
+    read = correction.read(tmp_path)
+    assert set(read.effects) == {"command_delay"}
+    biteno = CorrectedBiteno(TaskConfig(), ENTRIES, read)
     knee = biteno.joint_dof[constants.JOINTS.index("left_knee")]
     np.testing.assert_allclose(biteno.mj_model.dof_frictionloss[knee], 0.7, rtol=1e-6)
     _, states = walk(biteno, steps=2)
@@ -107,6 +107,6 @@ def test_what_discovery_wrote_is_read(tmp_path):
 def test_an_unknown_effect_or_place_is_refused_by_name(tmp_path):
     (tmp_path / "effects.json").write_text(json.dumps({"effects": {"gremlins": {}}}))
     with pytest.raises(ValueError, match="gremlins"):
-        corrected.correction(tmp_path)
+        correction.read(tmp_path)
     with pytest.raises(ValueError, match="third_knee"):
         robot(encoder_bias={"third_knee": {"rad": 0.1}})
