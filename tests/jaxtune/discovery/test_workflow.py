@@ -150,6 +150,21 @@ def test_what_no_hypothesis_explains_is_unnamed():
     assert result.where[0]["excess_floor_units"] > 1.0
 
 
+def test_two_that_do_not_pay_alone_are_tried_together(monkeypatch):
+    accept = workflow.accept
+    monkeypatch.setattr(workflow, "accept", lambda it, short, fits: bool(short[0].parts) and accept(it, short, fits))
+    result = discover({"coulomb": 0.5, "push": 0.6})
+    assert {rung.hypothesis.name for rung in result.rungs} == {"coulomb", "push"}
+    assert result.verdict == "named"
+    vector = result.fit.vector
+    assert vector[AXES.index("coulomb")] == pytest.approx(0.5, abs=0.05)
+    assert vector[AXES.index("push")] == pytest.approx(0.6, abs=0.05)
+    assert result.gap["after"] < 1.3 < result.gap["null"]
+    # Where nothing is missing none are tried.
+    monkeypatch.setattr(workflow, "together", None)
+    assert discover({}).verdict == "no_missing_effect"
+
+
 def test_what_does_not_move_the_signals_is_not_testable():
     result = discover({"coulomb": 0.5})
     assert result.not_testable == ["nothing"]
