@@ -30,65 +30,79 @@ def accept(discovery, short: Sequence[Hypothesis], everywhere: Mapping[float, Ma
       everywhere: their fits by horizon and hypothesis.
     """
     settings, result = discovery.settings, discovery.result
+    fitted, runs = everywhere[discovery.main], {split: discovery.runs(split) for split in ("train", "select")}
+    residuals = {horizon: _on_select(discovery, horizon, short, fits) for horizon, fits in everywhere.items()}
+    before, after = residuals[discovery.main]
+    train = {key: decide.losses(discovery.shaped(fit.residual, discovery.main)) for key, fit in fitted.items()}
+    lost = {key: np.concatenate([train[key], decide.losses(residual)]) for key, residual in after.items()}
+    both = np.concatenate([runs["train"], runs["select"]])
     base = discovery.fits[discovery.main]
-    losses, gains, best_at = {}, {}, {h.key: 0 for h in short}
-    fitted, runs = everywhere[discovery.main], discovery.runs("train")
-    for horizon, fits in everywhere.items():
-        residual, run = discovery.residual(horizon, "select"), discovery.problem.data["select"][horizon].run
-        found = residual(np.stack([discovery.fits[horizon].vector, *(fits[h.key].vector for h in short)]))
-        shaped = [discovery.shaped(r, horizon) for r in found]
-        select = {h.key: decide.losses(r) for h, r in zip(short, shaped[1:], strict=True)}
-        for key in decide.alike(select, run, 1.0):
-            best_at[key] += 1
-        if horizon == discovery.main:
-            before = shaped[0]
-            after = {h.key: r for h, r in zip(short, shaped[1:], strict=True)}
-            gains = {key: decide.paired(before, r) for key, r in after.items()}
-            train = {key: decide.losses(discovery.shaped(fit.residual, horizon)) for key, fit in fitted.items()}
-            losses = {key: np.concatenate([train[key], select[key]]) for key in select}
-    both = np.concatenate([runs, discovery.runs("select")])
-    gained = {key: base.linear.loss - fit.linear.loss for key, fit in fitted.items()}
-    close = decide.alike(losses, both, 2.0)
+    linear = {key: fit.linear for key, fit in fitted.items()}
+    gained = {key: base.linear.loss - one.loss for key, one in linear.items()}
+    close = decide.alike(lost, both, 2.0)
     close += [key for key in gained if key not in close and gained[key] > settings.same * max(gained.values())]
-    complexity = {h.key: len(h.directions) for h in short}
-    key = min(decide.alike(losses, both, 1.0), key=lambda key: (complexity[key], fitted[key].linear.loss))
-    chosen = decide.bagged({key: fit.linear for key, fit in fitted.items()}, runs)
-    fit = everywhere[discovery.main][key]
-    hypothesis = next(h for h in short if h.key == key)
-    errors = discovery.errors(fit)[-len(hypothesis.directions) :]
-    values = fit.coordinates[-len(errors) :]
-    low, high = hypothesis.bounds.T
+    best = {h.key: h for h in short if h.key in decide.alike(lost, both, 1.0)}
+    hypothesis = min(best.values(), key=lambda h: (len(h.directions), linear[h.key].loss))
     parts = hypothesis.parts or (hypothesis,)
-    drop = (before**2).mean(axis=(0, 1)) - (after[key] ** 2).mean(axis=(0, 1))
+    gains = {key: decide.paired(before, residual) for key, residual in after.items()}
     evidence = decide.Evidence(
-        gain=gained[key],
-        t=decide.t_statistic(gains[key], discovery.runs("select")),
-        floors=float(np.sqrt(max(drop.max(), 0.0))),
-        interval=_interval(parts, values, errors),
-        inside=bool(((low < values) & (values < high)).all()),
-        horizons=best_at[key],
-        # Its own name at some of its places is the same finding.
-        chosen=sum(
-            chosen[h.key]
-            for h in short
-            if h.key in close or (h.name == hypothesis.name and set(h.places) & set(hypothesis.places))
-        ),
+        gain=gained[hypothesis.key],
+        t=decide.t_statistic(gains[hypothesis.key], runs["select"]),
+        floors=_floors(before, after[hypothesis.key]),
+        **_estimate(discovery, fitted[hypothesis.key], hypothesis, parts),
+        horizons=sum(_wins(discovery, horizon, hypothesis.key, found) for horizon, (_, found) in residuals.items()),
+        chosen=_chosen(decide.bagged(linear, runs["train"]), short, close, hypothesis),
     )
-    thresholds = decide.Thresholds(
-        t=decide.max_t(gains, discovery.runs("select"), settings.level),
-        gain=len(parts) * discovery.least_gain,
+    least = decide.Thresholds(
+        t=decide.max_t(gains, runs["select"], settings.level), gain=len(parts) * discovery.least_gain
     )
-    tests = decide.passes(evidence, thresholds)
-    discovery.say(f"{key} {evidence} {thresholds} {tests} alike {close}")
+    tests = decide.passes(evidence, least)
+    discovery.say(f"{hypothesis.key} {evidence} {least} {tests} alike {close}")
     if not all(tests.values()):
-        result.rejected = {"hypothesis": key, "tests": tests, "evidence": evidence}
+        result.rejected = {"hypothesis": hypothesis.key, "tests": tests, "evidence": evidence}
         return False
+    mine = {part.name for part in parts}
     others = [part.name for h in short if h.key in close for part in h.parts or (h,)]
-    for part in parts:
-        alike = tuple(dict.fromkeys(name for name in others if name not in {one.name for one in parts}))
-        result.rungs.append(Rung(part, evidence, thresholds, alike))
-    discovery.fits = {horizon: fits[key] for horizon, fits in everywhere.items()}
+    alike = tuple(dict.fromkeys(name for name in others if name not in mine))
+    result.rungs += [Rung(part, evidence, least, alike) for part in parts]
+    discovery.fits = {horizon: fits[hypothesis.key] for horizon, fits in everywhere.items()}
     return True
+
+
+def _on_select(discovery, horizon: float, short: Sequence[Hypothesis], fits: Mapping[str, Fit]):
+    """Residuals [segments, bins, components] on `select` of the model as it stands, and of every hypothesis by key."""
+    vectors = [discovery.fits[horizon].vector, *(fits[h.key].vector for h in short)]
+    before, *after = (discovery.shaped(r, horizon) for r in discovery.residual(horizon, "select")(np.stack(vectors)))
+    return before, {h.key: residual for h, residual in zip(short, after, strict=True)}
+
+
+def _wins(discovery, horizon: float, key: str, found: Mapping[str, np.ndarray]) -> bool:
+    """Whether a hypothesis is best at a horizon, or within a standard error of it."""
+    lost = {other: decide.losses(residual) for other, residual in found.items()}
+    return key in decide.alike(lost, discovery.problem.data["select"][horizon].run, 1.0)
+
+
+def _floors(before: np.ndarray, after: np.ndarray) -> float:
+    """Root of the largest fall of a component's mean square, in floor units."""
+    fall = (before**2).mean(axis=(0, 1)) - (after**2).mean(axis=(0, 1))
+    return float(np.sqrt(max(fall.max(), 0.0)))
+
+
+def _chosen(share: Mapping[str, float], short: Sequence[Hypothesis], close: Sequence[str], mine: Hypothesis) -> float:
+    """How often a hypothesis, or what cannot be told from it, was best; its name at some of its places is the same."""
+    same = [h for h in short if h.key in close or (h.name == mine.name and set(h.places) & set(mine.places))]
+    return sum(share[h.key] for h in same)
+
+
+def _estimate(discovery, fit: Fit, hypothesis: Hypothesis, parts: Sequence[Hypothesis]) -> dict:
+    """What the fit says of the hypothesis' own coordinates: an interval, and whether they are inside their bounds."""
+    count = len(hypothesis.directions)
+    values, errors = fit.coordinates[-count:], discovery.errors(fit)[-count:]
+    low, high = hypothesis.bounds.T
+    return {
+        "interval": _interval(parts, values, errors),
+        "inside": bool(((low < values) & (values < high)).all()),
+    }
 
 
 def _interval(parts: Sequence[Hypothesis], values: np.ndarray, errors: np.ndarray) -> tuple[float, float]:
