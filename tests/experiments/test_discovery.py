@@ -10,7 +10,8 @@ import pytest
 from envs.logs import Controller, read, splits, write
 from envs.segments import noise
 from experiments import discover, discovery_bench
-from experiments.discovery_bench import ARM, SIZES, score, tally, wilson
+from experiments.discovery_bench import ARM, SIZES
+from experiments.discovery_scores import score, tally, wilson
 from experiments.excite import excitation
 from experiments.hidden import OUTSIDE, Truth, record
 from experiments.question import ask, gate, hypotheses, measure_scales, place_sets
