@@ -24,9 +24,10 @@ class Now:
     speed: jax.Array  # [joints] rad/s
     load: jax.Array  # [joints] Nm on the gears, the larger of those of their two sides
     limit: jax.Array  # [joints] Nm, the controller's
-    stiffness: jax.Array  # [joints] Nm/rad
-    damping: jax.Array  # [joints] Nm s/rad
-    rotor: jax.Array  # [joints] kg m^2, inertia of the motor on its side of the gears
+    stiffness: jax.Array  # [joints] Nm/rad, of the controller; none where the motor was measured
+    damping: jax.Array  # [joints] Nm s/rad, likewise
+    measured: bool  # whether the motor was, and went where it went
+    rotor: jax.Array  # [joints] kg m^2, the motor's part of the joint's inertia; none where it was measured
     carried: jax.Array  # [joints] Nm that the rotor takes to keep up with the joint
     body_velocity: jax.Array  # [bodies, 3] m/s of the centres of mass
 
@@ -81,8 +82,10 @@ class Chain:
 
     def read(self, values, memory: dict, joint: jax.Array, x) -> jax.Array:
         """What the encoders say of joints [2, joints], [2, joints]; nothing is remembered of it."""
-        motor = joint.at[0].add(self.ahead(memory)[0])
-        return self.stage("sensor", values, motor, self._now(x, motor), memory)[0]
+        far, fast = self.ahead(memory)
+        motor = joint.at[0].add(far)
+        # The controller answers to how fast the motor runs ahead within a step; sensors are late for the joint alone.
+        return self.stage("sensor", values, motor, self._now(x, motor), memory)[0].at[1].add(fast)
 
     def joints(self, data: mjx.Data) -> jax.Array:
         """Positions and velocities of the joints, [2, joints]."""
@@ -133,11 +136,9 @@ class Chain:
         torque, memory = self.stage("torque", values, held, now, memory)
         none = jnp.zeros_like(held)
         free = {"stiffness": none, "damping": none} if rotor is None else {"rotor": rotor}
-        before = self.ahead(memory)[0]
-        torque, memory = self.stage(
-            "transmission", values, torque - x["emf"] * motor[1], now.replace(carried=carried, **free), memory
-        )
-        running = (self.ahead(memory)[0] - before) / self.dt
+        now = now.replace(carried=carried, measured=rotor is None, **free)
+        running = self.ahead(memory)[1]
+        torque, memory = self.stage("transmission", values, torque - x["emf"] * motor[1], now, memory)
         return memory, (torque, {"q": readings[0], "dq": readings[1] + running, "tau": torque})
 
     def ahead(self, memory) -> jax.Array:
@@ -155,6 +156,7 @@ class Chain:
             limit=x["limit"],
             stiffness=x["stiffness"],
             damping=x["damping"] + x["emf"],
+            measured=False,
             rotor=jnp.zeros_like(state[1]),
             carried=jnp.zeros_like(state[1]),
             body_velocity=velocity,

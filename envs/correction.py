@@ -34,12 +34,14 @@ class Correction:
           places: names by what an effect may be on.
 
         Raises:
-          ValueError: a place is not there.
+          ValueError: there is no such place or parameter.
         """
         found = {}
         for row in self.rows:
             there = self.effects[row.name]
             for place in there:
+                for name in set(there[place]) - {parameter.name for parameter in row.parameters}:
+                    raise ValueError(f"effects: there is no '{name}' of '{row.name}'")
                 if place not in places[row.on]:
                     raise ValueError(
                         f"effects: '{row.name}' is on '{place}', expected one of {', '.join(places[row.on])}"
@@ -63,8 +65,11 @@ def read(folder: Path) -> Correction:
     """Reads a corrected model from its folder.
 
     Raises:
-      ValueError: an effect is not in the library.
+      ValueError: a file is missing, or an effect is not in the library.
     """
+    for name in (MODEL, EFFECTS):
+        if not (folder / name).exists():
+            raise ValueError(f"model: {folder / name} is missing")
     effects = json.loads((folder / EFFECTS).read_text())["effects"]
     known = {**LIBRARY, RESIDUAL.name: RESIDUAL}
     for name in effects:

@@ -70,7 +70,7 @@ def as_json(value: Any) -> Any:
 
 def write_json(path: Path, value: Any) -> None:
     """Writes JSON whole or not at all."""
-    draft = path.with_suffix(".tmp")
+    draft = path.with_suffix(f".{os.getpid()}.tmp")
     draft.write_text(json.dumps(as_json(value), indent=1) + "\n")
     draft.replace(path)
 

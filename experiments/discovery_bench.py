@@ -314,9 +314,9 @@ def main(args: Args) -> None:
         console.print(
             f"{done}/{len(cases)} case {case.number}: {answer['verdict']} {names} ({answer['seconds']:.0f} s)"
         )
-        lines = bench.report(identity)
+        bench.report(identity)
     table = Table("measure", "value", "95 % interval", "cases", "to reach")
-    for cells in shown(lines):
+    for cells in shown(bench.report(identity)):
         table.add_row(*cells)
     console.print(table)
 

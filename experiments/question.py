@@ -82,6 +82,8 @@ def ask(
         if run.time[-1] - run.time[0] < least_s:
             raise ValueError(f"{run.name}: got {run.time[-1] - run.time[0]:.3g} s, expected {least_s:.3g} s or more")
     plain = plain or Rig(spec, log.joints, rate)
+    if (plain.joints, plain.control_hz) != (tuple(log.joints), rate):
+        raise ValueError(f"plain: got {plain.joints} at {plain.control_hz:g} Hz, expected {log.joints} at {rate:g} Hz")
     if plain.others:
         raise ValueError(f"joints: {', '.join(plain.others)} may move too, and the log does not have them")
     rig = plain.scaled(measure_scales(plain, unsealed(log)))

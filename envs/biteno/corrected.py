@@ -55,7 +55,7 @@ class CorrectedBiteno(Biteno):
         joint = state.qpos[self.joint_qpos]
         still = jnp.stack([joint, jnp.zeros_like(joint)])
         state = state.replace(memory=self._chain.start(self._values, still, self._asked(self._model, joint)))
-        return state.replace(obs=self._observe(state, key))
+        return state.replace(obs=self._observe(state, jax.random.fold_in(key, 1)))
 
     def simulate(self, params: domain.Params, state: State, drive: Drive) -> Motion:
         """Physics in MJX, through the effects."""
@@ -63,6 +63,8 @@ class CorrectedBiteno(Biteno):
         data = self._data.replace(
             qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.qacc_warmstart, qacc=state.qacc_warmstart
         )
+        # Effects look at loads and velocities before the first sub-step has found them.
+        data = mjx.fwd_velocity(model, mjx.fwd_position(model, data))
 
         def step(carry, target):
             data, memory, read = self._chain.step(model, *carry, self._values, self._asked(model, target))
@@ -74,7 +76,8 @@ class CorrectedBiteno(Biteno):
             qvel=data.qvel,
             qacc_warmstart=data.qacc_warmstart,
             torque=torque[-1],
-            foot_force=self._foot_force(model, data),
+            # What the library does to a shank is not the floor's.
+            foot_force=self._foot_force(model, data.replace(xfrc_applied=jnp.zeros_like(data.xfrc_applied))),
             memory=memory,
         )
 

@@ -34,7 +34,7 @@ def _backlash(values, torque, now, memory):
     half = 0.5 * values["rad"]
     following = jnp.clip(offset + _pressing(torque, now, rate) / _resistance(now), -half, half)
     # Of a motor that was measured nobody knows when it let go.
-    rate = jnp.where(now.rotor > 0, (following - offset) / now.dt, 0.0)
+    rate = jnp.where(now.measured, 0.0, (following - offset) / now.dt)
     return _passed(torque, now, memory, following), jnp.stack([following, rate])
 
 
@@ -45,7 +45,7 @@ def _compliance(values, torque, now, memory):
     following = softness * (_pressing(torque, now, rate) + resistance * offset) / (1.0 + softness * resistance)
     fresh = (following - offset) / now.dt
     # Of a motor that was measured the torque is known row by row: its slope takes a few.
-    rate = jnp.where(now.rotor > 0, fresh, rate + now.dt / _SLOPE_S * (fresh - rate))
+    rate = jnp.where(now.measured, rate + now.dt / _SLOPE_S * (fresh - rate), fresh)
     return _passed(torque, now, memory, following), jnp.stack([following, rate])
 
 

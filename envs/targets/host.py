@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.biteno import Biteno, Drive, Motion, State
+from envs.biteno import Biteno, CorrectedBiteno, Drive, Motion, State
 from envs.targets.protocol import Act, Recording, watch
 from jaxtune.types import Trajectory
 
@@ -29,9 +29,14 @@ class HostTarget:
       robot: task and robot; its MJX model is not used.
       params: true physical values by name; only a report may read them.
       engine: what moves it.
+
+    Raises:
+      ValueError: the robot has effects that only MJX can give it.
     """
 
     def __init__(self, robot: Biteno, params: Mapping[str, float], engine: Engine):
+        if isinstance(robot, CorrectedBiteno):
+            raise ValueError("target: got a corrected robot, expected the nominal one: other engines lack its effects")
         self.params = params
         self._engine = engine
         self._reset = jax.jit(jax.vmap(lambda key: robot.reset({}, key)))

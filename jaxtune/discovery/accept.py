@@ -40,7 +40,7 @@ def accept(discovery, short: Sequence[Hypothesis], everywhere: Mapping[float, Ma
     linear = {key: fit.linear for key, fit in fitted.items()}
     gained = {key: base.linear.loss - one.loss for key, one in linear.items()}
     close = decide.alike(lost, both, 2.0)
-    close += [key for key in gained if key not in close and gained[key] > settings.same * max(gained.values())]
+    nearly = [key for key in gained if key not in close and gained[key] > settings.same * max(gained.values())]
     best = {h.key: h for h in short if h.key in decide.alike(lost, both, 1.0)}
     hypothesis = min(best.values(), key=lambda h: (len(h.directions), linear[h.key].loss))
     parts = hypothesis.parts or (hypothesis,)
@@ -57,12 +57,12 @@ def accept(discovery, short: Sequence[Hypothesis], everywhere: Mapping[float, Ma
         t=decide.max_t(gains, runs["select"], settings.level), gain=len(parts) * discovery.least_gain
     )
     tests = decide.passes(evidence, least)
-    discovery.say(f"{hypothesis.key} {evidence} {least} {tests} alike {close}")
+    discovery.say(f"{hypothesis.key} {evidence} {least} {tests} alike {close} nearly {nearly}")
     if not all(tests.values()):
         result.rejected = {"hypothesis": hypothesis.key, "tests": tests, "evidence": evidence}
         return False
     mine = {part.name for part in parts}
-    others = [part.name for h in short if h.key in close for part in h.parts or (h,)]
+    others = [part.name for h in short if h.key in (*close, *nearly) for part in h.parts or (h,)]
     alike = tuple(dict.fromkeys(name for name in others if name not in mine))
     result.rungs += [Rung(part, evidence, least, alike) for part in parts]
     discovery.fits = {horizon: fits[hypothesis.key] for horizon, fits in everywhere.items()}
@@ -96,8 +96,8 @@ def _chosen(share: Mapping[str, float], short: Sequence[Hypothesis], close: Sequ
 
 def _estimate(discovery, fit: Fit, hypothesis: Hypothesis, parts: Sequence[Hypothesis]) -> dict:
     """What the fit says of the hypothesis' own coordinates: an interval, and whether they are inside their bounds."""
-    count = len(hypothesis.directions)
-    values, errors = fit.coordinates[-count:], discovery.errors(fit)[-count:]
+    values = fit.own(hypothesis)
+    errors = discovery.errors(fit)[-len(values) :]
     low, high = hypothesis.bounds.T
     return {
         "interval": _interval(parts, values, errors),
@@ -120,8 +120,9 @@ def _interval(parts: Sequence[Hypothesis], values: np.ndarray, errors: np.ndarra
 
 
 def drop(discovery) -> None:
-    """Takes out earlier effects that no longer pay beside the last one."""
-    for rung in discovery.result.rungs[:-1]:
+    """Takes out earlier effects that no longer pay beside what was accepted last."""
+    newest = discovery.result.rungs[-1].evidence
+    for rung in [rung for rung in discovery.result.rungs if rung.evidence is not newest]:
         without = {horizon: discovery.ablated(horizon, rung.hypothesis) for horizon in discovery.fits}
         residual = discovery.residual(discovery.main, "select")
         found = residual(np.stack([without[discovery.main].vector, discovery.fits[discovery.main].vector]))

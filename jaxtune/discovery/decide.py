@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from jaxtune.discovery.least_squares import Linear
-from jaxtune.discovery.resample import blocks, standard_error
+from jaxtune.discovery.resample import LENGTH, blocks, standard_error
 
 _REFITS = 200
 _TIE = 0.03  # of what is left: less is nobody's victory, however significant
@@ -23,7 +23,7 @@ class Evidence:
     floors: float
     """Root of the largest fall of a single component's mean square, in floor units."""
     interval: tuple[float, float]
-    """95 % interval of the coordinate that is clearest of zero."""
+    """95 % interval of the coordinate that is clearest of zero; of two effects, of the one that is less clear."""
     inside: bool
     """Whether the coordinates are inside their bounds."""
     horizons: int
@@ -39,7 +39,7 @@ class Thresholds:
     t: float
     """Over all hypotheses that are compared on `select`, at once."""
     gain: float
-    """What the best hypothesis gains on healthy logs, 95th percentile."""
+    """What the best hypothesis gains on healthy logs, 95th percentile; of two effects, twice that."""
     floors: float = 1.0
     horizons: int = 2
     chosen: float = 0.7
@@ -82,7 +82,7 @@ def max_t(gains: Mapping[str, np.ndarray], run: np.ndarray, level: float) -> flo
     """The t that the best of hypotheses without an effect exceeds with probability `level`.
 
     Bootstrap of gains [segments] with their means taken off, the same draws for every hypothesis. These are all that
-    are ever looked at on `select`; which of the library they are was settled on `train`.
+    are looked at on `select` this time; which of the library they are was settled on `train`.
     """
     draws, found = blocks(run), []
     for values in gains.values():
@@ -134,16 +134,21 @@ def bagged(fits: Mapping[str, Linear], run: np.ndarray) -> dict[str, float]:
     return {key: float((winners == index).mean()) for index, key in enumerate(fits)}
 
 
-def sandwich(residual: np.ndarray, jacobian: np.ndarray, weight: float, sd: np.ndarray) -> np.ndarray:
-    """Standard errors [coordinates] that allow for residuals that go together within a segment.
+def sandwich(residual: np.ndarray, jacobian: np.ndarray, weight: float, sd: np.ndarray, run: np.ndarray) -> np.ndarray:
+    """Standard errors [coordinates] that allow for residuals that go together within a block of segments.
 
     Args:
       residual: [segments, features].
       jacobian: [segments, features, coordinates].
       weight: share of the features that count as independent.
       sd: [coordinates] of the prior.
+      run: [segments] index of each segment's run.
     """
     normal = weight * np.einsum("sfi,sfj->ij", jacobian, jacobian) + np.diag(1.0 / sd**2)
     inverse = np.linalg.pinv(normal, hermitian=True)
     pull = weight * np.einsum("sfi,sf->si", jacobian, residual)
+    # Blocks as they are drawn elsewhere: segments that follow on each other in a run.
+    first = np.flatnonzero(np.diff(run, prepend=run[0] - 1))
+    starts = np.concatenate([np.arange(a, b, LENGTH) for a, b in zip(first, [*first[1:], len(run)], strict=True)])
+    pull = np.add.reduceat(pull, starts, axis=0)
     return np.sqrt(np.diag(inverse @ (pull.T @ pull + np.diag(1.0 / sd**2)) @ inverse))

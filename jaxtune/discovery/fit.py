@@ -62,6 +62,10 @@ class Fit:
         """[axes]"""
         return self.coordinates @ self.free.directions
 
+    def own(self, hypothesis: Hypothesis) -> np.ndarray:
+        """Coordinates [parameters] of the hypothesis that it was begun for."""
+        return self.coordinates[-len(hypothesis.directions) :]
+
     def along(self, hypothesis: Hypothesis) -> np.ndarray:
         """Which coordinates [coordinates] are those of a hypothesis that is in it."""
         return np.array([any((row == mine).all() for mine in hypothesis.directions) for row in self.free.directions])
@@ -86,6 +90,13 @@ def refine(fits: Sequence[Fit], evaluate: Evaluate, rounds: int) -> list[Fit]:
         found = evaluate(np.stack(vectors)).reshape(len(fits), len(_SCALES), -1)
         fits = [_best(*trio) for trio in zip(fits, trials, found, strict=True)]
     return fits
+
+
+def anew(free: Free, coordinates: np.ndarray, weight: float, evaluate: Evaluate) -> Fit:
+    """A fit of which no more is known than where it stands."""
+    residual = evaluate((coordinates @ free.directions)[None])[0]
+    slopes = np.zeros((len(residual), len(coordinates)))
+    return polish([Fit(free, coordinates, residual, slopes, weight)], evaluate, 0)[0]
 
 
 def polish(fits: Sequence[Fit], evaluate: Evaluate, rounds: int) -> list[Fit]:
@@ -189,6 +200,10 @@ def begin(
 
 def given_up(free: Free, hypothesis: Hypothesis) -> np.ndarray:
     """Which coordinates [coordinates] are the hypothesis' own: nominal parameters at its places, prior and all."""
+    return np.any([_own(free, part) for part in hypothesis.parts or (hypothesis,)], axis=0)
+
+
+def _own(free: Free, hypothesis: Hypothesis) -> np.ndarray:
     if len(hypothesis.directions) > 1:
         return np.zeros(len(free.sd), bool)
     mine = hypothesis.directions[0] != 0
@@ -198,11 +213,12 @@ def given_up(free: Free, hypothesis: Hypothesis) -> np.ndarray:
 
 def without(fit: Fit, own: np.ndarray, hypothesis: Hypothesis) -> tuple[Fit, np.ndarray]:
     """A fit without some of its coordinates, and where those stood in the hypothesis' [parameters]."""
-    stood = np.zeros(len(hypothesis.directions))
-    if own.any():
-        direction = hypothesis.directions[0]
-        vector = fit.coordinates[own] @ fit.free.directions[own]
-        stood[0] = (vector[direction != 0] / direction[direction != 0]).mean()
+    stood, start = np.zeros(len(hypothesis.directions)), 0
+    for part in hypothesis.parts or (hypothesis,):
+        mine, direction = own & _own(fit.free, part), part.directions[0]
+        vector = fit.coordinates[mine] @ fit.free.directions[mine]
+        stood[start] = (vector[direction != 0] / direction[direction != 0]).mean()
+        start += len(part.directions)
     free = Free(*(part[~own] for part in fit.free.parts()))
     return replace(fit, free=free, coordinates=fit.coordinates[~own], jacobian=fit.jacobian[:, ~own]), stood
 

@@ -6,7 +6,8 @@ together.
 
 import numpy as np
 
-_LENGTH = 3
+LENGTH = 3
+"""Segments of a block."""
 
 
 def blocks(run: np.ndarray, draws: int = 1000, seed: int = 0) -> np.ndarray:
@@ -16,13 +17,18 @@ def blocks(run: np.ndarray, draws: int = 1000, seed: int = 0) -> np.ndarray:
       run: [segments] index of each segment's run; those of a run follow on each other.
       draws: how often.
       seed: of the draws.
+
+    Raises:
+      ValueError: segments of a run are apart.
     """
     count = len(run)
+    if len(np.unique(run)) != 1 + np.count_nonzero(np.diff(run)):
+        raise ValueError("run: the segments of a run must follow on each other")
     _, first, length = np.unique(run, return_index=True, return_counts=True)
     which = np.searchsorted(np.sort(first), np.arange(count), side="right") - 1
     first, length = (values[np.argsort(first)][which] for values in (first, length))
-    start = np.random.default_rng(seed).integers(count, size=(draws, -(-count // _LENGTH)))[..., None]
-    ahead = start - first[start] + np.arange(_LENGTH)
+    start = np.random.default_rng(seed).integers(count, size=(draws, -(-count // LENGTH)))[..., None]
+    ahead = start - first[start] + np.arange(LENGTH)
     return (first[start] + ahead % length[start]).reshape(draws, -1)[:, :count]
 
 

@@ -84,29 +84,33 @@ class Screen:
                 best = Score(gain, full, 0.0)
         return Score(best.gain, best.coordinates, visible)
 
-    def like(self, axis: int, hypotheses: Sequence[Hypothesis], share: float) -> list[str]:
-        """Names of hypotheses whose slopes explain a share of those of an axis, best first.
+    def like(self, axis: int, change: float, hypotheses: Sequence[Hypothesis], share: float) -> tuple[str, ...]:
+        """Names of hypotheses that explain a share of what a change along an axis does, best first.
 
         What the other free coordinates explain is projected out of both.
         """
         free = self._fit.free.directions
         own = (free[:, axis] != 0) & self._fit.free.nominal
         if not own.any():
-            return []
+            return ()
         _, project = self._projected(own)
         root, rest = np.sqrt(self._fit.weight), np.zeros(int((~own).sum()))
         seen = lambda column: project(np.concatenate([root * column, rest]))  # noqa: E731
-        wanted = seen(self._fit.jacobian[:, own][:, 0])
+        wanted = np.sign(change) * seen(self._fit.jacobian[:, own][:, 0])
         found = {}
         for hypothesis in hypotheses:
             for _, group in groups(hypothesis):
                 if not all(key in self._columns for keys in group for key in keys):
                     continue
                 columns = [sum(part * self._columns[key] for key, part in keys.items()) for keys in group]
-                left = complement(np.stack([seen(column) for column in columns], axis=1))(wanted)
+                columns = np.stack([seen(column) for column in columns], axis=1)
+                # What can only be added does not explain what was taken away.
+                if hypothesis.bounds[0, 0] >= 0 and columns[:, 0] @ wanted < 0:
+                    continue
+                left = complement(columns)(wanted)
                 explained = 1.0 - np.sum(left**2) / max(np.sum(wanted**2), 1e-12)
                 found[hypothesis.name] = max(found.get(hypothesis.name, 0.0), float(explained))
-        return sorted((name for name in found if found[name] >= share), key=lambda name: -found[name])
+        return tuple(sorted((name for name in found if found[name] >= share), key=lambda name: -found[name]))
 
     def _with_prior(self, value: np.ndarray, own: np.ndarray) -> np.ndarray:
         return np.concatenate([value, np.zeros(int(own.sum()))])

@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxtune.discovery import decide, localise
 from jaxtune.discovery.accept import Rung, accept, drop
-from jaxtune.discovery.fit import ROUNDS_MORE, Fit, Free, begin, polish, refine
+from jaxtune.discovery.fit import ROUNDS_MORE, Fit, Free, anew, begin, polish, refine
 from jaxtune.discovery.measure import Gauge, gauge, jacobian, nominal_directions, refitted
 from jaxtune.discovery.problem import Hypothesis, Problem, Residuals, apart, together
 from jaxtune.discovery.prove import judge, prove, worst
@@ -29,10 +29,8 @@ class Settings:
 
     shortlist: int = 8
     """Hypotheses that are fitted beside the best of each family."""
-    finalists: int = 6
-    """Of those, how many are fitted at every horizon."""
-    polished: int = 2
-    """Of those, how many are fitted with fresh slopes before they are compared."""
+    finalists: int = 4
+    """Of those, how many are fitted with fresh slopes, at every horizon, and compared."""
     paired: int = 4
     """How many of the best are tried two by two where none pays alone."""
     most: int = 4
@@ -276,26 +274,28 @@ class Discovery:
         short, everywhere = self._compete(short, tried)
         return bool(short) and (accept(self, short, everywhere) or self._pair(short, everywhere[self.main]))
 
-    def _compete(self, hypotheses: Sequence[Hypothesis], tried: Mapping[str, Sequence[np.ndarray]]):
+    def _compete(
+        self, hypotheses: Sequence[Hypothesis], tried: Mapping[str, Sequence[np.ndarray]], absolute: bool = False
+    ):
         """Fits hypotheses; the finalists, best first, and their fits by horizon and hypothesis."""
         settings, evaluate = self.settings, self.residual(self.main, "train")
-        fits = self.fit(hypotheses, tried, self.main, settings.rounds)
+        fits = self.fit(hypotheses, tried, self.main, settings.rounds, absolute)
         found = {h.key: fit for h, fit in zip(hypotheses, fits, strict=True) if fit.finite}
         self.result.not_finite += [h.key for h in hypotheses if h.key not in found]
-        order = sorted((h for h in hypotheses if h.key in found), key=lambda h: found[h.key].linear.loss)
-        short = order[: settings.finalists]
-        best = [h.key for h in short[: settings.polished]]
+        loss = lambda h: found[h.key].linear.loss  # noqa: E731
+        short = sorted((h for h in hypotheses if h.key in found), key=loss)[: settings.finalists]
+        if not short:
+            return [], {}
         # The model without them too, so that what they gain is theirs.
-        base, *polished = polish(
-            [self.fits[self.main], *(found[key] for key in best)], evaluate, settings.rounds if best else 0
-        )
+        base, *polished = polish([self.fits[self.main], *(found[h.key] for h in short)], evaluate, settings.rounds)
         self.fits[self.main] = base
         if not self.result.rungs:
             self.result.null = base
-        found |= dict(zip(best, polished, strict=True))
+        found |= {h.key: fit for h, fit in zip(short, polished, strict=True)}
+        short.sort(key=loss)
         everywhere = {self.main: {h.key: found[h.key] for h in short}}
-        starts, like = {h.key: [own(found[h.key], h)] for h in short}, [found[h.key] for h in short]
-        for horizon in self.problem.horizons if short else ():
+        starts, like = {h.key: [found[h.key].own(h)] for h in short}, [found[h.key] for h in short]
+        for horizon in self.problem.horizons:
             if horizon != self.main:
                 there = self.fit(short, starts, horizon, ROUNDS_MORE, absolute=True, like=like)
                 everywhere[horizon] = dict(zip([h.key for h in short], there, strict=True))
@@ -309,19 +309,21 @@ class Discovery:
         self.say(f"fit {len(couples)} pairs")
         pairs = [together(one, two) for one, two in couples]
         tried = {
-            pair.key: [np.concatenate([own(fits[one.key], one), own(fits[two.key], two)])]
+            pair.key: [np.concatenate([fits[one.key].own(one), fits[two.key].own(two)])]
             for pair, (one, two) in zip(pairs, couples, strict=True)
         }
         if not pairs:
             return False
-        pairs, everywhere = self._compete(pairs, tried)
+        pairs, everywhere = self._compete(pairs, tried, absolute=True)
         return bool(pairs) and accept(self, pairs, everywhere)
 
     def errors(self, fit: Fit) -> np.ndarray:
         """Standard errors of a fit's coordinates."""
         features = self.gauges[self.main].floor.size  # of a segment
         jacobian_ = fit.jacobian.reshape(-1, features, fit.jacobian.shape[-1])
-        return decide.sandwich(fit.residual.reshape(-1, features), jacobian_, fit.weight, fit.free.sd)
+        return decide.sandwich(
+            fit.residual.reshape(-1, features), jacobian_, fit.weight, fit.free.sd, self.runs("train")
+        )
 
     def ablated(self, horizon: float, hypothesis: Hypothesis) -> Fit:
         """The fit without an accepted effect, everything else fitted again."""
@@ -356,6 +358,8 @@ class Discovery:
             resume(self, state)
         while len(self.result.rungs) < self.settings.most and self.round():
             drop(self)
+            # As one that goes on after a cut would: from where the fits stand, and no more.
+            self.fits = {horizon: self.anew(fit.free, fit.coordinates, horizon) for horizon, fit in self.fits.items()}
             save(state_of(self))
         judge(self)
         named = {rung.hypothesis.name for rung in self.result.rungs}
@@ -363,10 +367,15 @@ class Discovery:
         prove(self)
         return self.result
 
+    def anew(self, free: Free, coordinates: np.ndarray, horizon: float) -> Fit:
+        """A fit of which no more is known than where it stands."""
+        return anew(free, coordinates, self.gauges[horizon].weight, self.residual(horizon, "train"))
+
     def mistaken_for(self, axis: int) -> tuple[str, ...]:
-        """Names of the effects that look like a change of a nominal parameter."""
-        axes = self._screen.like(axis, self.problem.hypotheses, self.settings.same) if self._screen else ()
-        return tuple(dict.fromkeys(axes))
+        """Names of the effects that look like the change of a nominal parameter."""
+        fit = self.fits[self.main]
+        self._screen = self._screen or self.screen(self.problem.hypotheses, fit)
+        return self._screen.like(axis, fit.vector[axis], self.problem.hypotheses, self.settings.same)
 
     def calibrate(self) -> None:
         """Finds what healthy logs gain and need, without asking anything of the measured ones."""
@@ -386,8 +395,3 @@ def _starts(hypothesis: Hypothesis, found: np.ndarray) -> list[np.ndarray]:
     """Points to try: what the screen found, less and more of it; the sizes that were looked at, where these matter."""
     others = list(hypothesis.probes) if len(hypothesis.probes) > 1 and hypothesis.bounds[0, 0] >= 0 else []
     return [found, 0.4 * found, 2.5 * found, *others]
-
-
-def own(fit: Fit, hypothesis: Hypothesis) -> np.ndarray:
-    """Coordinates [parameters] of the hypothesis that a fit was begun for."""
-    return fit.coordinates[-len(hypothesis.directions) :]

@@ -166,7 +166,8 @@ def named(name, family="joint_friction", places=("elbow",), others=()):
 def answer(effects=(), changes=(), verdict="named", after=1.0):
     gap = {"before": 20.0, "null": 10.0, "after": after}
     return {
-        "verdict": verdict, "effects": list(effects), "parameter_changes": list(changes), "gap": gap, "seconds": 1.0
+        "verdict": verdict, "effects": list(effects), "parameter_changes": list(changes), "gap": gap, "seconds": 1.0,
+        "where": [{"joint": "elbow"}, {"joint": "shoulder"}],
     }  # fmt: skip
 
 
@@ -190,12 +191,14 @@ def test_scores_count_names_families_sets_and_places_apart():
         score(truth(None, 0.0, ()), answer(verdict="no_missing_effect")),
         score(truth(None, 0.0, ()), answer([named("drag", "external")])),
         score(truth("cogging"), answer(verdict="unnamed")),
+        score(truth("cogging", places=("shoulder",)), answer(verdict="unnamed")),
     ]
     table = {line["measure"]: line for line in tally(rows)}
     assert table["top-1 name, 5 floor units and more"]["value"] == pytest.approx(1 / 3)
     assert table["truth in the reported set, 5 and more"]["value"] == pytest.approx(2 / 3)
     assert table["names something where nothing is hidden"]["value"] == 0.5
     assert table["`unnamed` outside the library"]["value"] == 1.0
+    assert table["joint of the largest gap right where `unnamed`"]["value"] == 0.5
     assert table["gap shrink at 15 floor units, name right"]["value"] == 20.0
     assert table["mean size of the reported set"]["value"] == pytest.approx(4 / 3)
 

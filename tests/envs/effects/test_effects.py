@@ -31,6 +31,7 @@ def now(speed=0.0, **fields):
         "limit": 5.0 * joints,
         "stiffness": 20.0 * joints,
         "damping": 0.0 * joints,
+        "measured": False,
         "rotor": 0.0 * joints,
         "carried": 0.0 * joints,
         "body_velocity": np.zeros((JOINTS, 3), np.float32),
