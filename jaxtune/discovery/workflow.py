@@ -238,9 +238,11 @@ class Discovery:
     def round(self) -> bool:
         """Looks for one more effect; whether one was accepted."""
         problem, settings = self.problem, self.settings
-        # As many rounds as the hypotheses get, so that what they gain is theirs.
+        # With slopes of where it stands now, or the screen would not see what the nominal parameters have taken over;
+        # and as many rounds as the hypotheses get, so that what they gain is theirs.
         for horizon, fit in self.fits.items():
-            self.fits[horizon] = refine([fit], self.residual(horizon, "train"), settings.rounds)[0]
+            fresh = self.anew(fit.free, fit.coordinates, horizon)
+            self.fits[horizon] = refine([fresh], self.residual(horizon, "train"), 2 * settings.rounds)[0]
         base = self.fits[self.main]
         if not self.result.rungs:
             self.result.null = base
@@ -286,11 +288,7 @@ class Discovery:
         short = sorted((h for h in hypotheses if h.key in found), key=loss)[: settings.finalists]
         if not short:
             return [], {}
-        # The model without them too, so that what they gain is theirs.
-        base, *polished = polish([self.fits[self.main], *(found[h.key] for h in short)], evaluate, settings.rounds)
-        self.fits[self.main] = base
-        if not self.result.rungs:
-            self.result.null = base
+        polished = polish([found[h.key] for h in short], evaluate, settings.rounds)
         found |= {h.key: fit for h, fit in zip(short, polished, strict=True)}
         short.sort(key=loss)
         everywhere = {self.main: {h.key: found[h.key] for h in short}}
@@ -358,8 +356,6 @@ class Discovery:
             resume(self, state)
         while len(self.result.rungs) < self.settings.most and self.round():
             drop(self)
-            # As one that goes on after a cut would: from where the fits stand, and no more.
-            self.fits = {horizon: self.anew(fit.free, fit.coordinates, horizon) for horizon, fit in self.fits.items()}
             save(state_of(self))
         judge(self)
         named = {rung.hypothesis.name for rung in self.result.rungs}
