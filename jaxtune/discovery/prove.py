@@ -4,9 +4,14 @@ import numpy as np
 
 from jaxtune.discovery.fit import Fit
 
+_OPEN = ("train", "select")
+
 
 def judge(discovery) -> None:
-    """The verdict, from what `select` says."""
+    """The verdict, from what is not sealed.
+
+    From `select` alone it would depend on how the floor of a few postures compares with that of all.
+    """
     result, settings, prior = discovery.result, discovery.settings, discovery.problem.prior
     fit = result.fit = discovery.fits[discovery.main]
     result.errors = discovery.errors(fit)
@@ -29,14 +34,14 @@ def judge(discovery) -> None:
         result.verdict = "parameter_change" if result.changed or result.rungs else "no_missing_effect"
 
 
-def gap(discovery, vector: np.ndarray, split: str = "select") -> float:
-    """Root mean square of the worst component of the positions, in floor units, at the main horizon."""
-    return float(_rms(discovery, vector[None], split)[0][_positions(discovery)].max())
+def gap(discovery, vector: np.ndarray) -> float:
+    """Root mean square of the worst component of the positions on all that is not sealed, in floor units."""
+    return float(_rms(discovery, vector[None], *_OPEN)[0][_positions(discovery)].max())
 
 
 def worst(discovery, vector: np.ndarray) -> float:
-    """Root mean square of the worst component of all signals on `select`, in floor units."""
-    return float(_rms(discovery, vector[None], "select")[0].max())
+    """Root mean square of the worst component of all signals on all that is not sealed, in floor units."""
+    return float(_rms(discovery, vector[None], *_OPEN)[0].max())
 
 
 def prove(discovery) -> None:
@@ -64,9 +69,9 @@ def prove(discovery) -> None:
     }
 
 
-def _rms(discovery, vectors: np.ndarray, split: str) -> np.ndarray:
-    """Root mean squares [vectors, components] in floor units."""
-    found = discovery.residual(discovery.main, split)(vectors)
+def _rms(discovery, vectors: np.ndarray, *splits: str) -> np.ndarray:
+    """Root mean squares [vectors, components] in floor units, at the main horizon."""
+    found = np.concatenate([discovery.residual(discovery.main, split)(vectors) for split in splits], axis=1)
     return np.stack([np.sqrt((discovery.shaped(one, discovery.main) ** 2).mean(axis=(0, 1))) for one in found])
 
 
