@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from envs.correction import EFFECTS, MODEL
-from envs.effects import LIBRARY, RESIDUAL
+from envs.effects import EVERY
 from envs.rig import Rig
 
 
@@ -68,13 +68,12 @@ def coordinates(rig: Rig, effects: Mapping[str, Mapping[str, Mapping[str, float]
     """
     vector = np.zeros(len(rig.axes))
     index = {(axis.effect, axis.place, axis.parameter): number for number, axis in enumerate(rig.axes)}
-    rows = {**LIBRARY, RESIDUAL.name: RESIDUAL}
     for effect, places in effects.items():
         for place, parameters in places.items():
             for name, value in parameters.items():
                 if (effect, place, name) not in index:
                     raise ValueError(f"effects: there is no '{name}' of '{effect}' at '{place}'")
-                row = rows[effect]
+                row = EVERY[effect]
                 parameter = next(p for p in row.parameters if p.name == name)
                 number = index[effect, place, name]
                 vector[number] = parameter.coordinate(value, float(rig.scale(row, parameter)[rig.axes[number].index]))

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from envs.effects import LIBRARY, RESIDUAL
+from envs.effects import EVERY
 from jaxtune.types import Effect, Parameter
 
 MODEL, EFFECTS = "model.xml", "effects.json"
@@ -25,7 +25,7 @@ class Correction:
     @property
     def rows(self) -> tuple[Effect, ...]:
         """Its effects, in the library's order: the order in which they act."""
-        return tuple(row for row in (*LIBRARY.values(), RESIDUAL) if row.name in self.effects)
+        return tuple(row for row in EVERY.values() if row.name in self.effects)
 
     def values(self, places: Mapping[str, Sequence[str]]) -> dict[str, dict[str, np.ndarray]]:
         """What the physics reads of every effect, by effect and parameter, [places].
@@ -71,8 +71,7 @@ def read(folder: Path) -> Correction:
         if not (folder / name).exists():
             raise ValueError(f"model: {folder / name} is missing")
     effects = json.loads((folder / EFFECTS).read_text())["effects"]
-    known = {**LIBRARY, RESIDUAL.name: RESIDUAL}
     for name in effects:
-        if name not in known:
+        if name not in EVERY:
             raise ValueError(f"{folder / EFFECTS}: there is no effect '{name}'")
     return Correction(folder / MODEL, effects)

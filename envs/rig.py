@@ -16,7 +16,7 @@ from mujoco import mjx
 
 from envs import domain, sensing
 from envs.chain import MIN_FRICTION_NM, Chain
-from envs.effects import LIBRARY, RESIDUAL
+from envs.effects import EVERY
 from envs.effects.memory import LONGEST_S
 from envs.segments import Segment
 from jaxtune.types import Effect, Parameter
@@ -88,8 +88,7 @@ class Rig:
         self._gravity = sensing.projected_gravity(jnp.asarray(model.body_quat[1], jnp.float32))
         self._scales: Mapping[str, np.ndarray] = {}
         self.places = {"joint": self.joints, "body": self.bodies, "foot": (), "robot": ("robot",)}
-        rows = (*LIBRARY.values(), RESIDUAL)
-        self.effects = {row.name: row for row in rows if self.places[row.on] and row.needs != "free"}
+        self.effects = {row.name: row for row in EVERY.values() if self.places[row.on] and row.needs != "free"}
         self.chain = Chain(self.dt, tuple(self.effects.values()), self.qpos, self.dof, self._bodies)
         self.axes = tuple(
             Axis(name, parameter.name, place, index)

@@ -70,17 +70,7 @@ def ask(
       ValueError: the runs cannot be split, or are too short for a horizon.
     """
     log, notes = gate(log)
-    rate = log.runs[0].controller.rate_hz
-    least_s = segments.HISTORY_S + min(horizons)
-    for run in log.runs:
-        if run.controller.rate_hz != rate:
-            raise ValueError(
-                f"{run.name}: controller.rate_hz: got {run.controller.rate_hz:g}, expected {rate:g} for all"
-            )
-        if run.controller.kind == "servo" and "target" in run.signals and "volts" not in run.signals:
-            raise ValueError(f"{run.name}: column 'volts' is missing, and the controller is a servo")
-        if run.time[-1] - run.time[0] < least_s:
-            raise ValueError(f"{run.name}: got {run.time[-1] - run.time[0]:.3g} s, expected {least_s:.3g} s or more")
+    rate = _checked(log, segments.HISTORY_S + min(horizons))
     plain = plain or Rig(spec, log.joints, rate)
     if (plain.joints, plain.control_hz) != (tuple(log.joints), rate):
         raise ValueError(f"plain: got {plain.joints} at {plain.control_hz:g} Hz, expected {log.joints} at {rate:g} Hz")
@@ -90,7 +80,6 @@ def ask(
     signals = tuple(name for name in ("dq", "gravity", "q") if all(name in run.signals for run in log.runs))
     nominal = rig.nominal()
     index = {(axis.effect, axis.place): number for number, axis in enumerate(rig.axes)}
-
     problem = Problem(
         simulate=_Simulator(plain, signals),
         values=rig.inner,
@@ -110,6 +99,21 @@ def ask(
     )
     names = {split: tuple(run.name for run in runs) for split, runs in splits(log).items()}
     return Question(problem, rig, {joint: index["constant_push", joint] for joint in rig.joints}, names, notes)
+
+
+def _checked(log: Log, least_s: float) -> float:
+    """The controller's rate in Hz, the same in all runs, which have what discovery needs."""
+    rate = log.runs[0].controller.rate_hz
+    for run in log.runs:
+        if run.controller.rate_hz != rate:
+            raise ValueError(
+                f"{run.name}: controller.rate_hz: got {run.controller.rate_hz:g}, expected {rate:g} for all"
+            )
+        if run.controller.kind == "servo" and "target" in run.signals and "volts" not in run.signals:
+            raise ValueError(f"{run.name}: column 'volts' is missing, and the controller is a servo")
+        if run.time[-1] - run.time[0] < least_s:
+            raise ValueError(f"{run.name}: got {run.time[-1] - run.time[0]:.3g} s, expected {least_s:.3g} s or more")
+    return rate
 
 
 def unsealed(log: Log) -> Log:

@@ -18,3 +18,6 @@ LIBRARY = {
     for row in family.ROWS
 }
 """Rows by name."""
+
+EVERY = {**LIBRARY, RESIDUAL.name: RESIDUAL}
+"""The library, and the torque that has no name, in the order in which they act."""

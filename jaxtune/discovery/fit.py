@@ -1,7 +1,7 @@
 """Fits of several hypotheses at once, the nominal parameters free in each (steps 3 and 6).
 
-Gauss and Newton with secants. The slopes of the nominal parameters are those found at the null; what changes of them,
-and of the hypothesis' own, is learnt from the steps taken (Broyden), so that a round costs two simulations.
+Gauss and Newton with secants. Slopes are found where a round of discovery begins and, of the finalists, where they
+stand (`polish`); in between they are learnt from the steps taken (Broyden): a round of a fit costs two simulations.
 """
 
 from collections.abc import Callable, Sequence
