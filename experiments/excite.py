@@ -83,9 +83,11 @@ def excitation(
     for number in range(runs):
         posture = home + 0.25 * (high - low) * rng.uniform(-1, 1, len(joints))
         room = np.minimum(np.minimum(high - posture, posture - low), 0.6)
-        gain = (1.0, 0.5)[(number // 2 + number) % 2]
         target, enabled = _medley(posture, np.maximum(room, 0.05), seconds, rate_hz, rng)
         split = splits[number % len(splits)]
+        # Every split gets both gains, the one run of four to select by the lower.
+        earlier = sum(motion.split == split for motion in motions)
+        gain = (1.0, 0.5)[(earlier + (split == "select")) % 2]
         motions.append(
             Motion(
                 f"run_{number:03d}",
