@@ -263,7 +263,7 @@ class Biteno:
         values |= {name: shaped[name] for name in self.config.shaping}
         values = {name: jnp.where(finite, value, 0.0) for name, value in values.items()}
         trained = rewards.weigh(values, self.config.weights) + rewards.weigh(values, self.config.shaping)
-        fell = (readings["gravity"][2] > -_MAX_TILT_COS) | (qpos[2] < _MIN_HEIGHT_M)
+        fell = fallen(readings["gravity"], qpos[2])
         done = (fell | ~finite).astype(jnp.float32)
 
         redraw = steps % round(self.config.command_s / constants.POLICY_DT_S) == 0
@@ -327,3 +327,8 @@ class Biteno:
         key_size, key_zero = jax.random.split(key)
         command = jax.random.uniform(key_size, (3,), minval=-1.0) * jnp.array(self.config.command_max)
         return jnp.where(jax.random.bernoulli(key_zero, self.config.zero_command_share), 0.0, command)
+
+
+def fallen(gravity: jax.Array, height: jax.Array) -> jax.Array:
+    """True where a robot has fallen: by projected gravity [..., 3] and height [...] of its trunk in m."""
+    return (gravity[..., 2] > -_MAX_TILT_COS) | (height < _MIN_HEIGHT_M)

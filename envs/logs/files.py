@@ -3,10 +3,9 @@
 from pathlib import Path
 
 import numpy as np
-import pyarrow
-import pyarrow.csv
 import yaml
 
+from envs.logs.bags import SUFFIXES, is_bag, read_bag
 from envs.logs.format import (
     JOINT_SIGNALS,
     SCALAR_SIGNALS,
@@ -17,7 +16,7 @@ from envs.logs.format import (
     column_names,
 )
 from envs.logs.meta import Meta
-from envs.logs.tables import READERS, check_time, check_values, refuse_first
+from envs.logs.tables import READERS, WRITERS, check_time, check_values, refuse_first
 from envs.models import BUILT_IN
 
 _UNIT_NORM = 0.05  # how far a unit vector may be from one
@@ -37,14 +36,16 @@ def read(folder: Path) -> Log:
     meta = Meta(folder, {name: joints for name, (_, joints) in BUILT_IN.items()})
     paths = sorted(folder.glob("run_*"))
     for path in paths:
-        if path.suffix not in READERS or not path.is_file():
-            raise ValueError(f"{path}: expected a file that ends in one of {', '.join(READERS)}")
+        if not (path.suffix in READERS and path.is_file()) and not is_bag(path):
+            raise ValueError(
+                f"{path}: expected a file that ends in one of {', '.join((*READERS, *SUFFIXES))}, or a bag's folder"
+            )
     stems = [path.stem for path in paths]
     if not paths:
-        raise ValueError(f"{folder}: no runs; expected run_*.csv or run_*.npz")
+        raise ValueError(f"{folder}: no runs; expected run_*.csv, .npz, .parquet or a bag")
     for stem in stems:
         if stems.count(stem) > 1:
-            raise ValueError(f"{folder}: run '{stem}' is there twice, as {' and '.join(READERS)}")
+            raise ValueError(f"{folder}: run '{stem}' is there twice, expected one file of a run")
     for name in meta.runs:
         if name not in stems:
             raise ValueError(f"{meta.path}: runs.{name}: there is no such run; found {', '.join(stems)}")
@@ -66,8 +67,8 @@ def write(log: Log, folder: Path, suffix: str = ".csv") -> None:
         `run_`.
     """
     folder = Path(folder)
-    if suffix not in READERS:
-        raise ValueError(f"suffix: got '{suffix}', expected one of {', '.join(READERS)}")
+    if suffix not in WRITERS:
+        raise ValueError(f"suffix: got '{suffix}', expected one of {', '.join(WRITERS)}")
     for run in log.runs:
         if not run.name.startswith("run_"):
             raise ValueError(f"runs: got '{run.name}', expected a name that begins with 'run_'")
@@ -91,10 +92,7 @@ def write(log: Log, folder: Path, suffix: str = ".csv") -> None:
         for signal, values in run.signals.items():
             names = column_names(signal, log.joints)
             columns |= dict(zip(names, values.reshape(len(run.time), -1).T, strict=True))
-        if suffix == ".npz":
-            np.savez(folder / f"{run.name}.npz", **columns)
-        else:
-            pyarrow.csv.write_csv(pyarrow.table(columns), folder / f"{run.name}.csv")
+        WRITERS[suffix](folder / f"{run.name}{suffix}", columns)
     (folder / "meta.yaml").write_text(yaml.safe_dump(meta, sort_keys=False))
 
 
@@ -104,7 +102,7 @@ def _as_meta(controller: Controller) -> dict:
 
 
 def _run(path: Path, meta: Meta) -> Run:
-    columns = READERS[path.suffix](path)
+    columns = read_bag(path, meta.columns) if is_bag(path) else READERS[path.suffix](path)
     for name, values in columns.items():
         refuse_first(path, name, values, ~np.isfinite(values), "a finite number")
     columns = _rename(path, columns, meta)

@@ -1,11 +1,13 @@
 """Columns of numbers from files: every cell what it may be, or its file, row and column in the error."""
 
 import csv
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import pyarrow
 import pyarrow.csv
+import pyarrow.parquet
 
 
 def check_time(path: Path, name: str, time: np.ndarray) -> None:
@@ -100,5 +102,40 @@ def _read_npz(path: Path) -> dict[str, np.ndarray]:
     return {name: values.astype(float) for name, values in columns.items()}
 
 
-READERS = {".csv": _read_csv, ".npz": _read_npz}
+def _read_parquet(path: Path) -> dict[str, np.ndarray]:
+    try:
+        table = pyarrow.parquet.read_table(path, partitioning=None, page_checksum_verification=True)
+        table.validate(full=True)
+    except (pyarrow.ArrowException, OSError) as error:
+        raise ValueError(f"{path}: {type(error).__name__}: {error}") from error
+    columns = {}
+    for name, values in zip(table.column_names, table.columns, strict=True):
+        if not name or name in columns:
+            raise ValueError(f"{path}, column '{name}': expected a name that is there once")
+        kind = values.type
+        if not any(is_a(kind) for is_a in _NUMBERS):
+            raise ValueError(f"{path}, column '{name}': got {kind}, expected numbers")
+        if values.null_count:
+            row = int(np.argmax(values.is_null().to_numpy()))
+            raise ValueError(f"{path}, row {row + 1}, column '{name}': is empty, expected a number")
+        columns[name] = values.to_numpy().astype(float)
+    return columns
+
+
+def _write_csv(path: Path, columns: Mapping[str, np.ndarray]) -> None:
+    pyarrow.csv.write_csv(pyarrow.table(dict(columns)), path)
+
+
+def _write_npz(path: Path, columns: Mapping[str, np.ndarray]) -> None:
+    np.savez(path, **columns)
+
+
+def _write_parquet(path: Path, columns: Mapping[str, np.ndarray]) -> None:
+    pyarrow.parquet.write_table(pyarrow.table(dict(columns)), path, write_page_checksum=True)
+
+
+_NUMBERS = (pyarrow.types.is_floating, pyarrow.types.is_integer, pyarrow.types.is_boolean)
+READERS = {".csv": _read_csv, ".npz": _read_npz, ".parquet": _read_parquet}
 """Readers by suffix: path to columns [rows] by name."""
+WRITERS = {".csv": _write_csv, ".npz": _write_npz, ".parquet": _write_parquet}
+"""Writers by suffix, of a path and columns."""

@@ -1,0 +1,171 @@
+"""ROS 1 and ROS 2 bags and MCAP files as columns; `columns` in `meta.yaml` says where each of them is found:
+
+    columns:
+      q.left_knee: /joint_states.position[left_knee]    # its place in the message's own `name`
+      gyro.x: /imu.angular_velocity.x
+      action.left_knee: /policy.data[2]
+
+The rows are the messages of one topic: that of the actions where there is one, else that of the positions. What other
+topics say is sampled there. Time is the stamp in the headers where all messages have one, else that of the recorder; it
+starts at zero. A run begins where the last of its topics begins and ends where the first of them ends; rows that fall
+into a hole of a measured topic are left out, which leaves a hole in the time stamps.
+"""
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from envs.logs.sampling import HELD, held, sampled
+
+SUFFIXES = (".bag", ".mcap", ".db3")
+"""Of files; a folder with a `metadata.yaml` is a bag as well."""
+
+_PLACE = re.compile(r"(?P<topic>/[^.\[\]\s]+)\.(?P<field>\w+(?:\.\w+)*)(?:\[(?P<index>[^\[\]]+)\])?")
+_HOLE = 3.5  # times a topic's period
+
+
+def is_bag(path: Path) -> bool:
+    """Whether a path is one of these."""
+    return (path.suffix in SUFFIXES and path.is_file()) or (path / "metadata.yaml").is_file()
+
+
+@dataclass(frozen=True)
+class _Place:
+    """Where a column is found."""
+
+    topic: str
+    fields: tuple[str, ...]
+    index: str | None
+
+    def __call__(self, message: Any) -> float:
+        value = message
+        for name in self.fields:
+            value = getattr(value, name)
+        if self.index is None:
+            return float(value)
+        digits = self.index.isdecimal()
+        return float(value[int(self.index) if digits else list(message.name).index(self.index)])
+
+
+@dataclass(frozen=True)
+class _Topic:
+    """What was heard on a topic."""
+
+    time: np.ndarray
+    """[messages] ns"""
+    values: Mapping[str, np.ndarray]
+    """[messages] by our name of the column."""
+
+
+def read_bag(path: Path, columns: Mapping[str, str]) -> dict[str, np.ndarray]:
+    """Reads the columns that are asked for.
+
+    Args:
+      path: of the bag.
+      columns: ours to theirs.
+
+    Returns:
+      [rows] by their name, and `t`.
+
+    Raises:
+      ValueError: names the topic, and the message (from 1) and field where it is about one.
+    """
+    places = {}
+    for ours, theirs in columns.items():
+        match = _PLACE.fullmatch(theirs)
+        if ours == "t" or not match:
+            raise ValueError(
+                f"{path}: columns.{ours}: got '{theirs}', expected /topic.field, /topic.field[3] or /topic.field[name] "
+                "of something other than the time, which comes with the messages"
+            )
+        places[ours] = _Place(match["topic"], tuple(match["field"].split(".")), match["index"])
+    of_rows = [ours for first in ("action.", "q.") for ours in places if ours.startswith(first)]
+    if not of_rows:
+        raise ValueError(f"{path}: columns: got none of 'q.*', expected where in the bag the positions are")
+    topics = _heard(path, places)
+    rows, start, time = _rows(path, topics, places[of_rows[0]].topic)
+    found = {"t": time}
+    for topic in topics.values():
+        for ours, values in topic.values.items():
+            at = 1e-9 * (topic.time - start)
+            slow = ours.partition(".")[0] in HELD
+            found[columns[ours]] = held(at, values, time) if slow else sampled(at, values, time, rows)
+    return found
+
+
+def _rows(path: Path, topics: Mapping[str, _Topic], of_rows: str) -> tuple[float, int, np.ndarray]:
+    """The period of the rows and the first stamp, ns, and times [rows], s from there."""
+    start = max(int(topic.time[0]) for topic in topics.values())
+    end = min(int(topic.time[-1]) for topic in topics.values())
+    stamps = topics[of_rows].time
+    stamps = stamps[(stamps >= start) & (stamps <= end)]
+    for name, topic in topics.items():
+        holes = np.diff(topic.time)
+        wide = holes > _HOLE * np.median(holes)
+        if name == of_rows or all(ours.partition(".")[0] in HELD for ours in topic.values):
+            continue
+        after = np.clip(np.searchsorted(topic.time, stamps), 1, len(topic.time) - 1)
+        stamps = stamps[~wide[after - 1] | (topic.time[after] == stamps)]
+    if len(stamps) < 2:
+        raise ValueError(f"{path}: the topics {', '.join(topics)} have {len(stamps)} row(s) in common, expected more")
+    time = 1e-9 * (stamps - stamps[0])
+    return float(np.median(np.diff(time))), int(stamps[0]), time
+
+
+def _heard(path: Path, places: Mapping[str, _Place]) -> dict[str, _Topic]:
+    """All messages of the topics that are needed."""
+    # An extra: not everyone has bags.
+    try:
+        from rosbags.highlevel import AnyReader
+        from rosbags.typesys import Stores, get_typestore
+    except ModuleNotFoundError as error:
+        raise ValueError(f"{path}: a bag, which needs rosbags; expected `pip install 'jaxtune[bags]'`") from error
+    store = get_typestore(Stores.ROS1_NOETIC if path.suffix == ".bag" else Stores.ROS2_HUMBLE)
+    heard = {place.topic: [] for place in places.values()}
+    try:
+        with AnyReader([path], default_typestore=store) as reader:
+            for topic in heard:
+                if topic not in reader.topics:
+                    raise LookupError(f"there is no topic '{topic}', expected some of {', '.join(reader.topics)}")
+            connections = [one for one in reader.connections if one.topic in heard]
+            for connection, recorded, raw in reader.messages(connections):
+                messages = heard[connection.topic]
+                message = reader.deserialize(raw, connection.msgtype)
+                messages.append(_read(message, recorded, connection.topic, len(messages) + 1, places))
+    except Exception as error:  # a damaged bag fails in many ways
+        raise ValueError(f"{path}: {type(error).__name__}: {error}") from error
+    stamped = all(stamp for messages in heard.values() for stamp, _, _ in messages)
+    return {topic: _topic(path, topic, messages, 0 if stamped else 1, places) for topic, messages in heard.items()}
+
+
+def _read(message: Any, recorded: int, topic: str, number: int, places: Mapping[str, _Place]) -> tuple:
+    """Stamp, time of recording, ns, and values in the order of the topic's places."""
+    stamp = getattr(getattr(message, "header", None), "stamp", None)
+    values = []
+    for place in places.values():
+        if place.topic == topic:
+            try:
+                values.append(place(message))
+            except (AttributeError, IndexError, TypeError, ValueError) as error:
+                field = ".".join(place.fields) + (f"[{place.index}]" if place.index else "")
+                raise ValueError(f"topic '{topic}', message {number}, '{field}': {error}") from error
+    return stamp.sec * 10**9 + stamp.nanosec if stamp else 0, recorded, values
+
+
+def _topic(path: Path, name: str, messages: list[tuple], clock: int, places: Mapping[str, _Place]) -> _Topic:
+    time = np.array([message[clock] for message in messages], np.int64)
+    if len(time) < 2:
+        raise ValueError(f"{path}, topic '{name}': got {len(time)} message(s), expected 2 or more")
+    late = np.diff(time) <= 0
+    if late.any():
+        number = int(np.argmax(late)) + 2
+        raise ValueError(
+            f"{path}, topic '{name}', message {number}: got the time {time[number - 1]} ns, expected more than "
+            f"{time[number - 2]} of the message before"
+        )
+    mine = [ours for ours, place in places.items() if place.topic == name]
+    return _Topic(time, dict(zip(mine, np.array([message[2] for message in messages]).T, strict=True)))

@@ -1,0 +1,194 @@
+"""Episodes from measured logs: what a policy saw and did, at its own ticks, as the simulator would have told it.
+
+A run is cut where the robot falls or is switched off and where its rows have a hole. Of every piece the first tick is
+left out, because nobody knows what was done before it, and so is the last one of a piece that does not end in a fall,
+because nobody knows what came of it.
+"""
+
+from functools import partial
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from envs import sensing
+from envs.biteno import constants, env, gait, rewards
+from envs.logs import Log, Run
+from envs.logs.format import JOINT_SIGNALS
+from envs.logs.sampling import HELD, sampled
+from jaxtune.types import Trajectory
+
+_NEEDED = ("q", "dq", "target", "action", "phase", "cmd", "gyro", "gravity", "vel")
+_READINGS = {"velocity": "vel", "gyro": "gyro", "gravity": "gravity", "joint": "q", "joint_velocity": "dq"}
+_SAME_RATE = 1.25  # rows and ticks are one where their rates differ by less
+_HOLE = 1.5  # periods of the policy
+_UP_S = 0.5  # after a fall, for which it must stand to have got up
+_STEADY = 0.95  # share of ticks that are equally many rows apart, where rows and ticks keep step
+
+
+@chex.dataclass(frozen=True)
+class Recorded:
+    """Measured episodes, and what a simulation needs to repeat them."""
+
+    trajectory: Trajectory
+    command: jax.Array  # [episodes, time, 3] m/s, m/s, rad/s
+    phase: jax.Array  # [episodes, time, 2] cycles
+    power: jax.Array  # [episodes, time] W, mechanical, braking not regained
+
+
+def episodes(log: Log, steps: int) -> Recorded:
+    """Turns a log of a walking BITeno into episodes of `steps` policy steps.
+
+    A longer piece of a run becomes several episodes; a shorter one is filled up with steps that are not alive.
+
+    Raises:
+      ValueError: the log is of another robot or policy, lacks a signal, or has no two ticks in a row.
+    """
+    if log.robot != "biteno" or set(log.joints) != set(constants.JOINTS):
+        raise ValueError(f"robot: got '{log.robot}' with {', '.join(log.joints)}, expected biteno with all its joints")
+    rate = (log.policy or {}).get("rate_hz", 1.0 / constants.POLICY_DT_S)
+    if abs(rate * constants.POLICY_DT_S - 1.0) > 1e-6:
+        raise ValueError(f"policy.rate_hz: got {rate:g}, expected {1.0 / constants.POLICY_DT_S:g}")
+    order = [log.joints.index(joint) for joint in constants.JOINTS]
+    found = []
+    for run in log.runs:
+        ticks = _at_ticks(run, order)
+        for rows, fell in _pieces(ticks):
+            found += _chunks(_steps(ticks, rows, fell), steps)
+    if not found:
+        raise ValueError(f"runs: got {len(log.runs)} without two ticks in a row, expected a robot that walks")
+    return _as_simulated(jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *found))
+
+
+def _at_ticks(run: Run, order: list[int]) -> dict[str, np.ndarray]:
+    """Signals [ticks, ...] by name when the policy looked, joints in the model's order, and `time` and `fallen`."""
+    signals = dict(run.signals)
+    if "quat" in signals and "gravity" not in signals:
+        signals["gravity"] = np.asarray(jax.vmap(sensing.projected_gravity)(signals["quat"]))
+    for name in _NEEDED:
+        if name not in signals:
+            raise ValueError(f"{run.name}: there is no '{name}', expected {', '.join(_NEEDED)}")
+    for name in JOINT_SIGNALS:
+        if name in signals:
+            signals[name] = signals[name][:, order]
+    rows, aligned = _ticks(run.name, run.time, signals["action"])
+    if aligned:
+        seen = {name: values[rows] for name, values in signals.items()} | {"time": run.time[rows]}
+    else:
+        # The policy looked some time after the row before.
+        at = 0.5 * (run.time[rows] + run.time[np.maximum(rows - 1, 0)])
+        seen = {name: values[rows] for name, values in signals.items() if name in HELD} | {"time": at}
+        for name in signals.keys() - set(HELD):
+            seen[name] = sampled(run.time, signals[name], at, constants.POLICY_DT_S)
+    if "tau" not in seen:
+        seen["tau"] = _wanted_torque(run, seen, order)
+    height = seen["pos"][:, 2] if "pos" in seen else np.full(len(rows), np.inf)
+    return seen | {"fallen": np.asarray(env.fallen(seen["gravity"], height))}
+
+
+def _ticks(name: str, time: np.ndarray, action: np.ndarray) -> tuple[np.ndarray, bool]:
+    """Rows in which the policy spoke, and whether they are when it looked."""
+    period, width = constants.POLICY_DT_S, float(np.median(np.diff(time)))
+    if width > _SAME_RATE * period:
+        raise ValueError(f"{name}: got {1 / width:.6g} rows a second, expected {1 / period:g} or more")
+    if width * _SAME_RATE >= period:
+        return np.arange(len(time)), True
+    rows = 1 + np.flatnonzero((np.diff(action, axis=0) != 0).any(axis=1))
+    apart = np.diff(time[rows])
+    if len(rows) < 2 or abs(np.median(apart) / period - 1.0) > _SAME_RATE - 1.0:
+        every = f"every {np.median(apart):.3g} s" if len(rows) > 1 else f"{len(rows)} time(s)"
+        raise ValueError(f"{name}: 'action' changes {every}, expected every {period:g} s")
+    # A policy that says the same twice is not heard the second time.
+    unheard = [
+        np.searchsorted(time, time[row] + np.arange(1, round(gap / period)) * period - 0.5 * width)
+        for row, gap in zip(rows, apart, strict=False)
+    ]
+    rows = np.unique(np.concatenate([rows, *unheard]))
+    steady = np.diff(rows) == round(period / width)
+    return rows, bool(steady.mean() >= _STEADY)
+
+
+def _wanted_torque(run: Run, seen: dict[str, np.ndarray], order: list[int]) -> np.ndarray:
+    """What the joints' controller asks for, [ticks, joints] Nm, where nobody measured what came of it."""
+    if run.controller.kind != "pd":
+        raise ValueError(f"{run.name}: there is no 'tau', expected it beside a controller of type servo")
+    kp, kd, limit = (run.controller.gains[name][order] for name in ("kp", "kd", "torque_limit_nm"))
+    return np.clip(kp * (seen["target"] - seen["q"]) - kd * seen["dq"], -limit, limit)
+
+
+def _pieces(ticks: dict[str, np.ndarray]) -> list[tuple[np.ndarray, bool]]:
+    """Ticks [ticks] that follow on each other with the robot on its feet, and whether it fell after them."""
+    up = ~ticks["fallen"] & (ticks.get("enabled", np.ones(len(ticks["time"]))) > 0)
+    hole = np.append(False, np.diff(ticks["time"]) > _HOLE * constants.POLICY_DT_S)
+    found, down = [], False
+    for rows in np.split(np.arange(len(up)), np.flatnonzero(hole | np.append(False, up[1:] != up[:-1]))):
+        stands = up[rows[0]] and len(rows) >= (round(_UP_S / constants.POLICY_DT_S) if down else 3)
+        if stands:
+            after = rows[-1] + 1
+            found.append((rows, bool(after < len(up) and ticks["fallen"][after] and not hole[after])))
+        down = not up[rows[0]] or (down and not stands)
+    return found
+
+
+def _steps(ticks: dict[str, np.ndarray], rows: np.ndarray, fell: bool) -> dict:
+    """What was before, at and after every step [steps] of a piece, by name."""
+    last = None if fell else -1
+    places = {"before": rows[:-1][:last], "now": rows[1:][:last], "after": rows[1:][:last] + 1}
+    moments = {
+        moment: {name: ticks[name][at].astype(np.float32) for name in (*_NEEDED, "tau")}
+        for moment, at in places.items()
+    }
+    ends = np.zeros(len(places["now"]), bool)
+    ends[-1:] = fell
+    return moments | {"alive": np.ones(len(ends), bool), "fell": ends}
+
+
+def _chunks(steps: dict, length: int) -> list[dict]:
+    """Episodes of a length."""
+    count = len(steps["alive"])
+
+    def cut(start: int) -> dict:
+        fill = max(0, start + length - count)
+        return jax.tree.map(
+            lambda leaf: np.pad(leaf[start : start + length], [(0, fill)] + [(0, 0)] * (leaf.ndim - 1)), steps
+        )
+
+    return [cut(start) for start in range(0, count, length)]
+
+
+@jax.jit
+def _as_simulated(steps: dict) -> Recorded:
+    """What the simulator would have told of steps [episodes, time]."""
+    before, now, after = (steps[moment] for moment in ("before", "now", "after"))
+    each = lambda function: jax.vmap(jax.vmap(function))  # noqa: E731
+    obs = each(partial(sensing.observe, stand=jnp.asarray(constants.STAND_RAD)))(
+        **{name: now[signal] for name, signal in _READINGS.items()},
+        command=now["cmd"],
+        last_action=before["action"],
+        joint_error=before["target"] - now["q"],
+        phase=now["phase"],
+    )
+    values = each(rewards.terms)(
+        **{name: after[signal] for name, signal in _READINGS.items()},
+        command=now["cmd"],
+        last_joint_velocity=now["dq"],
+        torque=after["tau"],
+        action=now["action"],
+        last_action=before["action"],
+        joint_reference=each(gait.joint_reference)(now["phase"], now["cmd"]),
+    )
+    alive, fell = steps["alive"], steps["fell"].any(axis=1)
+    return Recorded(
+        trajectory=Trajectory(
+            obs=obs,
+            action=now["action"],
+            alive=alive,
+            score=jnp.where(alive, rewards.weigh(values, constants.TABLE_ONE), 0.0),
+            fell=fell,
+            not_finite=jnp.zeros_like(fell),
+        ),
+        command=now["cmd"],
+        phase=now["phase"],
+        power=jnp.where(alive, jnp.maximum(now["tau"] * now["dq"], 0.0).sum(axis=-1), 0.0),
+    )
