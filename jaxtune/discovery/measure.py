@@ -5,13 +5,15 @@ of the state a segment starts from, and the gap between engines, all in one numb
 and every moment of a segment.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from jaxtune.discovery.fit import Evaluate, Fit, Free, refine
 from jaxtune.discovery.least_squares import Linear
 from jaxtune.discovery.problem import Problem, Residuals, Segments
 
+_ROUNDS = 4  # of a fit: what one step leaves of parameters that are a tenth off would pass for a gap between engines
 _LEAST_SHARE = 0.25  # of a component's mean floor; the first rows of a segment would count without end
 
 
@@ -25,8 +27,8 @@ class Gauge:
     """Share of the bins that count as independent."""
     jacobian: np.ndarray
     """[segments, bins, components, directions] of what is free from the start, at the nominal model, on `train`."""
-    healthy: tuple[np.ndarray, ...]
-    """Residuals [segments, bins, components] of every healthy log before any fit, on its `train`."""
+    healthy: tuple[Fit, ...]
+    """What is free from the start, fitted to the `train` of every healthy log."""
 
 
 def jacobian(measure: Residuals, vector: np.ndarray, directions: np.ndarray, segments: Segments) -> np.ndarray:
@@ -40,6 +42,16 @@ def nominal_directions(problem: Problem) -> np.ndarray:
     return np.concatenate([np.diag(problem.prior)[problem.prior > 0], problem.timing])
 
 
+def nominal(problem: Problem) -> Free:
+    """What is free from the start."""
+    directions = nominal_directions(problem)
+    count = len(directions)
+    bounds = np.tile([-5.0, 5.0], (count, 1))
+    # Nobody looks before it is time.
+    bounds[count - len(problem.timing) :, 0] = 0.0
+    return Free(directions, np.ones(count), bounds, np.ones(count, bool))
+
+
 def gauge(problem: Problem, measure: Residuals, horizon: float, known: tuple[np.ndarray, float] | None = None) -> Gauge:
     """Measures the floor at one horizon, or takes one that is known: floor and independent share."""
     zero = np.zeros(problem.axes)
@@ -49,16 +61,53 @@ def gauge(problem: Problem, measure: Residuals, horizon: float, known: tuple[np.
     raw = [measure(zero, log[horizon])[0] for log in problem.healthy]
     floor, weight = np.sqrt((np.concatenate(raw) ** 2).mean(axis=0)), 1.0
     for _ in range(2):
-        left = np.concatenate([refitted(log / floor, slope / floor[..., None], weight) for log in raw])
-        weight = independent_share(left)
-        fresh = floor * np.sqrt((left**2).mean(axis=0))
-        floor = np.maximum(fresh, _LEAST_SHARE * fresh.mean(axis=0))
+        left = np.stack([refitted(log / floor, slope / floor[..., None], weight) for log in raw])
+        floor, weight = _floor(floor, left)
+    fits = [
+        fitted(problem, residuals(measure, log[horizon], floor), slope / floor[..., None], weight)
+        for log in problem.healthy
+    ]
+    last, (floor, weight) = floor, _floor(floor, np.stack([fit.residual.reshape(raw[0].shape) for fit in fits]))
+    change = (last / floor).ravel()
     return Gauge(
         floor=floor,
         weight=weight,
         jacobian=slope / floor[..., None],
-        healthy=tuple(log / floor for log in raw),
+        healthy=tuple(
+            replace(fit, residual=(fit.residual.reshape(-1, len(change)) * change).ravel(), weight=weight)
+            for fit in fits
+        ),
     )
+
+
+def _floor(unit: np.ndarray, left: np.ndarray) -> tuple[np.ndarray, float]:
+    """The floor, and the independent share, of what is left of healthy logs [logs, segments, bins, components]."""
+    every = left.reshape(-1, *left.shape[2:])
+    fresh = unit * np.sqrt((every**2).mean(axis=0))
+    return np.maximum(fresh, _LEAST_SHARE * fresh.mean(axis=0)), independent_share(every)
+
+
+def fitted(problem: Problem, evaluate: Evaluate, slope: np.ndarray, weight: float) -> Fit:
+    """What is free from the start, fitted to a log.
+
+    Args:
+      evaluate: its residuals.
+      slope: [segments, bins, components, directions] at the nominal model.
+    """
+    free = nominal(problem)
+    start = Fit(
+        free=free,
+        coordinates=np.zeros(len(free.sd)),
+        residual=evaluate(np.zeros((1, problem.axes)))[0],
+        jacobian=slope.reshape(-1, len(free.sd)),
+        weight=weight,
+    )
+    return refine([start], evaluate, _ROUNDS)[0]
+
+
+def residuals(measure: Residuals, segments: Segments, floor: np.ndarray) -> Evaluate:
+    """Residuals [n, features] of vectors [n, axes], in floor units."""
+    return lambda vectors: (measure(vectors, segments) / floor).reshape(len(vectors), -1)
 
 
 def refitted(residual: np.ndarray, slope: np.ndarray, weight: float) -> np.ndarray:

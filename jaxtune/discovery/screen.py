@@ -46,19 +46,16 @@ class Screen:
         self._fit, self._columns = fit, columns
         self._projections = {}
 
-    def scores(self, hypotheses: Sequence[Hypothesis], residual: np.ndarray | None = None) -> dict[str, Score]:
-        """A score for every hypothesis; for other residuals [features], measured at the prior's centre, if given."""
-        return {hypothesis.key: self._score(hypothesis, residual) for hypothesis in hypotheses}
+    def scores(self, hypotheses: Sequence[Hypothesis], at: Fit | None = None) -> dict[str, Score]:
+        """A score for every hypothesis; at another fit of the same coordinates, if given."""
+        return {hypothesis.key: self._score(hypothesis, at) for hypothesis in hypotheses}
 
-    def _score(self, hypothesis: Hypothesis, residual: np.ndarray | None) -> Score:
+    def _score(self, hypothesis: Hypothesis, at: Fit | None) -> Score:
         own = given_up(self._fit.free, hypothesis)
-        value, project = self._projected(own)
-        least = np.sum(self._projected(np.zeros_like(own))[0] ** 2)
-        if residual is not None:
-            padding = np.zeros(len(value) - len(residual))
-            value = np.concatenate([np.sqrt(self._fit.weight) * residual, padding])
-            least = np.sum(self._projected(np.zeros_like(own))[1](self._with_prior(value, own)) ** 2)
-            value = project(value)
+        none = np.zeros_like(own)
+        project = self._projection(own)
+        value = project(_without(at or self._fit, own).rows()[0])
+        least = np.sum(self._projection(none)(_without(at or self._fit, none).rows()[0]) ** 2)
         best = Score(0.0, np.zeros(len(hypothesis.directions)), 0.0)
         visible = 0.0
         for sizes, group in groups(hypothesis):
@@ -93,7 +90,7 @@ class Screen:
         own = (free[:, axis] != 0) & self._fit.free.nominal
         if not own.any():
             return ()
-        _, project = self._projected(own)
+        project = self._projection(own)
         root, rest = np.sqrt(self._fit.weight), np.zeros(int((~own).sum()))
         seen = lambda column: project(np.concatenate([root * column, rest]))  # noqa: E731
         wanted = np.sign(change) * seen(self._fit.jacobian[:, own][:, 0])
@@ -112,21 +109,18 @@ class Screen:
                 found[hypothesis.name] = max(found.get(hypothesis.name, 0.0), float(explained))
         return tuple(sorted((name for name in found if found[name] >= share), key=lambda name: -found[name]))
 
-    def _with_prior(self, value: np.ndarray, own: np.ndarray) -> np.ndarray:
-        return np.concatenate([value, np.zeros(int(own.sum()))])
-
-    def _projected(self, own: np.ndarray):
-        """The point's residuals and the projection, without the coordinates that a hypothesis takes over."""
+    def _projection(self, own: np.ndarray):
+        """Onto what the coordinates cannot explain that a hypothesis does not take over."""
         key = own.tobytes()
         if key not in self._projections:
-            linear = self._fit.linear
-            left = Linear(
-                linear.residual, linear.jacobian[:, ~own], linear.offset[~own], linear.sd[~own], linear.weight
-            )
-            value, slope = left.rows()
-            project = complement(slope)
-            self._projections[key] = (project(value), project)
+            self._projections[key] = complement(_without(self._fit, own).rows()[1])
         return self._projections[key]
+
+
+def _without(fit: Fit, own: np.ndarray) -> Linear:
+    """A fit's surroundings without some of its coordinates."""
+    linear = fit.linear
+    return Linear(linear.residual, linear.jacobian[:, ~own], linear.offset[~own], linear.sd[~own], linear.weight)
 
 
 def shortlist(scores: Mapping[str, Score], hypotheses: Sequence[Hypothesis], count: int) -> list[Hypothesis]:

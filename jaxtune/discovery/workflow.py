@@ -15,7 +15,7 @@ import numpy as np
 from jaxtune.discovery import decide, localise
 from jaxtune.discovery.accept import Rung, accept, drop
 from jaxtune.discovery.fit import ROUNDS_MORE, Fit, Free, anew, begin, polish, refine
-from jaxtune.discovery.measure import Gauge, gauge, jacobian, nominal_directions, refitted
+from jaxtune.discovery.measure import Gauge, fitted, gauge, jacobian, nominal, residuals
 from jaxtune.discovery.problem import Hypothesis, Problem, Residuals, apart, together
 from jaxtune.discovery.prove import judge, prove, worst
 from jaxtune.discovery.saved import resume
@@ -135,33 +135,17 @@ class Discovery:
             known = self._calibration.floors[horizon] if self._calibration else None
             self.gauges[horizon] = gauge(self.problem, self.measure, horizon, known)
         self.say("null")
-        zero = np.zeros(self.problem.axes)
         for horizon in self.problem.horizons:
-            free = self._nominal()
-            start = Fit(
-                free=free,
-                coordinates=np.zeros(len(free.sd)),
-                residual=self.residual(horizon, "train")(zero[None])[0],
-                jacobian=self.gauges[horizon].jacobian.reshape(-1, len(free.sd)),
-                weight=self.gauges[horizon].weight,
-            )
-            self.fits[horizon] = refine([start], self.residual(horizon, "train"), 3)[0]
+            gauge_ = self.gauges[horizon]
+            evaluate = self.residual(horizon, "train")
+            self.fits[horizon] = fitted(self.problem, evaluate, gauge_.jacobian, gauge_.weight)
             if not np.isfinite(self.fits[horizon].residual).all():
                 raise ValueError(f"model: the nominal one breaks within {horizon:g} s of these logs")
         self.result.null = self.fits[self.main]
 
-    def _nominal(self) -> Free:
-        directions = nominal_directions(self.problem)
-        count = len(directions)
-        bounds = np.tile([-5.0, 5.0], (count, 1))
-        # Nobody looks before it is time.
-        bounds[count - len(self.problem.timing) :, 0] = 0.0
-        return Free(directions, np.ones(count), bounds, np.ones(count, bool))
-
     def residual(self, horizon: float, split: str):
         """Residuals [n, features] of vectors [n, axes]."""
-        floor, segments = self.gauges[horizon].floor, self.problem.data[split][horizon]
-        return lambda vectors: (self.measure(vectors, segments) / floor).reshape(len(vectors), -1)
+        return residuals(self.measure, self.problem.data[split][horizon], self.gauges[horizon].floor)
 
     def runs(self, split: str) -> np.ndarray:
         """Index of the run of every segment of the main horizon, [segments]."""
@@ -188,10 +172,8 @@ class Discovery:
         slopes = jacobian(self.measure, fit.vector, unit, segments) / gauge_.floor[..., None]
         flat = slopes.reshape(len(residual), -1, len(unit))
         if not self.penalty:
-            slope = gauge_.jacobian
             self.penalty = max(
-                localise.least_penalty(refitted(values, slope, gauge_.weight).reshape(len(residual), -1), flat)
-                for values in gauge_.healthy
+                localise.least_penalty(log.residual.reshape(len(residual), -1), flat) for log in gauge_.healthy
             )
         need = localise.free_torque(residual.reshape(len(residual), -1), flat, self.penalty)
         self.result.needs_torque = dict(zip(self._push, need.tolist(), strict=True))
@@ -231,7 +213,7 @@ class Discovery:
         gauge_ = self.gauges[self.main]
         best = []
         for log in gauge_.healthy:
-            scores = screen.scores(hypotheses, log.ravel())
+            scores = screen.scores(hypotheses, log)
             best.append(max(score.gain for score in scores.values()))
         return float(np.quantile(best, 1.0 - self.settings.level, method="higher"))
 
@@ -329,13 +311,13 @@ class Discovery:
         own = fit.along(hypothesis)
         evaluate = self.residual(horizon, "train")
         # What the hypothesis had taken over is a nominal parameter again.
-        nominal, slopes = self._nominal(), self.gauges[horizon].jacobian.reshape(len(fit.residual), -1)
+        first, slopes = nominal(self.problem), self.gauges[horizon].jacobian.reshape(len(fit.residual), -1)
         kept = fit.free.directions[fit.free.nominal & ~own]
-        back = np.array([not any((row == mine).all() for mine in kept) for row in nominal.directions])
+        back = np.array([not any((row == mine).all() for mine in kept) for row in first.directions])
         free = Free(*(part[~own] for part in fit.free.parts()))
         start = replace(
             fit,
-            free=free.and_then(Free(*(part[back] for part in nominal.parts()))),
+            free=free.and_then(Free(*(part[back] for part in first.parts()))),
             coordinates=np.concatenate([fit.coordinates[~own], np.zeros(back.sum())]),
             jacobian=np.concatenate([fit.jacobian[:, ~own], slopes[:, back]], axis=1),
         )
