@@ -61,15 +61,17 @@ HYPOTHESES = (
 WILD = hypothesis("wild", (0.0, 1.0), [0.1], "external")
 
 
-def measured(truth, seed, split=0, count=40):
+def measured(truth, seed, split=0, count=40, motion=None):
     """Segments by horizon: the truth's motion with noise, from states that are known to within the noise."""
-    rng = np.random.default_rng(seed)
+    rng, moved = np.random.default_rng((seed, 1)), np.random.default_rng(seed if motion is None else motion)
     vector = np.array([truth.get(axis, 0.0) for axis in AXES], np.float32)
     found = {}
     for horizon in HORIZONS:
         steps = round(horizon / DT)
-        force = 6.0 * rng.uniform(-1, 1, (count, 1)) * np.sin(rng.uniform(2, 12, (count, 1)) * DT * np.arange(steps))
-        start = {"x": rng.normal(0, 0.5, count), "v": rng.normal(0, 0.7, count), "force": force}
+        force = (
+            6.0 * moved.uniform(-1, 1, (count, 1)) * np.sin(moved.uniform(2, 12, (count, 1)) * DT * np.arange(steps))
+        )
+        start = {"x": moved.normal(0, 0.5, count), "v": moved.normal(0, 0.7, count), "force": force}
         start = {name: value.astype(np.float32) for name, value in start.items()}
         read = {name: np.asarray(value) for name, value in play(vector, start).items()}
         read = {name: value + NOISE * rng.standard_normal(value.shape) for name, value in read.items()}
@@ -87,7 +89,8 @@ def measured(truth, seed, split=0, count=40):
 def problem(truth, seed=0, hypotheses=HYPOTHESES):
     prior = np.array([0.1, 0.1, 0.0, 0.0, 0.0, 0.0, 0.0])
     # Nobody knows the nominal parameters better than to a tenth.
-    healthy = [measured({"mass": 0.1 * m, "damping": 0.1 * d}, 900 + i) for i, (m, d) in enumerate(DRAWS)]
+    drawn = [{"mass": 0.1 * m, "damping": 0.1 * d} for m, d in DRAWS]
+    healthy = [measured(one, 900 + i, motion=10 * seed) for i, one in enumerate(drawn)]
     return Problem(
         simulate=simulate,
         axes=len(AXES),
@@ -237,3 +240,35 @@ def test_residuals_compile_once_for_any_number_of_vectors_and_segments():
     alone = play(jnp.asarray(vectors[3], jnp.float32), segments.inputs)
     expected = np.concatenate([segments.signals[name] - np.asarray(alone[name]) for name in ("dq", "q")], axis=-1)
     np.testing.assert_allclose(many[3], expected.reshape(40, 10, 2, 2).mean(axis=2), atol=1e-5)
+
+
+@pytest.mark.parametrize(("quiet", "screens"), [(1.2, 1), (0.0, 2)])
+def test_at_the_floor_nobody_looks_for_more(monkeypatch, quiet, screens):
+    looked = []
+    monkeypatch.setattr(
+        Discovery, "screen", lambda self, *args, screen=Discovery.screen: looked.append(1) or screen(self, *args)
+    )
+    result = Discovery(problem({"coulomb": 0.5}), Settings(quiet=quiet), PUSH).run()
+    assert [rung.hypothesis.name for rung in result.rungs] == ["coulomb"]
+    assert len(looked) == screens
+
+
+def test_what_promises_too_little_is_not_fitted(monkeypatch):
+    begun = {}
+
+    def compete(self, short, *args):
+        begun.update({h.key: self.promise[h.key] / self.least_gain for h in short})
+        return [], {}
+
+    def tried(promising):
+        begun.clear()
+        Discovery(problem({"coulomb": 0.5}), Settings(promising=promising), PUSH).run()
+        return dict(begun)
+
+    monkeypatch.setattr(Discovery, "_compete", compete)
+    everything = tried(0.0)
+    best = max(everything, key=everything.get)
+    assert best == "coulomb@slider"
+    assert len(everything) > 1
+    assert set(tried(0.9 * everything[best])) == {h for h in everything if everything[h] > 0.9 * everything[best]}
+    assert not tried(1.1 * everything[best])
