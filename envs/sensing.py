@@ -4,10 +4,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-_VELOCITY_SCALE = 2.0
-_COMMAND_SCALE = np.array([2.0, 2.0, 0.25], np.float32)
-_GYRO_SCALE = 0.25
-_JOINT_VELOCITY_SCALE = 0.05
+LAYOUT = {
+    "velocity": np.full(3, 2.0, np.float32),
+    "command": np.array([2.0, 2.0, 0.25], np.float32),
+    "gyro": np.full(3, 0.25, np.float32),
+    "gravity": np.ones(3, np.float32),
+    "joint": np.ones(6, np.float32),
+    "joint_velocity": np.full(6, 0.05, np.float32),
+    "last_action": np.ones(6, np.float32),
+    "joint_error": np.ones(6, np.float32),
+    "clock": np.ones(4, np.float32),
+}
+"""Parts of the observation, in the order of the paper (section IV-A.2), and what each component is multiplied by."""
 
 NOISE = {"velocity": 0.1, "gyro": 0.2, "gravity": 0.05, "joint": 0.01, "joint_velocity": 1.5}
 """Half width of the uniform noise, before scaling: m/s, rad/s, 1, rad, rad/s."""
@@ -49,7 +57,7 @@ def observe(
     phase: jax.Array,
     stand: jax.Array,
 ) -> jax.Array:
-    """Builds the observation in the paper's order (section IV-A.2).
+    """Builds the observation, laid out as `LAYOUT` says.
 
     Args:
       velocity: [3] m/s, of the trunk's origin, body frame.
@@ -66,24 +74,23 @@ def observe(
       [40]: velocity 0:3, command 3:6, gyro 6:9, gravity 9:12, joint 12:18, joint velocity 18:24, last action 24:30,
       joint error 30:36, clock 36:40.
     """
-    return jnp.concatenate(
-        [
-            velocity * _VELOCITY_SCALE,
-            command * _COMMAND_SCALE,
-            gyro * _GYRO_SCALE,
-            gravity,
-            joint - stand,
-            joint_velocity * _JOINT_VELOCITY_SCALE,
-            last_action,
-            joint_error,
-            clock(phase),
-        ]
-    )
+    parts = {
+        "velocity": velocity,
+        "command": command,
+        "gyro": gyro,
+        "gravity": gravity,
+        "joint": joint - stand,
+        "joint_velocity": joint_velocity,
+        "last_action": last_action,
+        "joint_error": joint_error,
+        "clock": clock(phase),
+    }
+    return jnp.concatenate([parts[name] * scale for name, scale in LAYOUT.items()])
 
 
 def with_command(obs: jax.Array, command: jax.Array) -> jax.Array:
     """The observation [40] that another command would have made."""
-    return obs.at[3:6].set(command * _COMMAND_SCALE)
+    return obs.at[3:6].set(command * LAYOUT["command"])
 
 
 def disturb(key: jax.Array, readings: dict[str, jax.Array], scale: float) -> dict[str, jax.Array]:

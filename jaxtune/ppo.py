@@ -113,6 +113,19 @@ class PPO:
         make = networks.make_inference_fn(self._networks)
         return make((state.normalizer, state.params.policy), deterministic=deterministic)
 
+    @staticmethod
+    def layers(state: PPOState) -> tuple[tuple[jax.Array, jax.Array], list[tuple[jax.Array, jax.Array]]]:
+        """The deterministic policy as numbers, for who has no JAX.
+
+        Returns:
+          Mean and standard deviation [obs] that observations are normalised by; kernels [in, out] and biases [out] of
+          the layers, with ELU behind all but the last.
+        """
+        params = state.params.policy["params"]
+        hidden = params["MLP_0"]
+        every = [*(hidden[f"hidden_{index}"] for index in range(len(hidden))), params["Dense_0"]]
+        return (state.normalizer.mean, state.normalizer.std), [(layer["kernel"], layer["bias"]) for layer in every]
+
     def update(self, key: jax.Array, state: PPOState, env: Env, env_state: State) -> tuple[PPOState, State, dict]:
         """Collects one rollout and learns from it.
 

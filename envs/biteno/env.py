@@ -23,7 +23,7 @@ from envs import domain, sensing
 from envs.biteno import constants, gait, rewards
 from envs.chain import MIN_FRICTION_NM
 
-_ACTION_LIMIT = 10.0
+ACTION_LIMIT = 10.0
 _MIN_HEIGHT_M = 0.35
 _MAX_TILT_COS = np.cos(np.pi / 4)
 
@@ -207,7 +207,7 @@ class Biteno:
 
     def drive(self, params: domain.Params, state: State, action: jax.Array) -> Drive:
         """What an action [6] asks of the joints."""
-        action = jnp.clip(action, -_ACTION_LIMIT, _ACTION_LIMIT)
+        action = jnp.clip(action, -ACTION_LIMIT, ACTION_LIMIT)
         reference = gait.joint_reference(state.phase, state.command)
         base = reference if self.config.base == "raibert" else jnp.asarray(constants.STAND_RAD)
         target = base + self.config.action_scale * action
