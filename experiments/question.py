@@ -211,9 +211,9 @@ def _bounds(rig: Rig, row: Effect, places: Sequence[str]) -> np.ndarray:
 
 
 def _timing(rig: Rig) -> np.ndarray:
-    """Half a period of the controller, as the delay of all readings, [1, axes]."""
-    late = [axis.effect == "sensor_delay" for axis in rig.axes]
-    return np.array([late], float) * 0.5 / rig.control_hz
+    """Half a period of the controller, as the delay of all readings and as that of all targets, [2, axes]."""
+    late = [[axis.effect == effect for axis in rig.axes] for effect in ("sensor_delay", "command_delay")]
+    return np.array(late, float) * 0.5 / rig.control_hz
 
 
 def place_sets(places: Sequence[str]) -> list[tuple[str, ...]]:

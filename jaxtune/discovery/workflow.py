@@ -40,9 +40,7 @@ class Settings:
     share: float = 0.5
     """Of the energy above the floor that the named effects must explain together; else it is `unnamed`."""
     at_floor: float = 1.5
-    """Floor units up to which a gap is none."""
-    quiet: float = 1.2
-    """Floor units in any signal up to which nothing more is looked for."""
+    """Floor units up to which a gap is none, and up to which, in every signal, nothing more is looked for."""
     promising: float = 0.3
     """Share of the gain it takes that the screen must see for a fit."""
     same: float = 0.8
@@ -228,7 +226,7 @@ class Discovery:
         base = self.fits[self.main]
         if not self.result.rungs:
             self.result.null = base
-        if self.looked and worst(self, base.vector) <= settings.quiet:
+        if self.looked and worst(self, base.vector) <= settings.at_floor:
             return False
         taken = {rung.hypothesis.key for rung in self.result.rungs} | set(self.result.dropped)
         hypotheses = [h for h in problem.hypotheses if h.key not in taken]

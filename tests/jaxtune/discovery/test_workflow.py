@@ -242,13 +242,13 @@ def test_residuals_compile_once_for_any_number_of_vectors_and_segments():
     np.testing.assert_allclose(many[3], expected.reshape(40, 10, 2, 2).mean(axis=2), atol=1e-5)
 
 
-@pytest.mark.parametrize(("quiet", "screens"), [(1.2, 1), (0.0, 2)])
-def test_at_the_floor_nobody_looks_for_more(monkeypatch, quiet, screens):
+@pytest.mark.parametrize(("at_floor", "screens"), [(1.5, 1), (0.0, 2)])
+def test_at_the_floor_nobody_looks_for_more(monkeypatch, at_floor, screens):
     looked = []
     monkeypatch.setattr(
         Discovery, "screen", lambda self, *args, screen=Discovery.screen: looked.append(1) or screen(self, *args)
     )
-    result = Discovery(problem({"coulomb": 0.5}), Settings(quiet=quiet), PUSH).run()
+    result = Discovery(problem({"coulomb": 0.5}), Settings(at_floor=at_floor), PUSH).run()
     assert [rung.hypothesis.name for rung in result.rungs] == ["coulomb"]
     assert len(looked) == screens
 
