@@ -121,7 +121,7 @@ class Effect:
     parameters: tuple[Parameter, ...]
     sizes: tuple[float, ...]
     """Coordinates at which it is looked for, the smallest size of interest first; effects without a derivative at zero
-    have a second one."""
+    have larger ones beside it."""
     sentence: str
     """What a person should picture."""
     excited_by: str

@@ -101,7 +101,7 @@ ROWS = (
         name="torque_speed",
         enters="torque",
         parameters=(Parameter(name="nm_s_per_rad", scale="motor", bounds=(0.0, 1.0), prior=0.2),),
-        sizes=(0.1, 0.3),
+        sizes=(0.1, 0.3, 0.5),
         act=_torque_speed,
         sentence="The faster the motor turns, the less torque it can give.",
         excited_by="saturating steps",

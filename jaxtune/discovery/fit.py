@@ -77,8 +77,14 @@ class Fit:
 
     def moved(self, scale: float) -> np.ndarray:
         """Coordinates a share of the best step away, within the bounds."""
-        step = self.linear.step(_DAMPING)
+        step = self.linear.step(_DAMPING, self.free.bounds)
         return np.clip(self.coordinates + scale * step, self.free.bounds[:, 0], self.free.bounds[:, 1])
+
+    @property
+    def at_bounds(self) -> np.ndarray:
+        """Which coordinates [coordinates] are where they may not go on."""
+        low, high = self.free.bounds.T
+        return (self.coordinates <= low) | (self.coordinates >= high)
 
 
 def refine(fits: Sequence[Fit], evaluate: Evaluate, rounds: int) -> list[Fit]:

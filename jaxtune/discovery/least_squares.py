@@ -36,14 +36,31 @@ class Linear:
         slope = np.concatenate([root * self.jacobian, np.diag(1.0 / self.sd)])
         return value, slope
 
-    def step(self, damping: float = 0.0) -> np.ndarray:
-        """The step [coordinates] to the least loss."""
+    def step(self, damping: float = 0.0, bounds: np.ndarray | None = None) -> np.ndarray:
+        """The step [coordinates] to the least loss; within bounds [coordinates, 2] of the point, if given.
+
+        What would leave its bounds is put there, and the rest is solved again without it: a step that is only cut
+        short leads nowhere, because the others were to go along with it.
+        """
         value, slope = self.rows()
-        normal = slope.T @ slope
+        normal, pull = slope.T @ slope, slope.T @ value
         diagonal = np.diag(normal).copy()
         diagonal[diagonal <= 0] = 1.0
         # What nothing depends on stays where it is.
-        return np.linalg.solve(normal + np.diag(damping * diagonal + 1e-9 * diagonal), -slope.T @ value)
+        normal = normal + np.diag(damping * diagonal + 1e-9 * diagonal)
+        if bounds is None:
+            return np.linalg.solve(normal, -pull)
+        low, high = (bounds - self.offset[:, None]).T
+        step, free = np.zeros(len(pull)), np.ones(len(pull), bool)
+        while free.any():
+            step[free] = np.linalg.solve(
+                normal[np.ix_(free, free)], -pull[free] - normal[np.ix_(free, ~free)] @ step[~free]
+            )
+            out = free & ((step < low) | (step > high))
+            if not out.any():
+                break
+            step, free = np.where(out, np.clip(step, low, high), step), free & ~out
+        return step
 
 
 def complement(slope: np.ndarray, ridge: float = 1e-9):

@@ -14,6 +14,7 @@ from jaxtune.discovery.least_squares import Linear
 from jaxtune.discovery.problem import Problem, Residuals, Segments
 
 _ROUNDS = 6  # of a fit: what one step leaves of parameters that are a tenth off would pass for a gap between engines
+_FURTHEST = 9.0  # standard deviations: nothing positive is less than nothing
 _LEAST_SHARE = 0.25  # of a component's mean floor; the first rows of a segment would count without end
 
 
@@ -46,7 +47,7 @@ def nominal(problem: Problem) -> Free:
     """What is free from the start."""
     directions = nominal_directions(problem)
     count = len(directions)
-    bounds = np.tile([-5.0, 5.0], (count, 1))
+    bounds = np.tile([-_FURTHEST, _FURTHEST], (count, 1))
     # Nobody looks or acts before it is time.
     bounds[count - len(problem.timing) :, 0] = 0.0
     return Free(directions, np.ones(count), bounds, np.ones(count, bool))

@@ -91,7 +91,7 @@ class Problem:
     prior: np.ndarray
     """[axes] standard deviation of the nominal parameters, zero for every other axis."""
     timing: np.ndarray
-    """[directions, axes] a standard deviation along what nobody knows better either: when the controller looks and acts."""
+    """[directions, axes] a standard deviation along what nobody knows either: when the controller looks and acts."""
     data: Mapping[str, Mapping[float, Segments]]
     """Segments by split and horizon in s."""
     healthy: Sequence[Mapping[float, Segments]]

@@ -51,8 +51,9 @@ class Screen:
         return {hypothesis.key: self._score(hypothesis, at) for hypothesis in hypotheses}
 
     def _score(self, hypothesis: Hypothesis, at: Fit | None) -> Score:
-        own = given_up(self._fit.free, hypothesis)
-        none = np.zeros_like(own)
+        # What is at its bound cannot make room for anything.
+        none = self._fit.at_bounds
+        own = none | given_up(self._fit.free, hypothesis)
         project = self._projection(own)
         value = project(_without(at or self._fit, own).rows()[0])
         least = np.sum(self._projection(none)(_without(at or self._fit, none).rows()[0]) ** 2)
