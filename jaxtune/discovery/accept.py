@@ -48,6 +48,7 @@ def accept(discovery, short: Sequence[Hypothesis], everywhere: Mapping[float, Ma
     evidence = decide.Evidence(
         gain=gained[hypothesis.key],
         t=decide.t_statistic(gains[hypothesis.key], runs["select"]),
+        confirmed=decide.confirmed(before, after[hypothesis.key], runs["select"], base.weight),
         floors=_floors(before, after[hypothesis.key]),
         **_estimate(discovery, fitted[hypothesis.key], hypothesis, parts),
         horizons=sum(_wins(discovery, horizon, hypothesis.key, found) for horizon, (_, found) in residuals.items()),

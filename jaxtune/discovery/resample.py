@@ -35,3 +35,10 @@ def blocks(run: np.ndarray, draws: int = 1000, seed: int = 0) -> np.ndarray:
 def standard_error(values: np.ndarray, run: np.ndarray) -> float:
     """Of the mean of values [segments]."""
     return float(max(values[blocks(run)].mean(axis=1).std(), 1e-12))
+
+
+def in_blocks(values: np.ndarray, run: np.ndarray) -> np.ndarray:
+    """Sums of values [segments, ...] over blocks that do not overlap, [blocks, ...]."""
+    first = np.flatnonzero(np.diff(run, prepend=run[0] - 1))
+    starts = [np.arange(a, b, LENGTH) for a, b in zip(first, [*first[1:], len(run)], strict=True)]
+    return np.add.reduceat(values, np.concatenate(starts), axis=0)

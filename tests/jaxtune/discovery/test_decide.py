@@ -83,3 +83,29 @@ def test_a_pair_is_two_hypotheses_side_by_side():
     # Each is looked for alone.
     assert ((pair.probes != 0).sum(axis=1) == 1).all()
     assert pair.probes.shape == (len(one.probes) + len(two.probes), 2)
+
+
+def test_what_shows_in_few_segments_is_confirmed_there():
+    run = np.repeat([0, 1], 15)
+    before = np.random.default_rng(0).standard_normal((30, 4, 2))
+    after = before.copy()
+    before[[2, 9, 20]] += 10.0
+    # Three blocks gain 800 each or nearly, of which one does not count; a t of the same gains is low.
+    gain = decide.confirmed(before, after, run, 0.5)
+    expected = 0.5 * ((before[[2, 9, 20]] ** 2).sum() - (after[[2, 9, 20]] ** 2).sum())
+    assert gain == pytest.approx(expected * 2 / 3, rel=0.1)
+    assert decide.t_statistic(decide.paired(before, after), run) < 2.0
+    # One block proves nothing, and what is worse elsewhere counts.
+    lucky = after.copy()
+    lucky[2] += 10.0
+    assert decide.confirmed(lucky, after, run, 0.5) == 0.0
+    assert decide.confirmed(lucky, after + 0.1 * np.sign(after), run, 0.5) < 0.0
+
+
+def test_either_way_of_being_significant_is_enough():
+    sure = {"floors": 9.0, "interval": (1.0, 2.0), "inside": True, "horizons": 3, "chosen": 1.0}
+    least = decide.Thresholds(t=2.0, gain=100.0)
+    for t, confirmed, enough in ((3.0, -5.0, True), (1.0, 101.0, True), (1.0, 99.0, False)):
+        evidence = decide.Evidence(gain=500.0, t=t, confirmed=confirmed, **sure)
+        assert decide.passes(evidence, least)["significant"] is enough
+        assert all(decide.passes(evidence, least).values()) is enough
