@@ -31,7 +31,7 @@ from experiments.excite import Motion, excitation
 from experiments.hidden import OUTSIDE, Truth, record
 from experiments.question import HORIZONS_S, Question, ask
 from experiments.train import console, run
-from jaxtune.discovery.measure import gauge, refitted
+from jaxtune.discovery.measure import refitted, slopes
 from jaxtune.discovery.problem import Residuals
 from jaxtune.discovery.workflow import Calibration, Discovery
 
@@ -224,7 +224,7 @@ class Bench:
         known, seed = self.calibration.floors[main], self.seed(case)
         problem = self.ask(self.record(Truth(None), seed, noise=False), (main,)).problem
         measure, zero = Residuals(problem), np.zeros(problem.axes)
-        slope = gauge(problem, measure, main, known).jacobian
+        slope = slopes(problem, measure, main) / known[0][..., None]
         plain = measure(zero, problem.data["train"][main])[0]
         positions = slice(-len(self.size.joints), None)
 

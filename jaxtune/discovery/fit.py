@@ -18,6 +18,8 @@ Evaluate = Callable[[np.ndarray], np.ndarray]
 ROUNDS_MORE = 2  # of a fit that starts from another one
 _SCALES = (1.0, 0.35)
 _DAMPING = 1e-3
+_IDLE = 1e-3  # share of a loss
+_PATIENCE = 2  # rounds
 _SHORTEST = 0.03  # of a step that slopes are learnt from
 
 
@@ -88,13 +90,21 @@ class Fit:
 
 
 def refine(fits: Sequence[Fit], evaluate: Evaluate, rounds: int) -> list[Fit]:
-    """Moves every fit towards its least loss; one that meets nothing but numbers that are not finite says so."""
-    fits = list(fits)
+    """Moves every fit towards its least loss; one that meets nothing but numbers that are not finite says so.
+
+    One that has not moved by a thousandth of its loss twice in a row is where it belongs.
+    """
+    fits, idle = list(fits), [0] * len(fits)
     for _ in range(rounds):
-        trials = [[fit.moved(scale) for scale in _SCALES] for fit in fits]
-        vectors = [point @ fit.free.directions for fit, points in zip(fits, trials, strict=True) for point in points]
-        found = evaluate(np.stack(vectors)).reshape(len(fits), len(_SCALES), -1)
-        fits = [_best(*trio) for trio in zip(fits, trials, found, strict=True)]
+        active = [index for index, count in enumerate(idle) if count < _PATIENCE]
+        if not active:
+            break
+        trials = [[fits[index].moved(scale) for scale in _SCALES] for index in active]
+        vectors = [p @ fits[index].free.directions for index, pair in zip(active, trials, strict=True) for p in pair]
+        found = evaluate(np.stack(vectors)).reshape(len(active), len(_SCALES), -1)
+        for index, points, residuals in zip(active, trials, found, strict=True):
+            before, fits[index] = fits[index].linear.loss, _best(fits[index], points, residuals)
+            idle[index] = idle[index] + 1 if fits[index].linear.loss > (1.0 - _IDLE) * before else 0
     return fits
 
 

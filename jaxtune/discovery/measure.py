@@ -26,8 +26,6 @@ class Gauge:
     """[bins, components]"""
     weight: float
     """Share of the bins that count as independent."""
-    jacobian: np.ndarray
-    """[segments, bins, components, directions] of what is free from the start, at the nominal model, on `train`."""
     healthy: tuple[Fit, ...]
     """What is free from the start, fitted to the `train` of every healthy log."""
 
@@ -36,6 +34,12 @@ def jacobian(measure: Residuals, vector: np.ndarray, directions: np.ndarray, seg
     """Secants of the residuals along directions [k, axes], [segments, bins, components, k]."""
     found = measure(np.concatenate([vector[None], vector + directions]), segments)
     return np.moveaxis(found[1:] - found[:1], 0, -1)
+
+
+def slopes(problem: Problem, measure: Residuals, horizon: float) -> np.ndarray:
+    """Secants along what is free from the start, at the nominal model on `train`: [segments, bins, components, k]."""
+    zero = np.zeros(problem.axes)
+    return jacobian(measure, zero, nominal_directions(problem), problem.data["train"][horizon])
 
 
 def nominal_directions(problem: Problem) -> np.ndarray:
@@ -55,10 +59,9 @@ def nominal(problem: Problem) -> Free:
 
 def gauge(problem: Problem, measure: Residuals, horizon: float, known: tuple[np.ndarray, float] | None = None) -> Gauge:
     """Measures the floor at one horizon, or takes one that is known: floor and independent share."""
-    zero = np.zeros(problem.axes)
-    slope = jacobian(measure, zero, nominal_directions(problem), problem.data["train"][horizon])
     if known is not None:
-        return Gauge(floor=known[0], weight=known[1], jacobian=slope / known[0][..., None], healthy=())
+        return Gauge(floor=known[0], weight=known[1], healthy=())
+    zero, slope = np.zeros(problem.axes), slopes(problem, measure, horizon)
     raw = [measure(zero, log[horizon])[0] for log in problem.healthy]
     floor, weight = np.sqrt((np.concatenate(raw) ** 2).mean(axis=0)), 1.0
     for _ in range(2):
@@ -73,7 +76,6 @@ def gauge(problem: Problem, measure: Residuals, horizon: float, known: tuple[np.
     return Gauge(
         floor=floor,
         weight=weight,
-        jacobian=slope / floor[..., None],
         healthy=tuple(
             replace(fit, residual=(fit.residual.reshape(-1, len(change)) * change).ravel(), weight=weight)
             for fit in fits

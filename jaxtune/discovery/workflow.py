@@ -15,7 +15,7 @@ import numpy as np
 from jaxtune.discovery import decide, localise
 from jaxtune.discovery.accept import Rung, accept, drop
 from jaxtune.discovery.fit import ROUNDS_MORE, Fit, Free, anew, begin, polish, refine
-from jaxtune.discovery.measure import Gauge, fitted, gauge, jacobian, nominal, residuals
+from jaxtune.discovery.measure import Gauge, fitted, gauge, jacobian, nominal, residuals, slopes
 from jaxtune.discovery.problem import Hypothesis, Problem, Residuals, apart, together
 from jaxtune.discovery.prove import judge, prove, worst
 from jaxtune.discovery.saved import resume
@@ -117,6 +117,9 @@ class Discovery:
         self.main = problem.horizons[len(problem.horizons) // 2]
         self.gauges: dict[float, Gauge] = {}
         self.fits: dict[float, Fit] = {}
+        """The model as it stands, by horizon; other horizons than the main one from when they are first asked for."""
+        self._settled: set[float] = set()
+        self._slopes: dict[float, np.ndarray] = {}
         self.result = Result()
         self._calibration, self.looked = calibration, False
         self._screen: Screen | None = None
@@ -133,13 +136,31 @@ class Discovery:
             known = self._calibration.floors[horizon] if self._calibration else None
             self.gauges[horizon] = gauge(self.problem, self.measure, horizon, known)
         self.say("null")
-        for horizon in self.problem.horizons:
-            gauge_ = self.gauges[horizon]
-            evaluate = self.residual(horizon, "train")
-            self.fits[horizon] = fitted(self.problem, evaluate, gauge_.jacobian, gauge_.weight)
-            if not np.isfinite(self.fits[horizon].residual).all():
-                raise ValueError(f"model: the nominal one breaks within {horizon:g} s of these logs")
-        self.result.null = self.fits[self.main]
+        main = self.main
+        null = fitted(self.problem, self.residual(main, "train"), self.slopes(main), self.gauges[main].weight)
+        if not np.isfinite(null.residual).all():
+            raise ValueError(f"model: the nominal one breaks within {main:g} s of these logs")
+        self.fits[main] = self.result.null = null
+
+    def slopes(self, horizon: float) -> np.ndarray:
+        """Of what is free from the start, at the nominal model: [segments, bins, components, directions]."""
+        if horizon not in self._slopes:
+            found = slopes(self.problem, self.measure, horizon)
+            self._slopes[horizon] = found / self.gauges[horizon].floor[..., None]
+        return self._slopes[horizon]
+
+    def settle(self, horizon: float) -> Fit:
+        """The model as it stands, fitted once a round with fresh slopes.
+
+        Or the screen would not see what the nominal parameters have taken over; and with as many rounds as the
+        hypotheses get, so that what they gain is theirs.
+        """
+        if horizon not in self._settled:
+            fit = self.fits.get(horizon) or self.fits[self.main]
+            fresh = self.anew(fit.free, fit.coordinates, horizon)
+            self.fits[horizon] = refine([fresh], self.residual(horizon, "train"), 2 * self.settings.rounds)[0]
+            self._settled.add(horizon)
+        return self.fits[horizon]
 
     def residual(self, horizon: float, split: str):
         """Residuals [n, features] of vectors [n, axes]."""
@@ -203,7 +224,7 @@ class Discovery:
     ) -> list[Fit]:
         """Fits hypotheses with everything that is free already, each from the best of the points that are tried."""
         evaluate = self.residual(horizon, "train")
-        fits = begin(self.fits[horizon], hypotheses, [tried[h.key] for h in hypotheses], evaluate, absolute, like)
+        fits = begin(self.settle(horizon), hypotheses, [tried[h.key] for h in hypotheses], evaluate, absolute, like)
         return refine(fits, evaluate, rounds)
 
     def healthy_gain(self, screen: Screen, hypotheses: Sequence[Hypothesis]) -> float:
@@ -218,12 +239,8 @@ class Discovery:
     def round(self) -> bool:
         """Looks for one more effect; whether one was accepted."""
         problem, settings = self.problem, self.settings
-        # With slopes of where it stands now, or the screen would not see what the nominal parameters have taken over;
-        # and as many rounds as the hypotheses get, so that what they gain is theirs.
-        for horizon, fit in self.fits.items():
-            fresh = self.anew(fit.free, fit.coordinates, horizon)
-            self.fits[horizon] = refine([fresh], self.residual(horizon, "train"), 2 * settings.rounds)[0]
-        base = self.fits[self.main]
+        self._settled.clear()
+        base = self.settle(self.main)
         if not self.result.rungs:
             self.result.null = base
         if self.looked and worst(self, base.vector) <= settings.at_floor:
@@ -309,7 +326,7 @@ class Discovery:
         own = fit.along(hypothesis)
         evaluate = self.residual(horizon, "train")
         # What the hypothesis had taken over is a nominal parameter again.
-        first, slopes = nominal(self.problem), self.gauges[horizon].jacobian.reshape(len(fit.residual), -1)
+        first, seen = nominal(self.problem), self.slopes(horizon).reshape(len(fit.residual), -1)
         kept = fit.free.directions[fit.free.nominal & ~own]
         back = np.array([not any((row == mine).all() for mine in kept) for row in first.directions])
         free = Free(*(part[~own] for part in fit.free.parts()))
@@ -317,7 +334,7 @@ class Discovery:
             fit,
             free=free.and_then(Free(*(part[back] for part in first.parts()))),
             coordinates=np.concatenate([fit.coordinates[~own], np.zeros(back.sum())]),
-            jacobian=np.concatenate([fit.jacobian[:, ~own], slopes[:, back]], axis=1),
+            jacobian=np.concatenate([fit.jacobian[:, ~own], seen[:, back]], axis=1),
         )
         start = replace(start, residual=evaluate(start.vector[None])[0])
         return refine([start], evaluate, 3)[0]

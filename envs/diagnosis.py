@@ -1,0 +1,368 @@
+"""What is wrong with a log itself, before anything is learnt from it.
+
+Structure first: time stamps, rows, steps of rounding, clipping. Then physics, by trying: a repair (two joints
+exchanged, a sign turned, degrees made radians, an offset or a delay taken out, a clock set right) is believed where the
+log agrees much better with itself and with the model after it. Agreement has up to five parts for every joint, each
+between none (0) and all of it (2) of the signal's own size:
+
+- measured velocities are the slopes of measured positions;
+- the controller's torque is what the model needs for the measured motion (robots that are hung or clamped);
+- the measured torque is the controller's;
+- positions follow their targets, and stay within the joints' ranges.
+
+Repairs are looked for one after the other, the best first.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import mujoco
+import numpy as np
+
+from envs.logs import Run
+from envs.rig import hung
+from envs.segments import quantum_of, smoothed
+
+MEASURED = ("q", "dq", "tau")
+_MOST = 2.0
+_BETTER = 0.35  # by how much all parts together must agree better, in units of one joint's whole signal
+_SHARE = 0.15  # and by which share of what they disagree
+_MOST_REPAIRS = 3
+_ROWS = 600  # of a run, at most, that the model is asked about
+_DELAYS_S = (0.004, 0.008, 0.012, 0.016, 0.024, 0.032, 0.045)
+_LEAST_OFFSET_RAD = 0.025
+_LEAST_DRIFT = 0.015
+_LEAST_RATE_HZ = 100.0
+_COARSE = 0.005  # rad of an encoder's step that hides what matters
+_CLIPPED = 0.01  # share of rows at a signal's own largest or smallest value
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One suspicion."""
+
+    kind: str
+    """What is wrong, as one word or two."""
+    signal: str
+    """Where: a signal, `measured` for all that sensors say, or `t`."""
+    joints: tuple[str, ...]
+    size: float
+    """How much, in the unit of the sentence."""
+    sentence: str
+    """For a person, with what to do about it."""
+
+
+def diagnose(run: Run, joints: tuple[str, ...], spec: mujoco.MjSpec | None = None) -> list[Finding]:
+    """Everything that is suspected of a run.
+
+    Args:
+      run: as it was read.
+      joints: of the log.
+      spec: the model, for a robot that is hung or clamped; None where nothing but the log itself can be asked.
+    """
+    found, clean = structure(run)
+    return found + physics(clean, joints, hung(spec) if spec else None)
+
+
+# --- structure
+
+
+def structure(run: Run) -> tuple[list[Finding], Run]:
+    """What is wrong with time stamps, rows and single values; and the longest piece of the run that is in order."""
+    found = []
+    steps = np.diff(run.time)
+    period = float(np.median(steps))
+    if 1.0 / period < _LEAST_RATE_HZ:
+        text = f"{1 / period:.3g} rows a second are too few to see what a joint does: record {_LEAST_RATE_HZ:g} or more"
+        found.append(Finding("low rate", "t", (), 1.0 / period, text))
+    twice = _repeated(run)
+    if twice.any():
+        text = f"{twice.sum()} row(s) repeat the row before, the first is row {np.argmax(twice) + 2}: take them out"
+        found.append(Finding("duplicated rows", "t", (), float(twice.sum()), text))
+    holes = np.flatnonzero((steps > 1.6 * period) & (steps > period + 4.0 * _spread(steps)))
+    for row in holes:
+        moved = _moves_on(run, row, period)
+        kind, what = ("missing rows", "rows are missing") if moved else ("clock jump", "the clock jumps")
+        text = f"{what} behind row {row + 1}: {steps[row]:.4g} s to the next, where {period:.4g} s are usual"
+        found.append(Finding(kind, "t", (), float(steps[row]), text))
+    return found, _longest(run, np.union1d(holes, np.flatnonzero(twice)))
+
+
+def _spread(values: np.ndarray) -> float:
+    return float(1.4826 * np.median(np.abs(values - np.median(values)))) + 1e-9
+
+
+def _repeated(run: Run) -> np.ndarray:
+    """Rows but the first [rows - 1] in which everything that was measured is as it was."""
+    measured = [run.signals[name] for name in (*MEASURED, "gyro", "acc", "vel") if name in run.signals]
+    values = np.concatenate([one.reshape(len(run.time), -1) for one in measured], axis=1)
+    same = (np.diff(values, axis=0) == 0).all(axis=1)
+    # A robot that stands still behind coarse encoders repeats itself by right.
+    return same if same.mean() < 0.05 else np.zeros_like(same)
+
+
+def _moves_on(run: Run, row: int, period: float) -> bool:
+    """Whether positions have moved on over a hole as far as its length says, and not as far as one row does."""
+    before, after = slice(max(0, row - 4), row + 1), slice(row + 1, row + 6)
+    time, q = run.time, run.signals["q"]
+    slope = 0.5 * (_slope(time[before], q[before]) + _slope(time[after], q[after]))
+    moved = q[row + 1] - q[row]
+    hole = time[row + 1] - time[row]
+    return bool(np.sum((moved - hole * slope) ** 2) < np.sum((moved - period * slope) ** 2))
+
+
+def _slope(time: np.ndarray, values: np.ndarray) -> np.ndarray:
+    time = time - time.mean()
+    return time @ (values - values.mean(axis=0)) / max(time @ time, 1e-12)
+
+
+def _longest(run: Run, cuts: np.ndarray) -> Run:
+    """The longest piece between cuts, which are behind rows."""
+    edges = np.concatenate([[0], cuts + 1, [len(run.time)]])
+    index = int(np.argmax(np.diff(edges)))
+    rows = slice(edges[index], edges[index + 1])
+    return replace(run, time=run.time[rows], signals={name: values[rows] for name, values in run.signals.items()})
+
+
+# --- physics
+
+
+@dataclass(frozen=True)
+class _Repair:
+    """What is tried."""
+
+    kind: str
+    signal: str
+    joints: tuple[int, ...]
+    size: float
+    apply: Callable[[Run], Run]
+
+
+def physics(run: Run, joints: tuple[str, ...], model: mujoco.MjModel | None) -> list[Finding]:
+    """Orders, signs, units, offsets and delays that a run agrees better without."""
+    run = _thinned(run)
+    found = [*_coarse(run, joints), *_clipped(run, joints)]
+    disagreement = _Disagreement(run, joints, model)
+    now = disagreement(run)
+    for _ in range(_MOST_REPAIRS):
+        tried = [(repair, *_tried(repair, run, disagreement)) for repair in _repairs(run, disagreement)]
+        if not tried:
+            break
+        repair, repaired, then = min(tried, key=lambda one: one[2])
+        if now - then < max(_BETTER, _SHARE * now):
+            break
+        found.append(_as_finding(repair, joints))
+        run, now = repaired, then
+    return found
+
+
+def _tried(repair: _Repair, run: Run, disagreement: "_Disagreement") -> tuple[Run, float]:
+    repaired = repair.apply(run)
+    return repaired, disagreement(repaired)
+
+
+def _thinned(run: Run) -> Run:
+    """No more rows than are needed, in one piece from the middle: the motion is the same throughout."""
+    extra = len(run.time) - 4 * _ROWS
+    if extra <= 0:
+        return run
+    rows = slice(extra // 2, extra // 2 + 4 * _ROWS)
+    return replace(run, time=run.time[rows], signals={name: values[rows] for name, values in run.signals.items()})
+
+
+class _Disagreement:
+    """How much a run disagrees with itself and with the model, [0, 2] for every part and joint, summed.
+
+    Args:
+      run: as it was read; what is not in it is not asked about.
+      joints: of the log.
+      model: None where the base is free.
+    """
+
+    def __init__(self, run: Run, joints: tuple[str, ...], model: mujoco.MjModel | None):
+        self._model, self._data = model, None if model is None else mujoco.MjData(model)
+        self._driven = "target" in run.signals and run.controller.kind == "pd"
+        if model is not None:
+            places = [model.joint(name) for name in joints]
+            self._qpos = np.array([place.qposadr[0] for place in places])
+            self._dof = np.array([place.dofadr[0] for place in places])
+            limited = np.array([bool(model.jnt_limited[place.id]) for place in places])
+            span = np.array([place.range for place in places])
+            self._range = np.where(limited[:, None], span, [-np.inf, np.inf]).T
+
+    def __call__(self, run: Run) -> float:
+        """Of a run."""
+        return float(sum(part.sum() for part in self.parts(run).values()))
+
+    def parts(self, run: Run) -> dict[str, np.ndarray]:
+        """By name, [joints]."""
+        position, slope = np.moveaxis(smoothed(replace(run, signals={"q": run.signals["q"]})), 1, 0)
+        found = {}
+        if "dq" in run.signals:
+            found["velocity"] = _apart(run.signals["dq"], slope)
+        asked = self.asked(run)
+        if asked is not None and "tau" in run.signals:
+            found["torque"] = _apart(run.signals["tau"], asked)
+        if "target" in run.signals:
+            found["target"] = 0.5 * _apart(run.signals["target"], position)
+        if self._model is not None:
+            low, high = self._range
+            found["range"] = _MOST * ((position < low - 0.1) | (position > high + 0.1)).mean(axis=0)
+            given = asked if asked is not None else run.signals.get("tau")
+            if given is not None:
+                needed, rows = self.needed(run, position, slope)
+                found["dynamics"] = _apart(_together(given)[rows], needed)
+        return found
+
+    def asked(self, run: Run) -> np.ndarray | None:
+        """Torque of the controller, [rows, joints]; None where it has none that is known."""
+        if not self._driven:
+            return None
+        gains = run.controller.gains
+        speed = run.signals["dq"] if "dq" in run.signals else smoothed(run)[:, 1]
+        torque = gains["kp"] * (run.signals["target"] - run.signals["q"]) - gains["kd"] * speed
+        on = run.signals.get("enabled", np.ones(len(run.time)))[:, None]
+        return on * np.clip(torque, -gains["torque_limit_nm"], gains["torque_limit_nm"])
+
+    def needed(self, run: Run, position: np.ndarray, slope: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Torque that the model needs for the motion [some rows, joints], and which rows."""
+        acceleration = np.gradient(_together(slope), run.time, axis=0)
+        # The ends are not smoothed.
+        rows = np.unique(np.linspace(10, len(run.time) - 11, _ROWS).astype(int))
+        found = np.empty((len(rows), len(self._dof)))
+        for index, row in enumerate(rows):
+            self._data.qpos[self._qpos], self._data.qvel[self._dof] = position[row], slope[row]
+            self._data.qacc[self._dof] = acceleration[row]
+            mujoco.mj_inverse(self._model, self._data)
+            found[index] = self._data.qfrc_inverse[self._dof]
+        return found, rows
+
+
+def _together(values: np.ndarray) -> np.ndarray:
+    """Means over a few rows, [rows, joints]."""
+    kernel = np.ones(7) / 7.0
+    return np.stack([np.convolve(column, kernel, "same") for column in values.T], axis=1)
+
+
+def _apart(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """How far two signals [rows, joints] are apart, as a share of the mean of their root mean squares, [joints]."""
+    difference = np.sqrt(((one - other) ** 2).mean(axis=0))
+    size = 0.5 * (np.sqrt((one**2).mean(axis=0)) + np.sqrt((other**2).mean(axis=0)))
+    return np.minimum(difference / np.maximum(size, 1e-9), _MOST)
+
+
+def _repairs(run: Run, disagreement: _Disagreement) -> list[_Repair]:
+    """Everything that is tried."""
+    count = run.signals["q"].shape[1]
+    measured = tuple(name for name in MEASURED if name in run.signals)
+    groups = {"measured": measured} | {name: (name,) for name in (*MEASURED, "target") if name in run.signals}
+    groups["all"] = tuple(dict.fromkeys([*measured, *(["target"] if "target" in run.signals else [])]))
+    found = []
+    for label, names in groups.items():
+        for pair in combinations(range(count), 2):
+            order = np.arange(count)
+            order[list(pair)] = pair[::-1]
+            found.append(_Repair("swapped joints", label, pair, 0.0, _on(names, lambda v, order=order: v[:, order])))
+        for joint in range(count):
+            sign = np.where(np.arange(count) == joint, -1.0, 1.0)
+            found.append(_Repair("flipped sign", label, (joint,), -1.0, _on(names, lambda v, sign=sign: v * sign)))
+        angles = tuple(name for name in names if name != "tau")
+        for kind, factor in (("degrees", np.pi / 180.0), ("radians twice", 180.0 / np.pi)) if angles else ():
+            found.append(_Repair(kind, label, (), factor, _on(angles, lambda v, factor=factor: v * factor)))
+    if "tau" in run.signals:
+        found.append(_Repair("millinewtonmetres", "tau", (), 1e-3, _on(("tau",), lambda v: v * 1e-3)))
+    return found + _delays(run, measured) + _offsets(run, disagreement) + _drift(run)
+
+
+def _on(names: tuple[str, ...], change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Run], Run]:
+    """The run with some of its signals changed."""
+    return lambda run: replace(run, signals={**run.signals, **{name: change(run.signals[name]) for name in names}})
+
+
+def _delays(run: Run, measured: tuple[str, ...]) -> list[_Repair]:
+    """What was measured, taken earlier; alone, and velocities alone."""
+    period, found = float(np.median(np.diff(run.time))), []
+    for label, names in {"measured": measured, "dq": ("dq",)}.items():
+        for delay in _DELAYS_S if "target" in run.signals and set(names) <= set(measured) else ():
+            rows = round(delay / period)
+            if rows:
+                earlier = lambda v, rows=rows: np.concatenate([v[rows:], np.repeat(v[-1:], rows, axis=0)])  # noqa: E731
+                found.append(_Repair("late", label, (), rows * period, _on(names, earlier)))
+    return found
+
+
+def _offsets(run: Run, disagreement: _Disagreement) -> list[_Repair]:
+    """Positions moved by what the controller's torque lacks in the mean."""
+    asked = disagreement.asked(run)
+    if asked is None or disagreement._model is None:
+        return []
+    position, slope = np.moveaxis(smoothed(replace(run, signals={"q": run.signals["q"]})), 1, 0)
+    needed, rows = disagreement.needed(run, position, slope)
+    free = np.abs(asked[rows]) < 0.98 * run.controller.gains["torque_limit_nm"]
+    on = run.signals.get("enabled", np.ones(len(run.time)))[rows, None] > 0
+    lacks = np.where(free & on, asked[rows] - needed, np.nan)
+    found = []
+    for joint, offset in enumerate(np.nanmedian(lacks, axis=0) / run.controller.gains["kp"]):
+        if abs(offset) >= _LEAST_OFFSET_RAD:
+            shift = np.where(np.arange(len(run.signals["q"][0])) == joint, offset, 0.0)
+            found.append(_Repair("offset", "q", (joint,), -offset, _on(("q",), lambda v, shift=shift: v + shift)))
+    return found
+
+
+def _drift(run: Run) -> list[_Repair]:
+    """A clock set right by what velocities say of positions."""
+    if "dq" not in run.signals:
+        return []
+    slope = smoothed(replace(run, signals={"q": run.signals["q"]}))[:, 1]
+    ratio = float(np.median((run.signals["dq"] * slope).sum(axis=0) / np.maximum((slope**2).sum(axis=0), 1e-12)))
+    if not _LEAST_DRIFT < abs(ratio - 1.0) < 0.5:
+        return []
+    return [_Repair("clock drift", "t", (), 1.0 / ratio - 1.0, lambda run: replace(run, time=run.time / ratio))]
+
+
+def _coarse(run: Run, joints: tuple[str, ...]) -> list[Finding]:
+    quantum = quantum_of(run.signals["q"])
+    if quantum < _COARSE:
+        return []
+    text = f"positions come in steps of {quantum:.3g} rad: what is smaller cannot be seen"
+    return [Finding("quantised", "q", joints, quantum, text)]
+
+
+def _clipped(run: Run, joints: tuple[str, ...]) -> list[Finding]:
+    """Signals that stay at their own largest or smallest value, again and again."""
+    found = []
+    for name in ("q", "dq", "tau"):
+        if name not in run.signals:
+            continue
+        values = run.signals[name]
+        limit = (
+            run.controller.gains.get("torque_limit_nm", np.full(values.shape[1], np.inf)) if name == "tau" else np.inf
+        )
+        for end in (values.max(axis=0), values.min(axis=0)):
+            stays = (values == end) & (np.abs(end) < 0.99 * limit)
+            moving = np.ptp(values, axis=0) > 20 * max(quantum_of(values), 1e-9)
+            share = np.where(moving, stays.mean(axis=0), 0.0)
+            for joint in np.flatnonzero(share > _CLIPPED):
+                text = f"{name} of {joints[joint]} is cut off at {end[joint]:.4g}, in {share[joint]:.0%} of the rows"
+                found.append(Finding("clipped", name, (joints[joint],), float(end[joint]), text))
+    return found
+
+
+_SENTENCES: Mapping[str, str] = {
+    "swapped joints": "{signal}: {joints} are exchanged; say so under `columns` in meta.yaml",
+    "flipped sign": "{signal}: {joints} turns the other way; say so under `sign` in meta.yaml, or turn the column",
+    "degrees": "{signal}: angles are in degrees; say so under `units` in meta.yaml",
+    "radians twice": "{signal}: angles are 57 times too small: they were made radians twice",
+    "millinewtonmetres": "{signal}: torques are in mNm; say so under `units` in meta.yaml",
+    "late": "{signal}: what was measured is {size:.0f} ms late",
+    "offset": "{signal}: {joints} reads {size:+.3f} rad too much",
+    "clock drift": "{signal}: the clock runs {size:+.1%} off, by what velocities say of positions",
+}
+
+
+def _as_finding(repair: _Repair, joints: tuple[str, ...]) -> Finding:
+    names = tuple(joints[joint] for joint in repair.joints)
+    size = 1e3 * repair.size if repair.kind == "late" else repair.size
+    sentence = _SENTENCES[repair.kind].format(signal=repair.signal, joints=" and ".join(names), size=size)
+    return Finding(repair.kind, repair.signal, names, size, sentence)

@@ -1,0 +1,260 @@
+"""A robot that answers only through files: `python -m experiments.robot_stub --folder RUN`.
+
+It stands in for the real one. MuJoCo C moves it, with what the learner's simulator lacks: targets arrive late, motors
+lag and give less the faster they turn, encoders are rounded, the IMU is noisy and biased, the estimate of its velocity
+drifts, its floor is another. It finds `RUN/round_*/request.json` beside an exported policy, walks with `player.py`'s
+policy, falls where it falls, and writes `RUN/round_*/log`; nothing else of it can be seen.
+"""
+
+import json
+import shutil
+import time
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from envs.biteno import constants
+from envs.logs import Controller, Log, Run, write
+from experiments.player import Player
+from experiments.train import console, run
+
+_STEP_S = 0.0005
+_TICK_S = 0.001  # of the joints' controllers
+_ROW_S = 0.002
+_FALLEN_COS = np.cos(np.pi / 4)
+_FALLEN_M = 0.35
+
+
+@dataclass(frozen=True, kw_only=True)
+class Body:
+    """What the robot is; multipliers of the nominal model where no unit says otherwise."""
+
+    trunk_mass: float = 1.0
+    """Mass of the trunk."""
+    leg_mass: float = 1.0
+    """Mass of the six moving links."""
+    foot_friction: float = 0.75
+    """Friction of the feet."""
+    transport_s: float = 0.01
+    """How late targets arrive."""
+    motor_lag_s: float = 0.004
+    """Time constant of the torque."""
+    no_load_rad_s: float = 30.0
+    """Speed at which a motor gives nothing."""
+    torque_scale: float = 1.0
+    """Torque for the same current."""
+    encoder_rad: float = 2 * np.pi / 2**14
+    """Step of the encoders."""
+    velocity_noise_rad_s: float = 0.05
+    """Of the joints' velocities."""
+    gyro_noise_rad_s: float = 0.02
+    """Of the gyro."""
+    gyro_bias_rad_s: float = 0.01
+    """Standard deviation of what it says at rest, drawn for every run."""
+    tilt_bias_rad: float = 0.01
+    """Standard deviation of the error of the estimated direction of gravity, drawn for every run."""
+    drift_mps: float = 0.05
+    """Standard deviation of the velocity estimate's wandering error."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Args:
+    """Plays the robot: walks with the policies that a folder holds and writes logs."""
+
+    folder: Path
+    """Folder of the run of experiments.sim2real."""
+    body: Body = field(default_factory=Body)
+    """What the robot is."""
+    idle_s: float = 3600.0
+    """Goes home when nothing was asked for so long."""
+    seed: int = 0
+    """Of its noise and, with the request's own, of its commands."""
+
+
+class Robot:
+    """The body, one run at a time."""
+
+    def __init__(self, body: Body):
+        self.body = body
+        spec = mujoco.MjSpec.from_file(str(constants.MODEL_PATH))
+        for link in spec.bodies[1:]:
+            for geom in link.geoms:
+                geom.mass *= body.trunk_mass if link.name == "trunk" else body.leg_mass
+        for foot in constants.FEET:
+            friction = spec.geom(foot).friction
+            spec.geom(foot).friction = [friction[0] * body.foot_friction, *friction[1:]]
+        model = spec.compile()
+        self.controller = Controller(
+            kind="pd",
+            rate_hz=1.0 / _TICK_S,
+            gains={
+                "kp": model.actuator_gainprm[:, 0].copy(),
+                "kd": -model.actuator_biasprm[:, 2].copy(),
+                "torque_limit_nm": model.actuator_forcerange[:, 1].copy(),
+            },
+        )
+        model.opt.timestep = _STEP_S
+        model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+        model.opt.iterations, model.opt.ls_iterations = 100, 50
+        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION
+        self.model = model
+        joints = [model.joint(name) for name in constants.JOINTS]
+        self._qpos = np.array([joint.qposadr[0] for joint in joints])
+        self._dof = np.array([joint.dofadr[0] for joint in joints])
+        self._feet = [model.geom(foot).id for foot in constants.FEET]
+
+    def walk(self, name: str, player: Player, seconds: float, rng: np.random.Generator) -> tuple[Run, bool]:
+        """Walks from standing until the time is over or the robot has fallen.
+
+        Returns:
+          The run, and whether it fell.
+        """
+        self._stand_up(rng)
+        player.reset(rng.uniform())
+        per_tick, per_row = round(_TICK_S / _STEP_S), round(_ROW_S / _STEP_S)
+        per_policy = round(constants.POLICY_DT_S / _STEP_S)
+        command, rows, fell = _command(rng), [], False
+        for step in range(round(seconds / _STEP_S)):
+            if step % round(5.0 / _STEP_S) == 0 and step:
+                command = _command(rng)
+            if step % per_tick == 0:
+                seen = self._look(rng)
+            if step % per_policy == 0:
+                if step:
+                    player.tick()
+                target = player.step(
+                    velocity=seen["vel"],
+                    command=command,
+                    gyro=seen["gyro"],
+                    gravity=seen["gravity"],
+                    joint=seen["q"],
+                    joint_velocity=seen["dq"],
+                )
+            if step % per_tick == 0:
+                self._line.append(target)
+                asked = self._asked(self._line[0], seen)
+            if step % per_row == 0:
+                said = {"target": target, "action": player.action, "phase": player.phase, "cmd": command}
+                rows.append({"tau": self._torque.copy(), "enabled": 1.0, "contact": self._contact()} | seen | said)
+            self._push(asked)
+            mujoco.mj_step(self.model, self.data)
+            if self._fallen():
+                fell = True
+                rows.append(rows[-1] | self._look(rng) | {"enabled": 0.0})
+                break
+        signals = {signal: np.stack([row[signal] for row in rows]).astype(float) for signal in rows[0]}
+        walked = Run(
+            name=name,
+            condition="walk",
+            split=None,
+            controller=self.controller,
+            time=_ROW_S * np.arange(len(rows)),
+            signals=signals,
+        )
+        return walked, fell
+
+    def _stand_up(self, rng: np.random.Generator) -> None:
+        self.data = mujoco.MjData(self.model)
+        mujoco.mj_resetDataKeyframe(self.model, self.data, self.model.keyframe("home").id)
+        self.data.qpos[self._qpos] += rng.uniform(-0.1, 0.1, len(self._qpos))
+        mujoco.mj_forward(self.model, self.data)
+        body = self.body
+        self._torque = np.zeros(len(self._qpos))
+        self._line = deque([self.data.qpos[self._qpos].copy()], maxlen=1 + round(body.transport_s / _TICK_S))
+        self._line.extend([self._line[0]] * round(body.transport_s / _TICK_S))
+        self._bias = {
+            "gyro": body.gyro_bias_rad_s * rng.standard_normal(3),
+            "tilt": body.tilt_bias_rad * rng.standard_normal(3),
+            "vel": body.drift_mps * rng.standard_normal(3),
+        }
+
+    def _look(self, rng: np.random.Generator) -> dict[str, np.ndarray]:
+        """What the sensors say."""
+        body, data = self.body, self.data
+        turn = np.zeros(9)
+        mujoco.mju_quat2Mat(turn, data.qpos[3:7])
+        into_body = turn.reshape(3, 3).T
+        # The error of the velocity estimate wanders over seconds.
+        stays = np.exp(-_TICK_S / 2.0)
+        wander = body.drift_mps * np.sqrt(1 - stays**2) * rng.standard_normal(3)
+        self._bias["vel"] = stays * self._bias["vel"] + wander
+        gravity = into_body @ np.array([0.0, 0.0, -1.0])
+        gravity = gravity + np.cross(self._bias["tilt"], gravity)
+        return {
+            "q": np.round(data.qpos[self._qpos] / body.encoder_rad) * body.encoder_rad,
+            "dq": data.qvel[self._dof] + body.velocity_noise_rad_s * rng.standard_normal(len(self._dof)),
+            "gyro": data.qvel[3:6] + self._bias["gyro"] + body.gyro_noise_rad_s * rng.standard_normal(3),
+            "gravity": gravity / np.linalg.norm(gravity),
+            "vel": into_body @ data.qvel[:3] + self._bias["vel"],
+        }
+
+    def _asked(self, target: np.ndarray, seen: dict[str, np.ndarray]) -> np.ndarray:
+        gains = self.controller.gains
+        torque = gains["kp"] * (target - seen["q"]) - gains["kd"] * seen["dq"]
+        return np.clip(torque, -gains["torque_limit_nm"], gains["torque_limit_nm"])
+
+    def _push(self, asked: np.ndarray) -> None:
+        body, speed = self.body, self.data.qvel[self._dof]
+        self._torque += _STEP_S / body.motor_lag_s * (body.torque_scale * asked - self._torque)
+        limit = self.controller.gains["torque_limit_nm"]
+        drop = limit / body.no_load_rad_s * speed
+        self._torque = np.clip(self._torque, -limit - drop, limit - drop)
+        self.data.qfrc_applied[self._dof] = self._torque
+
+    def _contact(self) -> np.ndarray:
+        touching = {int(geom) for pair in self.data.contact.geom for geom in pair}
+        return np.array([float(foot in touching) for foot in self._feet])
+
+    def _fallen(self) -> bool:
+        w, x, y, _ = self.data.qpos[3:7]
+        return bool(1 - 2 * (x * x + y * y) < _FALLEN_COS or self.data.qpos[2] < _FALLEN_M or not np.isfinite(w))
+
+
+def _command(rng: np.random.Generator) -> np.ndarray:
+    """Forward in m/s, sideways in m/s, turning in rad/s."""
+    command = rng.uniform(-1, 1, 3) * [1.0, 0.3, 0.8]
+    return np.zeros(3) if rng.uniform() < 0.1 else command
+
+
+def answer(place: Path, robot: Robot, seed: int) -> Sequence[bool]:
+    """Walks as a request asks, and writes the log; which of the runs ended in a fall."""
+    request = json.loads((place / "request.json").read_text())
+    player = Player(place / "policy" / "policy.npz")
+    rngs = [np.random.default_rng((seed, request["seed"], index)) for index in range(request["episodes"])]
+    walked = [robot.walk(f"run_{index:03d}", player, request["seconds"], rng) for index, rng in enumerate(rngs)]
+    meta = player.meta
+    log = Log(
+        robot=meta["robot"],
+        base="free",
+        rate_hz=1.0 / _ROW_S,
+        joints=tuple(meta["joints"]),
+        policy={name: meta[name] for name in ("rate_hz", "action_scale", "base")},
+        runs=tuple(run for run, _ in walked),
+    )
+    # Whole or not at all: who waits for the folder may read it at once.
+    draft = place / "log.partial"
+    shutil.rmtree(draft, ignore_errors=True)
+    write(log, draft, ".parquet")
+    draft.rename(place / "log")
+    return [fell for _, fell in walked]
+
+
+def main(args: Args) -> None:
+    """Answers requests until none has come for a while."""
+    robot, last = Robot(args.body), time.monotonic()
+    while time.monotonic() - last < args.idle_s:
+        for request in sorted(args.folder.glob("**/round_*/request.json")):
+            place = request.parent
+            if not (place / "log").exists():
+                falls = answer(place, robot, args.seed)
+                console.print(f"{place}: walked {len(falls)} times, fell {sum(falls)} times")
+                last = time.monotonic()
+        time.sleep(0.5)
+
+
+if __name__ == "__main__":
+    run(main, Args)
