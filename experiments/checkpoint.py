@@ -31,6 +31,12 @@ def set_up_compiler(xla_flags: str) -> None:
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
 
 
+def a_device_a_core(most: int = 8) -> str:
+    """The flag that makes every core which this process may use a device of its own, for what shares its work out."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return f"--xla_force_host_platform_device_count={min(cores, most)}"
+
+
 def versions() -> dict[str, str]:
     """Versions of what a result depends on, the device, and the git revision where there is one."""
     found = {"python": platform.python_version(), "device": jax.devices()[0].device_kind}

@@ -44,7 +44,7 @@ class Args:
 
 def main(args: Args) -> None:
     """Asks, answers, proves, and writes it down."""
-    checkpoint.set_up_compiler("")
+    checkpoint.set_up_compiler(checkpoint.a_device_a_core())
     began = time.monotonic()
     log = gathered(args.logs)
     if len(args.horizons) != 3 or sorted(set(args.horizons)) != list(args.horizons) or args.horizons[0] <= 0:

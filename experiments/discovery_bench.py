@@ -298,7 +298,7 @@ class Bench:
 
 def main(args: Args) -> None:
     """Works off this piece's cases and scores all that are done."""
-    checkpoint.set_up_compiler("")
+    checkpoint.set_up_compiler(checkpoint.a_device_a_core())
     if args.size not in SIZES:
         raise ValueError(f"size: got '{args.size}', expected one of {', '.join(SIZES)}")
     number, _, pieces = args.piece.partition("/")

@@ -12,6 +12,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh, PartitionSpec
 
 Simulate = Callable[[jax.Array, Any], Mapping[str, jax.Array]]
 """`simulate(values [axes], inputs) -> {signal: [rows, components]}`, of one segment.
@@ -126,15 +127,16 @@ class Problem:
 class Residuals:
     """Measured less simulated, in means over a few rows: [hypotheses, segments, bins, components of all signals].
 
-    Every (vector, segment) is a simulation of its own; they are moved side by side, `width` at a time, in a loop whose
-    length is an argument. So it compiles once for every length of segments, whatever their number and the vectors'.
+    Every (vector, segment) is a simulation of its own; they are moved side by side, `width` at a time on every device,
+    in a loop whose length is an argument. So it compiles once for every length of segments, whatever their number and
+    the vectors'.
     """
 
     _CHUNKS = 32
     """Chunks that are handed over at once."""
 
     def __init__(self, problem: Problem, width: int = 64):
-        self._problem, self._width = problem, width
+        self._problem, self._width = problem, width * len(jax.devices())
 
     def __call__(self, vectors: np.ndarray, segments: Segments) -> np.ndarray:
         """Residuals of vectors [hypotheses, axes]; those that are not finite come back as they are."""
@@ -173,13 +175,21 @@ def _moved(simulate: Simulate, bin_rows: int, count, values, which, piece, input
     def one(mine, segment):
         return binned(simulate(mine, segment), bin_rows)
 
-    shape = jax.eval_shape(one, values[0], jax.tree.map(lambda leaf: leaf[0], inputs))
+    def all_of(count, values, which, piece, inputs):
+        shape = jax.eval_shape(one, values[0], jax.tree.map(lambda leaf: leaf[0], inputs))
 
-    def work(index, found):
-        mine = jax.tree.map(lambda leaf: leaf[piece[index]], inputs)
-        return found.at[index].set(jax.vmap(one)(values[which[index]], mine))
+        def work(index, found):
+            mine = jax.tree.map(lambda leaf: leaf[piece[index]], inputs)
+            return found.at[index].set(jax.vmap(one)(values[which[index]], mine))
 
-    return jax.lax.fori_loop(0, count, work, jnp.zeros((*which.shape, *shape.shape), shape.dtype))
+        return jax.lax.fori_loop(0, count, work, jnp.zeros((*which.shape, *shape.shape), shape.dtype))
+
+    # Nothing is exchanged: devices share the width, and each loops by itself.
+    mesh, across = Mesh(np.array(jax.devices()), ("width",)), PartitionSpec(None, "width")
+    specs = (PartitionSpec(), PartitionSpec(), across, across, PartitionSpec())
+    return jax.shard_map(all_of, mesh=mesh, in_specs=specs, out_specs=across, check_vma=False)(
+        count, values, which, piece, inputs
+    )
 
 
 def _pieces(signals: Mapping[str, np.ndarray]):

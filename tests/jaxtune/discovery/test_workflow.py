@@ -1,7 +1,11 @@
 """Discovery on a slider whose truth is known: mass, damping, and whatever is hidden in it."""
 
 import json
+import os
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -272,3 +276,24 @@ def test_what_promises_too_little_is_not_fitted(monkeypatch):
     assert len(everything) > 1
     assert set(tried(0.9 * everything[best])) == {h for h in everything if everything[h] > 0.9 * everything[best]}
     assert not tried(1.1 * everything[best])
+
+
+def test_devices_share_the_work():
+    code = (
+        "import jax, numpy as np, test_workflow as toy\n"
+        "from jaxtune.discovery.problem import Residuals\n"
+        "problem = toy.problem({'coulomb': 0.5})\n"
+        "vectors = np.random.default_rng(0).uniform(0, 0.3, (7, len(toy.AXES))) * (np.arange(len(toy.AXES)) < 6)\n"
+        "found = Residuals(problem, width=16)(vectors, problem.data['train'][0.1])\n"
+        "print(len(jax.devices()), found.shape, found.sum(), np.abs(found).max())\n"
+    )
+    said = []
+    for devices in (1, 2):
+        flags = f"--xla_force_host_platform_device_count={devices}"
+        path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
+        environment = os.environ | {"XLA_FLAGS": flags, "PYTHONPATH": path, "JAX_PLATFORMS": "cpu"}
+        done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+        said.append(done.stdout.split())
+    assert [line[0] for line in said] == ["1", "2"]
+    assert said[0][1:5] == said[1][1:5]
+    np.testing.assert_allclose(*(np.array(line[5:], float) for line in said), rtol=1e-4)
