@@ -15,27 +15,29 @@ Repairs are looked for one after the other, the best first.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial, reduce
 from itertools import combinations
 
 import mujoco
 import numpy as np
 
 from envs.logs import Run
-from envs.rig import hung
-from envs.segments import quantum_of, smoothed
+from envs.segments import noise, quantum_of, smoothed
 
 MEASURED = ("q", "dq", "tau")
 _MOST = 2.0
-_BETTER = 0.35  # by how much all parts together must agree better, in units of one joint's whole signal
-_SHARE = 0.15  # and by which share of what they disagree
+_BETTER = 0.25  # by how much all parts together must agree better, in units of one joint's whole signal
+_SHARE = 0.1  # and by which share of what they disagree
 _MOST_REPAIRS = 3
-_ROWS = 600  # of a run, at most, that the model is asked about
+_UNITS = ("degrees", "radians twice", "millinewtonmetres")
+_ROWS = 250  # that the model is asked about, at most
 _DELAYS_S = (0.004, 0.008, 0.012, 0.016, 0.024, 0.032, 0.045)
 _LEAST_OFFSET_RAD = 0.025
 _LEAST_DRIFT = 0.015
 _LEAST_RATE_HZ = 100.0
-_COARSE = 0.005  # rad of an encoder's step that hides what matters
+_COARSE = 0.004  # share of a joint's motion: larger steps of an encoder hide what matters
 _CLIPPED = 0.01  # share of rows at a signal's own largest or smallest value
+_LEAST_CLIPPED = 8  # and number
 
 
 @dataclass(frozen=True)
@@ -53,16 +55,17 @@ class Finding:
     """For a person, with what to do about it."""
 
 
-def diagnose(run: Run, joints: tuple[str, ...], spec: mujoco.MjSpec | None = None) -> list[Finding]:
+def diagnose(run: Run, joints: tuple[str, ...], model: mujoco.MjModel, base: str = "fixed") -> list[Finding]:
     """Everything that is suspected of a run.
 
     Args:
       run: as it was read.
       joints: of the log.
-      spec: the model, for a robot that is hung or clamped; None where nothing but the log itself can be asked.
+      model: of the robot, hung (`envs.rig.hung`) where the base is fixed.
+      base: fixed or free; what a robot on the ground needs of its joints depends on forces that nobody measured.
     """
     found, clean = structure(run)
-    return found + physics(clean, joints, hung(spec) if spec else None)
+    return found + physics(clean, joints, model, base == "fixed")
 
 
 # --- structure
@@ -82,7 +85,7 @@ def structure(run: Run) -> tuple[list[Finding], Run]:
         found.append(Finding("duplicated rows", "t", (), float(twice.sum()), text))
     holes = np.flatnonzero((steps > 1.6 * period) & (steps > period + 4.0 * _spread(steps)))
     for row in holes:
-        moved = _moves_on(run, row, period)
+        moved = _moves_on(run, row)
         kind, what = ("missing rows", "rows are missing") if moved else ("clock jump", "the clock jumps")
         text = f"{what} behind row {row + 1}: {steps[row]:.4g} s to the next, where {period:.4g} s are usual"
         found.append(Finding(kind, "t", (), float(steps[row]), text))
@@ -97,19 +100,29 @@ def _repeated(run: Run) -> np.ndarray:
     """Rows but the first [rows - 1] in which everything that was measured is as it was."""
     measured = [run.signals[name] for name in (*MEASURED, "gyro", "acc", "vel") if name in run.signals]
     values = np.concatenate([one.reshape(len(run.time), -1) for one in measured], axis=1)
-    same = (np.diff(values, axis=0) == 0).all(axis=1)
-    # A robot that stands still behind coarse encoders repeats itself by right.
-    return same if same.mean() < 0.05 else np.zeros_like(same)
+    same = np.diff(values, axis=0) == 0
+    # A robot that stands still behind coarse encoders repeats itself by right, every column for itself.
+    often = same.mean(axis=0)
+    by_chance = len(same) * np.prod(often[often < 0.3])
+    every = same.all(axis=1)
+    return every if every.sum() > 3.0 * by_chance + 1.0 else np.zeros_like(every)
 
 
-def _moves_on(run: Run, row: int, period: float) -> bool:
-    """Whether positions have moved on over a hole as far as its length says, and not as far as one row does."""
-    before, after = slice(max(0, row - 4), row + 1), slice(row + 1, row + 6)
-    time, q = run.time, run.signals["q"]
-    slope = 0.5 * (_slope(time[before], q[before]) + _slope(time[after], q[after]))
-    moved = q[row + 1] - q[row]
-    hole = time[row + 1] - time[row]
-    return bool(np.sum((moved - hole * slope) ** 2) < np.sum((moved - period * slope) ** 2))
+def _moves_on(run: Run, row: int) -> bool:
+    """Whether the robot has moved on over a hole further than one row's worth."""
+    before, after = slice(max(0, row - 5), row + 1), slice(row + 1, row + 7)
+    period = float(np.median(np.diff(run.time)))
+    for name in ("q", "dq"):
+        if name not in run.signals:
+            continue
+        values = run.signals[name]
+        slope = 0.5 * (_slope(run.time[before], values[before]) + _slope(run.time[after], values[after]))
+        # Means of what lies on both sides, or noise would pass for motion.
+        apart = run.time[after].mean() - run.time[row + 1] + run.time[row] - run.time[before].mean() + period
+        missed = values[after].mean(axis=0) - values[before].mean(axis=0) - apart * slope
+        if (np.abs(missed) > 4.0 * noise(values) + quantum_of(values) + 2.0 * period * np.abs(slope)).any():
+            return True
+    return False
 
 
 def _slope(time: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -139,27 +152,38 @@ class _Repair:
     apply: Callable[[Run], Run]
 
 
-def physics(run: Run, joints: tuple[str, ...], model: mujoco.MjModel | None) -> list[Finding]:
+def physics(run: Run, joints: tuple[str, ...], model: mujoco.MjModel, held: bool) -> list[Finding]:
     """Orders, signs, units, offsets and delays that a run agrees better without."""
-    run = _thinned(run)
-    found = [*_coarse(run, joints), *_clipped(run, joints)]
-    disagreement = _Disagreement(run, joints, model)
+    run, found = _thinned(run), []
+    # Accelerations behind coarse encoders say nothing.
+    disagreement = _Disagreement(run, joints, model, held and not _is_coarse(run))
     now = disagreement(run)
     for _ in range(_MOST_REPAIRS):
-        tried = [(repair, *_tried(repair, run, disagreement)) for repair in _repairs(run, disagreement)]
-        if not tried:
+        repairs = _repairs(run, disagreement)
+        chain, repaired, then = _best([[repair] for repair in repairs], run, disagreement)
+        if chain[0].kind in _UNITS or not _believed(now, then):
+            # Nothing agrees in wrong units, so what is wrong beside them does not show alone.
+            units = [repair for repair in repairs if repair.kind in _UNITS]
+            others = [repair for repair in repairs if repair.kind in ("swapped joints", "flipped sign")]
+            both = _best([[unit, other] for unit in units for other in others], run, disagreement)
+            if _believed(min(now, then), both[2]):
+                chain, repaired, then = both
+        if not _believed(now, then):
             break
-        repair, repaired, then = min(tried, key=lambda one: one[2])
-        if now - then < max(_BETTER, _SHARE * now):
-            break
-        found.append(_as_finding(repair, joints))
+        found += [_as_finding(repair, joints) for repair in chain]
         run, now = repaired, then
-    return found
+    # In the model's units, or degrees would look coarse.
+    return [*found, *_drift(run), *_coarse(run, joints), *_clipped(run, joints)]
 
 
-def _tried(repair: _Repair, run: Run, disagreement: "_Disagreement") -> tuple[Run, float]:
-    repaired = repair.apply(run)
-    return repaired, disagreement(repaired)
+def _best(chains: list[list[_Repair]], run: Run, disagreement: "_Disagreement") -> tuple[list[_Repair], Run, float]:
+    """The repairs, one after the other, after which a run disagrees least; that run; and how much it still does."""
+    found = [(chain, reduce(lambda run, repair: repair.apply(run), chain, run)) for chain in chains]
+    return min(((chain, one, disagreement(one)) for chain, one in found), key=lambda each: each[2])
+
+
+def _believed(now: float, then: float) -> bool:
+    return now - then > max(_BETTER, _SHARE * now)
 
 
 def _thinned(run: Run) -> Run:
@@ -177,19 +201,19 @@ class _Disagreement:
     Args:
       run: as it was read; what is not in it is not asked about.
       joints: of the log.
-      model: None where the base is free.
+      model: of the robot.
+      dynamics: whether torques are asked about.
     """
 
-    def __init__(self, run: Run, joints: tuple[str, ...], model: mujoco.MjModel | None):
-        self._model, self._data = model, None if model is None else mujoco.MjData(model)
+    def __init__(self, run: Run, joints: tuple[str, ...], model: mujoco.MjModel, dynamics: bool):
+        self._model, self._data, self.dynamics = model, mujoco.MjData(model), dynamics
         self._driven = "target" in run.signals and run.controller.kind == "pd"
-        if model is not None:
-            places = [model.joint(name) for name in joints]
-            self._qpos = np.array([place.qposadr[0] for place in places])
-            self._dof = np.array([place.dofadr[0] for place in places])
-            limited = np.array([bool(model.jnt_limited[place.id]) for place in places])
-            span = np.array([place.range for place in places])
-            self._range = np.where(limited[:, None], span, [-np.inf, np.inf]).T
+        places = [model.joint(name) for name in joints]
+        self._qpos = np.array([place.qposadr[0] for place in places])
+        self._dof = np.array([place.dofadr[0] for place in places])
+        limited = np.array([bool(model.jnt_limited[place.id]) for place in places])
+        span = np.array([place.range for place in places])
+        self._range = np.where(limited[:, None], span, [-np.inf, np.inf]).T
 
     def __call__(self, run: Run) -> float:
         """Of a run."""
@@ -206,13 +230,12 @@ class _Disagreement:
             found["torque"] = _apart(run.signals["tau"], asked)
         if "target" in run.signals:
             found["target"] = 0.5 * _apart(run.signals["target"], position)
-        if self._model is not None:
-            low, high = self._range
-            found["range"] = _MOST * ((position < low - 0.1) | (position > high + 0.1)).mean(axis=0)
-            given = asked if asked is not None else run.signals.get("tau")
-            if given is not None:
-                needed, rows = self.needed(run, position, slope)
-                found["dynamics"] = _apart(_together(given)[rows], needed)
+        low, high = self._range
+        found["range"] = _MOST * ((position < low - 0.1) | (position > high + 0.1)).mean(axis=0)
+        given = asked if asked is not None else run.signals.get("tau")
+        if self.dynamics and given is not None:
+            needed, rows = self.needed(run, position, slope)
+            found["dynamics"] = _apart(_together(given)[rows], needed)
         return found
 
     def asked(self, run: Run) -> np.ndarray | None:
@@ -272,7 +295,7 @@ def _repairs(run: Run, disagreement: _Disagreement) -> list[_Repair]:
             found.append(_Repair(kind, label, (), factor, _on(angles, lambda v, factor=factor: v * factor)))
     if "tau" in run.signals:
         found.append(_Repair("millinewtonmetres", "tau", (), 1e-3, _on(("tau",), lambda v: v * 1e-3)))
-    return found + _delays(run, measured) + _offsets(run, disagreement) + _drift(run)
+    return found + _delays(run, measured) + _offsets(run, disagreement)
 
 
 def _on(names: tuple[str, ...], change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Run], Run]:
@@ -287,15 +310,20 @@ def _delays(run: Run, measured: tuple[str, ...]) -> list[_Repair]:
         for delay in _DELAYS_S if "target" in run.signals and set(names) <= set(measured) else ():
             rows = round(delay / period)
             if rows:
-                earlier = lambda v, rows=rows: np.concatenate([v[rows:], np.repeat(v[-1:], rows, axis=0)])  # noqa: E731
-                found.append(_Repair("late", label, (), rows * period, _on(names, earlier)))
+                found.append(_Repair("late", label, (), rows * period, partial(_earlier, names, rows)))
     return found
+
+
+def _earlier(names: tuple[str, ...], rows: int, run: Run) -> Run:
+    """The run with some of its signals taken some rows earlier."""
+    signals = {name: values[rows:] if name in names else values[:-rows] for name, values in run.signals.items()}
+    return replace(run, time=run.time[:-rows], signals=signals)
 
 
 def _offsets(run: Run, disagreement: _Disagreement) -> list[_Repair]:
     """Positions moved by what the controller's torque lacks in the mean."""
     asked = disagreement.asked(run)
-    if asked is None or disagreement._model is None:
+    if asked is None or not disagreement.dynamics:
         return []
     position, slope = np.moveaxis(smoothed(replace(run, signals={"q": run.signals["q"]})), 1, 0)
     needed, rows = disagreement.needed(run, position, slope)
@@ -303,30 +331,40 @@ def _offsets(run: Run, disagreement: _Disagreement) -> list[_Repair]:
     on = run.signals.get("enabled", np.ones(len(run.time)))[rows, None] > 0
     lacks = np.where(free & on, asked[rows] - needed, np.nan)
     found = []
-    for joint, offset in enumerate(np.nanmedian(lacks, axis=0) / run.controller.gains["kp"]):
+    for joint, column in enumerate(lacks.T):
+        if np.isnan(column).all():
+            continue
+        offset = float(np.nanmedian(column)) / run.controller.gains["kp"][joint]
         if abs(offset) >= _LEAST_OFFSET_RAD:
             shift = np.where(np.arange(len(run.signals["q"][0])) == joint, offset, 0.0)
             found.append(_Repair("offset", "q", (joint,), -offset, _on(("q",), lambda v, shift=shift: v + shift)))
     return found
 
 
-def _drift(run: Run) -> list[_Repair]:
-    """A clock set right by what velocities say of positions."""
+def _drift(run: Run) -> list[Finding]:
+    """A clock that runs fast or slow, by what velocities say of positions at all joints alike."""
     if "dq" not in run.signals:
         return []
     slope = smoothed(replace(run, signals={"q": run.signals["q"]}))[:, 1]
-    ratio = float(np.median((run.signals["dq"] * slope).sum(axis=0) / np.maximum((slope**2).sum(axis=0), 1e-12)))
-    if not _LEAST_DRIFT < abs(ratio - 1.0) < 0.5:
+    ratio = (run.signals["dq"] * slope).sum(axis=0) / np.maximum((slope**2).sum(axis=0), 1e-12)
+    drift = float(np.median(ratio) - 1.0)
+    apart = [_apart(run.signals["dq"], slope * factor).mean() for factor in (1.0, np.median(ratio))]
+    if abs(drift) < _LEAST_DRIFT or np.ptp(ratio) > 0.5 * abs(drift) or apart[1] > 0.6 * apart[0]:
         return []
-    return [_Repair("clock drift", "t", (), 1.0 / ratio - 1.0, lambda run: replace(run, time=run.time / ratio))]
+    text = f"the clock runs {abs(drift):.1%} too {'fast' if drift > 0 else 'slow'}, by what velocities say of positions"
+    return [Finding("clock drift", "t", (), drift, text)]
 
 
 def _coarse(run: Run, joints: tuple[str, ...]) -> list[Finding]:
     quantum = quantum_of(run.signals["q"])
-    if quantum < _COARSE:
+    if not _is_coarse(run):
         return []
     text = f"positions come in steps of {quantum:.3g} rad: what is smaller cannot be seen"
     return [Finding("quantised", "q", joints, quantum, text)]
+
+
+def _is_coarse(run: Run) -> bool:
+    return quantum_of(run.signals["q"]) > _COARSE * float(np.median(np.ptp(run.signals["q"], axis=0)))
 
 
 def _clipped(run: Run, joints: tuple[str, ...]) -> list[Finding]:
@@ -339,10 +377,18 @@ def _clipped(run: Run, joints: tuple[str, ...]) -> list[Finding]:
         limit = (
             run.controller.gains.get("torque_limit_nm", np.full(values.shape[1], np.inf)) if name == "tau" else np.inf
         )
-        for end in (values.max(axis=0), values.min(axis=0)):
-            stays = (values == end) & (np.abs(end) < 0.99 * limit)
-            moving = np.ptp(values, axis=0) > 20 * max(quantum_of(values), 1e-9)
-            share = np.where(moving, stays.mean(axis=0), 0.0)
+        quantum = max(quantum_of(values), 1e-9)
+        for side, end in ((1.0, values.max(axis=0)), (-1.0, values.min(axis=0))):
+            inward = side * (end - values)
+            stays = (inward < 0.5 * quantum) & (np.abs(end) < 0.99 * limit)
+            # What is rounded comes back to the same values, but to its ends no more often than to those beside them.
+            beside = (inward < 3.5 * quantum).mean(axis=0) - stays.mean(axis=0)
+            moving = np.ptp(values, axis=0) > 20 * quantum
+            share = np.where(
+                moving & (stays.sum(axis=0) >= _LEAST_CLIPPED) & (stays.mean(axis=0) > 2.0 * beside),
+                stays.mean(axis=0),
+                0.0,
+            )
             for joint in np.flatnonzero(share > _CLIPPED):
                 text = f"{name} of {joints[joint]} is cut off at {end[joint]:.4g}, in {share[joint]:.0%} of the rows"
                 found.append(Finding("clipped", name, (joints[joint],), float(end[joint]), text))
@@ -357,7 +403,6 @@ _SENTENCES: Mapping[str, str] = {
     "millinewtonmetres": "{signal}: torques are in mNm; say so under `units` in meta.yaml",
     "late": "{signal}: what was measured is {size:.0f} ms late",
     "offset": "{signal}: {joints} reads {size:+.3f} rad too much",
-    "clock drift": "{signal}: the clock runs {size:+.1%} off, by what velocities say of positions",
 }
 
 

@@ -11,6 +11,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
 from envs.biteno.constants import DUTY, POLICY_DT_S
+from envs.logs import Run
 
 _COLOURS = {"ours": "tab:blue", "spm": "tab:orange", "dr": "tab:green", "oracle": "tab:gray"}
 _MARKS = {"accept": "o", "widen": "^", "unexplained": "X", "radius_exhausted": "s", "not_finite": "x"}
@@ -106,6 +107,22 @@ def gait(path: Path, force: np.ndarray, phase: np.ndarray) -> None:
         axis.text(-0.01, 2.4 * foot + 1.45, f"{name}, floor", ha="right", va="center", transform=_beside(axis))
     axis.set(xlabel="s", yticks=[], xlim=(0, time[-1]))
     axis.spines[["left", "right", "top"]].set_visible(False)
+    _save(figure, path)
+
+
+def suspicions(path: Path, run: Run, joints: Sequence[str], titles: Sequence[str]) -> None:
+    """A run as it was recorded: the clock, and every joint's position and target with what is suspected above."""
+    figure, axes = plt.subplots(1 + len(joints), 1, figsize=(10, 1.6 * (2 + len(joints))), layout="constrained")
+    axes[0].plot(run.time[1:], 1e3 * np.diff(run.time), lw=0.8)
+    axes[0].set(ylabel="row to row, ms", yscale="log")
+    for index, (axis, joint) in enumerate(zip(axes[1:], joints, strict=True)):
+        if "target" in run.signals:
+            axis.plot(run.time, run.signals["target"][:, index], lw=0.8, color="tab:orange", label="target")
+        axis.plot(run.time, run.signals["q"][:, index], lw=0.8, color="tab:blue", label="q")
+        axis.set(ylabel=f"{joint}, rad", xlim=(run.time[0], run.time[-1]))
+    axes[1].legend(loc="upper right")
+    axes[-1].set(xlabel="s")
+    figure.suptitle("\n".join(textwrap.fill(title, 120) for title in titles) or "nothing is suspected", fontsize=9)
     _save(figure, path)
 
 

@@ -1,0 +1,189 @@
+"""The log doctor, on logs of the arm that are damaged here: every kind of damage, alone and two at a time."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from envs import models
+from envs.diagnosis import diagnose
+from envs.logs import Controller
+from envs.rig import hung
+from experiments.discovery_bench import ARM
+from experiments.excite import excitation
+from experiments.hidden import Truth, record
+
+JOINTS = ("shoulder", "elbow")
+SPEC = models.spec(str(ARM))
+MODEL = hung(SPEC)
+NAMING = ("swapped joints", "flipped sign", "clipped", "offset")
+GAINS = {"kp": np.array([40.0, 20.0]), "kd": np.array([2.0, 0.8]), "torque_limit_nm": np.array([15.0, 15.0])}
+
+
+@cache
+def healthy(seed):
+    """A run of 3 s of an arm in another engine, its masses and gains off, its sensors noisy and rounded."""
+    motion = excitation(SPEC, JOINTS, 4, 3.0, 500.0, seed)[:1]
+    controller = Controller(kind="pd", rate_hz=1000.0, gains=GAINS)
+    return record(SPEC, JOINTS, motion, controller, Truth(None), 0.1, seed).runs[0]
+
+
+def measured(run, change):
+    return replace(run, signals=run.signals | {name: change(run.signals[name]) for name in ("q", "dq")})
+
+
+def rows(run, keep):
+    return replace(run, time=run.time[keep], signals={name: values[keep] for name, values in run.signals.items()})
+
+
+def swapped(run, rng):
+    return measured(run, lambda values: values[:, ::-1]), ("swapped joints", JOINTS)
+
+
+def flipped(run, rng):
+    joint = rng.integers(2)
+    sign = np.where(np.arange(2) == joint, -1.0, 1.0)
+    return measured(run, lambda values: values * sign), ("flipped sign", (JOINTS[joint],))
+
+
+def degrees(run, rng):
+    return measured(run, np.degrees), ("degrees", ())
+
+
+def target_degrees(run, rng):
+    return replace(run, signals=run.signals | {"target": np.degrees(run.signals["target"])}), ("degrees", ())
+
+
+def offset(run, rng):
+    joint = rng.integers(2)
+    shift = np.where(np.arange(2) == joint, rng.choice([-1, 1]) * rng.uniform(0.06, 0.2), 0.0)
+    return replace(run, signals=run.signals | {"q": run.signals["q"] + shift}), ("offset", (JOINTS[joint],))
+
+
+def late(run, rng):
+    count = rng.integers(5, 20)
+    delayed = measured(run, lambda values: np.concatenate([values[:count], values[:-count]]))
+    return rows(delayed, np.arange(count, len(run.time))), ("late", ())
+
+
+def quantised(run, rng):
+    step = rng.uniform(0.01, 0.03)
+    return replace(run, signals=run.signals | {"q": np.round(run.signals["q"] / step) * step}), ("quantised", ())
+
+
+def clipped(run, rng):
+    joint = rng.integers(2)
+    values = run.signals["dq"].copy()
+    most = np.quantile(np.abs(values[:, joint]), 0.85)
+    values[:, joint] = np.clip(values[:, joint], -most, most)
+    return replace(run, signals=run.signals | {"dq": values}), ("clipped", (JOINTS[joint],))
+
+
+def low_rate(run, rng):
+    return rows(run, np.arange(0, len(run.time), 8)), ("low rate", ())
+
+
+def duplicated(run, rng):
+    at, count = rng.integers(50, len(run.time) - 50), rng.integers(3, 20)
+    again = rows(run, np.r_[0:at, np.repeat(at, count), at : len(run.time)])
+    period = np.median(np.diff(run.time))
+    return replace(again, time=run.time[0] + period * np.arange(len(again.time))), ("duplicated rows", ())
+
+
+def missing(run, rng):
+    at, count = rng.integers(100, len(run.time) - 200), rng.integers(10, 60)
+    return rows(run, np.r_[0:at, at + count : len(run.time)]), ("missing rows", ())
+
+
+def jump(run, rng):
+    time = run.time.copy()
+    time[rng.integers(len(time) // 5, 4 * len(time) // 5) :] += rng.uniform(0.05, 0.5)
+    return replace(run, time=time), ("clock jump", ())
+
+
+def drift(run, rng):
+    return replace(run, time=run.time * np.exp(rng.choice([-1, 1]) * rng.uniform(0.04, 0.2))), ("clock drift", ())
+
+
+# In the order in which they can happen to a log: units come late, the clock last.
+DAMAGE = (swapped, flipped, offset, late, quantised, clipped, degrees, target_degrees, duplicated, missing, jump, drift)
+# Behind coarse encoders nobody sees a small offset or delay; and two kinds of degrees are one word.
+TOGETHER = ({offset, quantised}, {late, quantised}, {degrees, target_degrees})
+ALONE = (*DAMAGE, low_rate)
+
+
+def said(run):
+    return {(one.kind, one.joints if one.kind in NAMING else ()) for one in diagnose(run, JOINTS, MODEL)}
+
+
+def share_right(cases):
+    """Share of (run, what is wrong with it) of which exactly that is said; the others, to be read."""
+    wrong = [(truth, found) for run, truth in cases if named(found := said(run)) != named(truth)]
+    return 1.0 - len(wrong) / len(cases), wrong
+
+
+def named(findings):
+    """What counts: of exchanged joints, what else is wrong with one may as well be said of the other."""
+    if ("swapped joints", JOINTS) not in findings:
+        return findings
+    return {kind for kind, _ in findings}
+
+
+def alone(count):
+    rng = np.random.default_rng(0)
+    done = [ALONE[i % len(ALONE)](healthy(i // len(ALONE)), rng) for i in range(count)]
+    return [(run, {truth}) for run, truth in done]
+
+
+def paired(count):
+    rng, cases = np.random.default_rng(1), []
+    while len(cases) < count:
+        one, two = np.sort(rng.choice(len(DAMAGE), 2, replace=False))
+        if {DAMAGE[one], DAMAGE[two]} in TOGETHER:
+            continue
+        run, first = DAMAGE[one](healthy(len(cases) % 20), rng)
+        run, second = DAMAGE[two](run, rng)
+        cases.append((run, {first, second}))
+    return cases
+
+
+def test_one_damage_is_found():
+    share, wrong = share_right(alone(13))
+    assert share >= 0.92, wrong
+
+
+def test_two_at_a_time_are_found():
+    share, wrong = share_right(paired(8))
+    assert share >= 0.87, wrong
+
+
+def test_nothing_is_said_of_healthy_logs():
+    share, wrong = share_right([(healthy(seed), set()) for seed in range(6)])
+    assert share == 1.0, wrong
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("cases", [alone, paired])
+def test_two_hundred_are_found(cases):
+    share, wrong = share_right(cases(200))
+    assert share >= 0.95, wrong
+
+
+@pytest.mark.slow
+def test_nothing_is_said_of_two_hundred_healthy_logs():
+    share, wrong = share_right([(healthy(seed), set()) for seed in range(200)])
+    assert share >= 0.95, wrong
+
+
+def test_sizes_are_what_was_done():
+    rng = np.random.default_rng(3)
+    for damage, kind in ((late, "late"), (offset, "offset"), (drift, "clock drift")):
+        run, _ = damage(healthy(1), rng)
+        (one,) = diagnose(run, JOINTS, MODEL)
+        assert one.kind == kind
+        if damage is offset:
+            moved = np.median(run.signals["q"] - healthy(1).signals["q"], axis=0)
+            assert one.size == pytest.approx(moved[np.abs(moved).argmax()], abs=0.03)
+        if damage is drift:
+            assert 1 + one.size == pytest.approx(run.time[-1] / healthy(1).time[-1], rel=0.01)
