@@ -1,8 +1,8 @@
 """Episodes from measured logs: what a policy saw and did, at its own ticks, as the simulator would have told it.
 
-A run is cut where the robot falls or is switched off and where its rows have a hole. Of every piece the first tick is
-left out, because nobody knows what was done before it, and so is the last one of a piece that does not end in a fall,
-because nobody knows what came of it.
+A run is cut where the robot falls and where its rows have a hole. Motors that are switched off under a walking policy
+are a fall: that is how most robots fall. Of every piece the first tick is left out, because nobody knows what was done
+before it, and so is the last one of a piece that does not end in a fall, because nobody knows what came of it.
 """
 
 from functools import partial
@@ -62,7 +62,7 @@ def episodes(log: Log, steps: int) -> Recorded:
 
 
 def _at_ticks(run: Run, order: list[int]) -> dict[str, np.ndarray]:
-    """Signals [ticks, ...] by name when the policy looked, joints in the model's order, and `time` and `fallen`."""
+    """Signals [ticks, ...] by name when the policy looked, joints in the model's order, and `time` and `up`."""
     signals = dict(run.signals)
     if "quat" in signals and "gravity" not in signals:
         signals["gravity"] = np.asarray(jax.vmap(sensing.projected_gravity)(signals["quat"]))
@@ -72,7 +72,12 @@ def _at_ticks(run: Run, order: list[int]) -> dict[str, np.ndarray]:
     for name in JOINT_SIGNALS:
         if name in signals:
             signals[name] = signals[name][:, order]
+    height = signals["pos"][:, 2] if "pos" in signals else np.full(len(run.time), np.inf)
+    down = np.asarray(env.fallen(signals["gravity"], height)) | (signals.get("enabled", np.ones(len(height))) == 0)
     rows, aligned = _ticks(run.name, run.time, signals["action"])
+    if down[-1]:
+        # Who has fallen is asked for no more actions.
+        rows = np.union1d(rows, len(run.time) - 1)
     if aligned:
         seen = {name: values[rows] for name, values in signals.items()} | {"time": run.time[rows]}
     else:
@@ -83,8 +88,7 @@ def _at_ticks(run: Run, order: list[int]) -> dict[str, np.ndarray]:
             seen[name] = sampled(run.time, signals[name], at, constants.POLICY_DT_S)
     if "tau" not in seen:
         seen["tau"] = _wanted_torque(run, seen, order)
-    height = seen["pos"][:, 2] if "pos" in seen else np.full(len(rows), np.inf)
-    return seen | {"fallen": np.asarray(env.fallen(seen["gravity"], height))}
+    return seen | {"up": ~down[rows]}
 
 
 def _ticks(name: str, time: np.ndarray, action: np.ndarray) -> tuple[np.ndarray, bool]:
@@ -119,14 +123,14 @@ def _wanted_torque(run: Run, seen: dict[str, np.ndarray], order: list[int]) -> n
 
 def _pieces(ticks: dict[str, np.ndarray]) -> list[tuple[np.ndarray, bool]]:
     """Ticks [ticks] that follow on each other with the robot on its feet, and whether it fell after them."""
-    up = ~ticks["fallen"] & (ticks.get("enabled", np.ones(len(ticks["time"]))) > 0)
+    up = ticks["up"]
     hole = np.append(False, np.diff(ticks["time"]) > _HOLE * constants.POLICY_DT_S)
     found, down = [], False
     for rows in np.split(np.arange(len(up)), np.flatnonzero(hole | np.append(False, up[1:] != up[:-1]))):
         stands = up[rows[0]] and len(rows) >= (round(_UP_S / constants.POLICY_DT_S) if down else 3)
         if stands:
             after = rows[-1] + 1
-            found.append((rows, bool(after < len(up) and ticks["fallen"][after] and not hole[after])))
+            found.append((rows, bool(after < len(up) and not hole[after])))
         down = not up[rows[0]] or (down and not stands)
     return found
 

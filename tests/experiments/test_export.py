@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -11,9 +12,10 @@ import numpy as np
 import onnxruntime
 import pytest
 
-from envs import sensing
+from envs import logs, sensing
 from envs.biteno import constants, env, gait
-from experiments import export
+from envs.targets import recorded
+from experiments import export, robot_stub
 from experiments.config import preset
 from experiments.loop import Loop
 from experiments.player import Player
@@ -112,3 +114,68 @@ def test_a_robot_needs_numpy_alone(folder):
     done = subprocess.run([sys.executable, "-c", code], cwd=Path(folder), capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert np.abs(np.array(json.loads(done.stdout)) - constants.STAND_RAD).max() < 0.6
+
+
+IDEAL = robot_stub.Body(
+    foot_friction=1.0,
+    transport_s=0.0,
+    motor_lag_s=0.0005,
+    no_load_rad_s=1e9,
+    encoder_rad=1e-9,
+    velocity_noise_rad_s=0.0,
+    gyro_noise_rad_s=0.0,
+    gyro_bias_rad_s=0.0,
+    tilt_bias_rad=0.0,
+    drift_mps=0.0,
+)
+
+
+def asked(folder, place, body, episodes=2, seconds=4.0):
+    """What a robot answers to a request."""
+    place.mkdir()
+    (place / "policy").symlink_to(folder)
+    (place / "request.json").write_text(json.dumps({"episodes": episodes, "seconds": seconds, "seed": 0}))
+    falls = robot_stub.answer(place, robot_stub.Robot(body), seed=0)
+    return falls, logs.read(place / "log")
+
+
+def test_the_ideal_robot_walks_as_well_as_the_simulator(folder, tmp_path):
+    falls, log = asked(folder, tmp_path / "round_000", IDEAL)
+    assert falls == [False, False]
+    assert [len(run.time) for run in log.runs] == [2000, 2000]
+    found = recorded.episodes(log, 400)
+    # Of 4 s; the walk earns 59 in 20 s, and at most 70 can be had.
+    assert 2000 * float(found.trajectory.score.sum() / found.trajectory.alive.sum()) > 50
+    # The row of a tick is what the policy saw: it does the same again.
+    player = Player(folder / "policy.npz")
+    for step in range(0, 390, 13):
+        action = player.network(np.asarray(found.trajectory.obs[0, step], float))
+        np.testing.assert_allclose(action, found.trajectory.action[0, step], atol=1e-4)
+
+
+def test_a_robot_that_falls_says_so(folder, tmp_path):
+    falls, log = asked(folder, tmp_path / "round_000", replace(IDEAL, torque_scale=0.2), episodes=1)
+    assert falls == [True]
+    (run,) = log.runs
+    assert run.time[-1] < 3.9
+    assert run.signals["enabled"][-1] == 0.0
+    np.testing.assert_array_equal(recorded.episodes(log, 400).trajectory.fell, [True])
+
+
+def test_what_the_robot_lacks_is_in_its_log(folder, tmp_path):
+    def second(body):
+        (tmp_path / str(len(list(tmp_path.iterdir())))).mkdir()
+        place = tmp_path / str(len(list(tmp_path.iterdir())) - 1) / "round_000"
+        return asked(folder, place, body, episodes=1, seconds=1.0)[1].runs[0].signals
+
+    plain = second(IDEAL)
+    coarse = second(replace(IDEAL, encoder_rad=0.01))["q"]
+    np.testing.assert_allclose(coarse, np.round(coarse / 0.01) * 0.01, atol=1e-12)
+    for field, size, signal in (("gyro_noise_rad_s", 0.5, "gyro"), ("velocity_noise_rad_s", 0.5, "dq")):
+        shaken = second(replace(IDEAL, **{field: size}))[signal]
+        assert np.diff(shaken, axis=0).std() > max(0.5, 2 * np.diff(plain[signal], axis=0).std())
+    drifted = second(replace(IDEAL, drift_mps=0.5))["vel"]
+    assert np.abs(drifted[:5] - plain["vel"][:5]).mean() > 0.1
+    # With a time constant of 20 ms a motor gives 5 % of what it is asked for in the first millisecond.
+    slow = second(replace(IDEAL, motor_lag_s=0.02))["tau"]
+    assert np.abs(np.diff(slow, axis=0)).max() < 0.3 * np.abs(np.diff(plain["tau"], axis=0)).max()

@@ -167,13 +167,13 @@ def test_a_robot_that_gets_up_starts_another_episode(simulated):
     np.testing.assert_array_equal(found.trajectory.alive.sum(axis=1), [59, len(stays.time) - 100 - 2])
 
 
-def test_motors_off_are_no_fall(simulated):
+def test_motors_off_are_a_fall(simulated):
     _, log = simulated
     stays = log.runs[0]
     enabled = np.where(np.arange(len(stays.time)) < 100, 1.0, 0.0)
     found = recorded.episodes(replace(log, runs=(replace(stays, signals=stays.signals | {"enabled": enabled}),)), STEPS)
-    np.testing.assert_array_equal(found.trajectory.fell, [False])
-    np.testing.assert_array_equal(found.trajectory.alive.sum(axis=1), [98])
+    np.testing.assert_array_equal(found.trajectory.fell, [True])
+    np.testing.assert_array_equal(found.trajectory.alive.sum(axis=1), [99])
 
 
 def test_a_long_run_is_several_episodes(simulated):
