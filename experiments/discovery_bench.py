@@ -184,14 +184,23 @@ class Bench:
             discovery.prepare()
             discovery.calibrate()
             found = discovery.calibration
-            arrays = {f"floor {horizon}": floor for horizon, (floor, _) in found.floors.items()}
+            arrays = {
+                f"floor {horizon} {split}": floor
+                for horizon, (floors, _) in found.floors.items()
+                for split, floor in floors.items()
+            }
             arrays |= {f"weight {horizon}": weight for horizon, (_, weight) in found.floors.items()}
             partial = path.with_suffix(f".{os.getpid()}.npz")
             np.savez(partial, gain=found.gain, penalty=found.penalty, **arrays)
             partial.replace(path)
         with np.load(path) as saved:
-            horizons = [float(name.split()[1]) for name in saved.files if name.startswith("floor")]
-            floors = {h: (saved[f"floor {h}"], float(saved[f"weight {h}"])) for h in horizons}
+            floors = {}
+            for name in saved.files:
+                kind, *place = name.split()
+                if kind == "floor":
+                    horizon, split = place
+                    of_splits, _ = floors.setdefault(float(horizon), ({}, float(saved[f"weight {horizon}"])))
+                    of_splits[split] = saved[name]
             return Calibration(floors, float(saved["gain"]), float(saved["penalty"]))
 
     def truth(self, case: Case) -> tuple[Truth, float]:
@@ -221,20 +230,21 @@ class Bench:
         What nominal parameters can make up for within their priors does not count: nobody could see it.
         """
         main = sorted(self.calibration.floors)[len(self.calibration.floors) // 2]
-        known, seed = self.calibration.floors[main], self.seed(case)
+        (floors, weight), seed = self.calibration.floors[main], self.seed(case)
+        floor = floors["train"]
         problem = self.ask(self.record(Truth(None), seed, noise=False), (main,)).problem
         measure, zero = Residuals(problem), np.zeros(problem.axes)
-        slope = slopes(problem, measure, main) / known[0][..., None]
+        slope = slopes(problem, measure, main) / floor[..., None]
         plain = measure(zero, problem.data["train"][main])[0]
         positions = slice(-len(self.size.joints), None)
 
         def severity(size: float) -> float:
             log = self.record(Truth(case.effect, places, size), seed, noise=False)
             segments = self.ask(log, (main,)).problem.data["train"][main]
-            moved = (measure(zero, segments)[0] - plain) / known[0]
+            moved = (measure(zero, segments)[0] - plain) / floor
             if not np.isfinite(moved).all():
                 return np.inf
-            left = refitted(moved, slope, known[1])
+            left = refitted(moved, slope, weight)
             return float(np.sqrt((left[..., positions] ** 2).mean(axis=(0, 1))).max())
 
         return severity

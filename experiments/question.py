@@ -88,10 +88,7 @@ def ask(
         prior=np.array([nominal.get(axis, 0.0) for axis in rig.axes]),
         timing=_timing(rig),
         data=_cut(log, rig, signals, horizons),
-        healthy=[
-            _cut(healthy(log, spec, seed + number), rig, signals, horizons, ("train",))["train"]
-            for number in range(healthy_logs)
-        ],
+        healthy=[_cut(healthy(log, spec, seed + number), rig, signals, horizons) for number in range(healthy_logs)],
         bin_rows=segments.rows_together(1.0 / log.rate_hz, _BIN_S),
         regimes=regimes.REGIMES,
         components={name: tuple("xyz") if name == "gravity" else rig.joints for name in signals},
@@ -223,16 +220,15 @@ def place_sets(places: Sequence[str]) -> list[tuple[str, ...]]:
     return sets if len(places) < 2 or tuple(places) in sets else [*sets, tuple(places)]
 
 
-def _cut(log: Log, rig: Rig, signals, horizons, wanted=("train", "select", "sealed")) -> dict[str, dict[float, Any]]:
-    parts = splits(log)
-    names = {split: {run.name for run in parts[split]} for split in wanted}
+def _cut(log: Log, rig: Rig, signals, horizons) -> dict[str, dict[float, Any]]:
+    names = {split: {run.name for run in runs} for split, runs in splits(log).items()}
     labels = [regimes.regimes(run) for run in log.runs]
-    data: dict[str, dict[float, Any]] = {split: {} for split in wanted}
+    data: dict[str, dict[float, Any]] = {split: {} for split in names}
     for horizon in horizons:
         # All runs at once: segments of equal shape compile once.
         cut = segments.cut(log.runs, horizon, rig.dt, _BIN_S)
         label = np.stack([labels[run][rows] for run, rows in zip(cut.run, cut.row, strict=True)])
-        for split in wanted:
+        for split in names:
             mine = np.array([log.runs[run].name in names[split] for run in cut.run])
             if mine.sum() < _LEAST_SEGMENTS:
                 raise ValueError(

@@ -5,6 +5,7 @@ of the state a segment starts from, and the gap between engines, all in one numb
 and every moment of a segment.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,8 +23,8 @@ _LEAST_SHARE = 0.25  # of a component's mean floor; the first rows of a segment 
 class Gauge:
     """How residuals of one horizon are read."""
 
-    floor: np.ndarray
-    """[bins, components]"""
+    floor: Mapping[str, np.ndarray]
+    """[bins, components] by split: the same model is further off in some postures than in others."""
     weight: float
     """Share of the bins that count as independent."""
     healthy: tuple[Fit, ...]
@@ -57,24 +58,33 @@ def nominal(problem: Problem) -> Free:
     return Free(directions, np.ones(count), bounds, np.ones(count, bool))
 
 
-def gauge(problem: Problem, measure: Residuals, horizon: float, known: tuple[np.ndarray, float] | None = None) -> Gauge:
+def gauge(
+    problem: Problem,
+    measure: Residuals,
+    horizon: float,
+    known: tuple[Mapping[str, np.ndarray], float] | None = None,
+) -> Gauge:
     """Measures the floor at one horizon, or takes one that is known: floor and independent share."""
     if known is not None:
         return Gauge(floor=known[0], weight=known[1], healthy=())
     zero, slope = np.zeros(problem.axes), slopes(problem, measure, horizon)
-    raw = [measure(zero, log[horizon])[0] for log in problem.healthy]
+    train = [log["train"][horizon] for log in problem.healthy]
+    raw = [measure(zero, log)[0] for log in train]
     floor, weight = np.sqrt((np.concatenate(raw) ** 2).mean(axis=0)), 1.0
     for _ in range(2):
         left = np.stack([refitted(log / floor, slope / floor[..., None], weight) for log in raw])
-        floor, weight = _floor(floor, left)
-    fits = [
-        fitted(problem, residuals(measure, log[horizon], floor), slope / floor[..., None], weight)
-        for log in problem.healthy
-    ]
-    last, (floor, weight) = floor, _floor(floor, np.stack([fit.residual.reshape(raw[0].shape) for fit in fits]))
-    change = (last / floor).ravel()
+        floor, weight = _floor(floor, left), independent_share(_every(left))
+    fits = [fitted(problem, residuals(measure, log, floor), slope / floor[..., None], weight) for log in train]
+    left = np.stack([fit.residual.reshape(raw[0].shape) for fit in fits])
+    fresh, weight = _floor(floor, left), independent_share(_every(left))
+    change = (floor / fresh).ravel()
+    floors = {"train": fresh}
+    # Where nothing was fitted, as in the measured log.
+    for split in problem.data.keys() - floors.keys():
+        there = [measure(fit.vector, log[split][horizon])[0] for fit, log in zip(fits, problem.healthy, strict=True)]
+        floors[split] = _floor(np.ones_like(fresh), np.stack(there))
     return Gauge(
-        floor=floor,
+        floor=floors,
         weight=weight,
         healthy=tuple(
             replace(fit, residual=(fit.residual.reshape(-1, len(change)) * change).ravel(), weight=weight)
@@ -83,11 +93,14 @@ def gauge(problem: Problem, measure: Residuals, horizon: float, known: tuple[np.
     )
 
 
-def _floor(unit: np.ndarray, left: np.ndarray) -> tuple[np.ndarray, float]:
-    """The floor, and the independent share, of what is left of healthy logs [logs, segments, bins, components]."""
-    every = left.reshape(-1, *left.shape[2:])
-    fresh = unit * np.sqrt((every**2).mean(axis=0))
-    return np.maximum(fresh, _LEAST_SHARE * fresh.mean(axis=0)), independent_share(every)
+def _floor(unit: np.ndarray, left: np.ndarray) -> np.ndarray:
+    """The floor [bins, components] from what is left of healthy logs [logs, segments, bins, components] in a unit."""
+    fresh = unit * np.sqrt((_every(left) ** 2).mean(axis=0))
+    return np.maximum(fresh, _LEAST_SHARE * fresh.mean(axis=0))
+
+
+def _every(left: np.ndarray) -> np.ndarray:
+    return left.reshape(-1, *left.shape[2:])
 
 
 def fitted(problem: Problem, evaluate: Evaluate, slope: np.ndarray, weight: float) -> Fit:

@@ -95,9 +95,9 @@ class Problem:
     """[directions, axes] a standard deviation along what nobody knows either: when the controller looks and acts."""
     data: Mapping[str, Mapping[float, Segments]]
     """Segments by split and horizon in s."""
-    healthy: Sequence[Mapping[float, Segments]]
-    """Segments by horizon, of `train`, of logs in which nothing is missing: the nominal model in another engine, with
-    the log's noise."""
+    healthy: Sequence[Mapping[str, Mapping[float, Segments]]]
+    """Segments by split and horizon of logs in which nothing is missing: the nominal model in another engine, with the
+    log's noise."""
     bin_rows: int
     """Rows that are taken together."""
     regimes: tuple[str, ...]

@@ -84,8 +84,8 @@ class Result:
 class Calibration:
     """What healthy logs say, which depends on the robot, its motion and its noise alone."""
 
-    floors: dict[float, tuple[np.ndarray, float]]
-    """Floor [bins, components] and independent share by horizon."""
+    floors: dict[float, tuple[Mapping[str, np.ndarray], float]]
+    """Floors [bins, components] by split, and independent share, by horizon."""
     gain: float
     """What the best hypothesis gains on them."""
     penalty: float
@@ -146,7 +146,7 @@ class Discovery:
         """Of what is free from the start, at the nominal model: [segments, bins, components, directions]."""
         if horizon not in self._slopes:
             found = slopes(self.problem, self.measure, horizon)
-            self._slopes[horizon] = found / self.gauges[horizon].floor[..., None]
+            self._slopes[horizon] = found / self.gauges[horizon].floor["train"][..., None]
         return self._slopes[horizon]
 
     def settle(self, horizon: float) -> Fit:
@@ -164,7 +164,7 @@ class Discovery:
 
     def residual(self, horizon: float, split: str):
         """Residuals [n, features] of vectors [n, axes]."""
-        return residuals(self.measure, self.problem.data[split][horizon], self.gauges[horizon].floor)
+        return residuals(self.measure, self.problem.data[split][horizon], self.gauges[horizon].floor[split])
 
     def runs(self, split: str) -> np.ndarray:
         """Index of the run of every segment of the main horizon, [segments]."""
@@ -172,7 +172,7 @@ class Discovery:
 
     def shaped(self, residual: np.ndarray, horizon: float) -> np.ndarray:
         """[segments, bins, components, ...] again."""
-        return residual.reshape(-1, *self.gauges[horizon].floor.shape, *residual.shape[1:])
+        return residual.reshape(-1, *self.gauges[horizon].floor["train"].shape, *residual.shape[1:])
 
     # --- one round
 
@@ -188,7 +188,7 @@ class Discovery:
             return []
         unit = np.zeros((len(self._push), problem.axes))
         unit[np.arange(len(unit)), list(self._push.values())] = 0.05
-        slopes = jacobian(self.measure, fit.vector, unit, segments) / gauge_.floor[..., None]
+        slopes = jacobian(self.measure, fit.vector, unit, segments) / gauge_.floor["train"][..., None]
         flat = slopes.reshape(len(residual), -1, len(unit))
         if not self.penalty:
             self.penalty = max(
@@ -314,7 +314,7 @@ class Discovery:
 
     def errors(self, fit: Fit) -> np.ndarray:
         """Standard errors of a fit's coordinates."""
-        features = self.gauges[self.main].floor.size  # of a segment
+        features = self.gauges[self.main].floor["train"].size  # of a segment
         jacobian_ = fit.jacobian.reshape(-1, features, fit.jacobian.shape[-1])
         return decide.sandwich(
             fit.residual.reshape(-1, features), jacobian_, fit.weight, fit.free.sd, self.runs("train")

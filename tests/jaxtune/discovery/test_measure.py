@@ -14,7 +14,7 @@ def floor_of(draws, monkeypatch):
     problem = toy.problem({})
     found = gauge(problem, Residuals(problem), 0.4)
     assert len(found.healthy) == len(draws)
-    return found.floor.mean(axis=0), found
+    return found.floor["train"].mean(axis=0), found
 
 
 def test_parameters_a_fifth_off_do_not_raise_the_floor(monkeypatch):

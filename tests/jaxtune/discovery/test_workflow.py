@@ -94,14 +94,18 @@ def problem(truth, seed=0, hypotheses=HYPOTHESES):
     prior = np.array([0.1, 0.1, 0.0, 0.0, 0.0, 0.0, 0.0])
     # Nobody knows the nominal parameters better than to a tenth.
     drawn = [{"mass": 0.1 * m, "damping": 0.1 * d} for m, d in DRAWS]
-    healthy = [measured(one, 900 + i, motion=10 * seed) for i, one in enumerate(drawn)]
+    splits = ("train", "select", "sealed")
+    healthy = [
+        {split: measured(one, 900 + 100 * k + i, k, motion=10 * seed + k) for k, split in enumerate(splits)}
+        for i, one in enumerate(drawn)
+    ]
     return Problem(
         simulate=simulate,
         axes=len(AXES),
         hypotheses=hypotheses,
         prior=prior,
         timing=np.zeros((0, len(AXES))),
-        data={split: measured(truth, 10 * seed + i, i) for i, split in enumerate(("train", "select", "sealed"))},
+        data={split: measured(truth, 10 * seed + i, i) for i, split in enumerate(splits)},
         healthy=healthy,
         bin_rows=2,
         regimes=("steady",),
