@@ -66,7 +66,7 @@ def accept(discovery, short: Sequence[Hypothesis], everywhere: Mapping[float, Ma
     others = [part.name for h in short if h.key in (*close, *nearly) for part in h.parts or (h,)]
     alike = tuple(dict.fromkeys(name for name in others if name not in mine))
     result.rungs += [Rung(part, evidence, least, alike) for part in parts]
-    discovery.fits = {horizon: fits[hypothesis.key] for horizon, fits in everywhere.items()}
+    discovery.stand({horizon: fits[hypothesis.key] for horizon, fits in everywhere.items()})
     return True
 
 
@@ -127,9 +127,10 @@ def drop(discovery) -> None:
         without = {horizon: discovery.ablated(horizon, rung.hypothesis) for horizon in discovery.fits}
         residual = discovery.residual(discovery.main, "select")
         found = residual(np.stack([without[discovery.main].vector, discovery.fits[discovery.main].vector]))
-        gains = decide.paired(*(discovery.shaped(one, discovery.main) for one in found))
-        if decide.t_statistic(gains, discovery.runs("select")) < 1.0:
+        pair, run = [discovery.shaped(one, discovery.main) for one in found], discovery.runs("select")
+        still = decide.confirmed(*pair, run, discovery.gauges[discovery.main].weight) > discovery.least_gain
+        if decide.t_statistic(decide.paired(*pair), run) < 1.0 and not still:
             discovery.say(f"drop {rung.hypothesis.key}")
             discovery.result.rungs.remove(rung)
             discovery.result.dropped.append(rung.hypothesis.key)
-            discovery.fits = without
+            discovery.stand(without)

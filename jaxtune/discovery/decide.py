@@ -21,7 +21,8 @@ class Evidence:
     t: float
     """On `select`: mean fall of what a segment counts for over its standard error."""
     confirmed: float
-    """Fall of the loss on `select`, where it was not fitted, the block of segments that gains most left out."""
+    """Fall of the loss on `select`, where it was not fitted, the block of segments that gains most left out; in units
+    of what is left."""
     floors: float
     """Root of the largest fall of a single component's mean square, in floor units."""
     interval: tuple[float, float]
@@ -78,9 +79,12 @@ def losses(residual: np.ndarray) -> np.ndarray:
 
 
 def confirmed(before: np.ndarray, after: np.ndarray, run: np.ndarray, weight: float) -> float:
-    """Fall of the loss of residuals [segments, bins, components], the block of segments that gains most left out."""
+    """Fall of the loss of residuals [segments, bins, components], the block of segments that gains most left out.
+
+    In units of what is left, where that is more than the floor: among large residuals chance is large too.
+    """
     gains = in_blocks(weight * (before**2 - after**2).sum(axis=(1, 2)), run)
-    return float(gains.sum() - max(gains.max(), 0.0))
+    return float((gains.sum() - max(gains.max(), 0.0)) / max((after**2).mean(), 1.0))
 
 
 def t_statistic(gains: np.ndarray, run: np.ndarray) -> float:

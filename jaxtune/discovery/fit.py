@@ -18,7 +18,7 @@ Evaluate = Callable[[np.ndarray], np.ndarray]
 ROUNDS_MORE = 2  # of a fit that starts from another one
 _SCALES = (1.0, 0.35)
 _DAMPING = 1e-3
-_IDLE = 1e-3  # share of a loss
+_IDLE = 0.5  # of a loss, in which chance counts one
 _PATIENCE = 2  # rounds
 _SHORTEST = 0.03  # of a step that slopes are learnt from
 
@@ -92,7 +92,7 @@ class Fit:
 def refine(fits: Sequence[Fit], evaluate: Evaluate, rounds: int) -> list[Fit]:
     """Moves every fit towards its least loss; one that meets nothing but numbers that are not finite says so.
 
-    One that has not moved by a thousandth of its loss twice in a row is where it belongs.
+    One that twice in a row has not gained what chance would is done.
     """
     fits, idle = list(fits), [0] * len(fits)
     for _ in range(rounds):
@@ -104,7 +104,7 @@ def refine(fits: Sequence[Fit], evaluate: Evaluate, rounds: int) -> list[Fit]:
         found = evaluate(np.stack(vectors)).reshape(len(active), len(_SCALES), -1)
         for index, points, residuals in zip(active, trials, found, strict=True):
             before, fits[index] = fits[index].linear.loss, _best(fits[index], points, residuals)
-            idle[index] = idle[index] + 1 if fits[index].linear.loss > (1.0 - _IDLE) * before else 0
+            idle[index] = idle[index] + 1 if before - fits[index].linear.loss < _IDLE else 0
     return fits
 
 

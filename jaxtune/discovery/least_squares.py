@@ -7,6 +7,7 @@ weight |r|^2 + |(offset + u) / sd|^2.
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import lsq_linear
 
 
 @dataclass(frozen=True)
@@ -39,8 +40,7 @@ class Linear:
     def step(self, damping: float = 0.0, bounds: np.ndarray | None = None) -> np.ndarray:
         """The step [coordinates] to the least loss; within bounds [coordinates, 2] of the point, if given.
 
-        What would leave its bounds is put there, and the rest is solved again without it: a step that is only cut
-        short leads nowhere, because the others were to go along with it.
+        A step that is only cut short at its bounds leads nowhere: the others were to go along with it.
         """
         value, slope = self.rows()
         normal, pull = slope.T @ slope, slope.T @ value
@@ -50,17 +50,12 @@ class Linear:
         normal = normal + np.diag(damping * diagonal + 1e-9 * diagonal)
         if bounds is None:
             return np.linalg.solve(normal, -pull)
-        low, high = (bounds - self.offset[:, None]).T
-        step, free = np.zeros(len(pull)), np.ones(len(pull), bool)
-        while free.any():
-            step[free] = np.linalg.solve(
-                normal[np.ix_(free, free)], -pull[free] - normal[np.ix_(free, ~free)] @ step[~free]
-            )
-            out = free & ((step < low) | (step > high))
-            if not out.any():
-                break
-            step, free = np.where(out, np.clip(step, low, high), step), free & ~out
-        return step
+        # Of unit diagonal, so that all coordinates count alike.
+        scale = np.sqrt(np.diag(normal))
+        root = np.linalg.cholesky(normal / np.outer(scale, scale)).T
+        low, high = ((bounds - self.offset[:, None]) * scale[:, None]).T
+        wanted = np.linalg.solve(root.T, -pull / scale)
+        return lsq_linear(root, wanted, bounds=(low, high), method="bvls").x / scale
 
 
 def complement(slope: np.ndarray, ridge: float = 1e-9):

@@ -53,8 +53,8 @@ def nominal(problem: Problem) -> Free:
     directions = nominal_directions(problem)
     count = len(directions)
     bounds = np.tile([-_FURTHEST, _FURTHEST], (count, 1))
-    # Nobody looks or acts before it is time.
-    bounds[count - len(problem.timing) :, 0] = 0.0
+    # Nobody looks or acts before it is time, nor later than a period after.
+    bounds[count - len(problem.timing) :] = [0.0, 2.0]
     return Free(directions, np.ones(count), bounds, np.ones(count, bool))
 
 

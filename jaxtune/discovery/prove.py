@@ -13,7 +13,7 @@ def judge(discovery) -> None:
     From `select` alone it would depend on how the floor of a few postures compares with that of all.
     """
     result, settings, prior = discovery.result, discovery.settings, discovery.problem.prior
-    fit = result.fit = discovery.fits[discovery.main]
+    fit = result.fit = discovery.settle(discovery.main)
     result.errors = discovery.errors(fit)
     null, after = (gap(discovery, one.vector) for one in (result.null, fit))
     unexplained = after > settings.at_floor

@@ -52,7 +52,7 @@ class Screen:
 
     def _score(self, hypothesis: Hypothesis, at: Fit | None) -> Score:
         # What is at its bound cannot make room for anything.
-        none = self._fit.at_bounds
+        none = (at or self._fit).at_bounds
         own = none | given_up(self._fit.free, hypothesis)
         project = self._projection(own)
         value = project(_without(at or self._fit, own).rows()[0])

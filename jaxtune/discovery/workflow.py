@@ -149,6 +149,11 @@ class Discovery:
             self._slopes[horizon] = found / self.gauges[horizon].floor["train"][..., None]
         return self._slopes[horizon]
 
+    def stand(self, fits: dict[float, Fit]) -> None:
+        """Goes on from another model."""
+        self.fits, self._screen = fits, None
+        self._settled.clear()
+
     def settle(self, horizon: float) -> Fit:
         """The model as it stands, fitted once a round with fresh slopes.
 
@@ -158,7 +163,10 @@ class Discovery:
         if horizon not in self._settled:
             fit = self.fits.get(horizon) or self.fits[self.main]
             fresh = self.anew(fit.free, fit.coordinates, horizon)
-            self.fits[horizon] = refine([fresh], self.residual(horizon, "train"), 2 * self.settings.rounds)[0]
+            fit = refine([fresh], self.residual(horizon, "train"), 2 * self.settings.rounds)[0]
+            if not np.isfinite(fit.residual).all():
+                raise ValueError(f"model: it breaks within {horizon:g} s of these logs")
+            self.fits[horizon] = fit
             self._settled.add(horizon)
         return self.fits[horizon]
 
