@@ -29,6 +29,7 @@ _MOST = 2.0
 _BETTER = 0.25  # by how much all parts together must agree better, in units of one joint's whole signal
 _SHARE = 0.1  # and by which share of what they disagree
 _MOST_REPAIRS = 3
+_LEAST_ROWS = 100  # in one piece
 _UNITS = ("degrees", "radians twice", "millinewtonmetres")
 _ROWS = 250  # that the model is asked about, at most
 _DELAYS_S = (0.004, 0.008, 0.012, 0.016, 0.024, 0.032, 0.045)
@@ -65,6 +66,9 @@ def diagnose(run: Run, joints: tuple[str, ...], model: mujoco.MjModel, base: str
       base: fixed or free; what a robot on the ground needs of its joints depends on forces that nobody measured.
     """
     found, clean = structure(run)
+    if len(clean.time) < _LEAST_ROWS:
+        text = f"no more than {len(clean.time)} rows follow on each other in order: nothing else can be said"
+        return [*found, Finding("in pieces", "t", (), float(len(clean.time)), text)]
     return found + physics(clean, joints, model, base == "fixed")
 
 
@@ -103,7 +107,7 @@ def _repeated(run: Run) -> np.ndarray:
     same = np.diff(values, axis=0) == 0
     # A robot that stands still behind coarse encoders repeats itself by right, every column for itself.
     often = same.mean(axis=0)
-    by_chance = len(same) * np.prod(often[often < 0.3])
+    by_chance = len(same) * np.prod(often[often < 0.3] if (often < 0.3).any() else often)
     every = same.all(axis=1)
     return every if every.sum() > 3.0 * by_chance + 1.0 else np.zeros_like(every)
 
@@ -187,11 +191,13 @@ def _believed(now: float, then: float) -> bool:
 
 
 def _thinned(run: Run) -> Run:
-    """No more rows than are needed, in one piece from the middle: the motion is the same throughout."""
-    extra = len(run.time) - 4 * _ROWS
-    if extra <= 0:
+    """No more rows than are needed, in the piece in which most is moved."""
+    count = 6 * _ROWS
+    if len(run.time) <= count:
         return run
-    rows = slice(extra // 2, extra // 2 + 4 * _ROWS)
+    moved = np.abs(np.diff(run.signals["q"], axis=0, prepend=run.signals["q"][:1])).sum(axis=1).cumsum()
+    start = int(np.argmax(moved[count:] - moved[:-count]))
+    rows = slice(start, start + count)
     return replace(run, time=run.time[rows], signals={name: values[rows] for name, values in run.signals.items()})
 
 

@@ -1,7 +1,9 @@
 """Plays an exported policy on a robot's computer: NumPy and this file are enough.
 
     player = Player("policy.npz")
-    target = player.step(velocity=..., command=..., gyro=..., gravity=..., joint=..., joint_velocity=...)  # 100 Hz
+    while walking:  # 100 times a second
+        target = player.step(velocity=..., command=..., gyro=..., gravity=..., joint=..., joint_velocity=...)
+        player.tick()
 
 Numbers and layout come with the policy (`python -m experiments.export`). What is written here a second time, without
 JAX, is compared with the simulator's own observation, clock and reference in the tests.
@@ -57,14 +59,21 @@ class Player:
 
         Returns:
           Joint targets [joints], rad. `action` and `phase` are those of this step until `tick` is called.
+
+        Raises:
+          ValueError: a reading is not finite; the player remembers what it did before.
         """
         meta = self.meta
         error = np.zeros(len(joint)) if self.target is None else self.target - joint
         obs = self.observe(velocity, command, gyro, gravity, joint, joint_velocity, self.action, error, self.phase)
+        if not np.isfinite(obs).all():
+            names = [row["name"] for row in meta["observation"] for _ in range(row["size"])]
+            bad = dict.fromkeys(name for name, value in zip(names, obs, strict=True) if not np.isfinite(value))
+            raise ValueError(f"{', '.join(bad)}: got a number that is not finite")
         self.action = np.clip(self.network(obs), -meta["action_limit"], meta["action_limit"])
         base = self.reference(self.phase, command) if meta["base"] == "raibert" else np.array(meta["stand_rad"])
         self.target = base + meta["action_scale"] * self.action
-        return self.target
+        return self.target.copy()
 
     def tick(self) -> None:
         """Moves the gait clock on by a step."""

@@ -17,7 +17,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from envs.biteno import constants
+from envs.biteno import TaskConfig, constants, env
 from envs.logs import Controller, Log, Run, write
 from experiments.player import Player
 from experiments.train import console, run
@@ -25,8 +25,7 @@ from experiments.train import console, run
 _STEP_S = 0.0005
 _TICK_S = 0.001  # of the joints' controllers
 _ROW_S = 0.002
-_FALLEN_COS = np.cos(np.pi / 4)
-_FALLEN_M = 0.35
+_TASK = TaskConfig()  # what it is asked to do
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,7 +65,7 @@ class Args:
     """Plays the robot: walks with the policies that a folder holds and writes logs."""
 
     folder: Path
-    """Folder of the run of experiments.sim2real."""
+    """Folder of requests, `round_*/request.json` beside `round_*/policy`."""
     body: Body = field(default_factory=Body)
     """What the robot is."""
     idle_s: float = 3600.0
@@ -119,7 +118,7 @@ class Robot:
         per_policy = round(constants.POLICY_DT_S / _STEP_S)
         command, rows, fell = _command(rng), [], False
         for step in range(round(seconds / _STEP_S)):
-            if step % round(5.0 / _STEP_S) == 0 and step:
+            if step % round(_TASK.command_s / _STEP_S) == 0 and step:
                 command = _command(rng)
             if step % per_tick == 0:
                 seen = self._look(rng)
@@ -199,7 +198,8 @@ class Robot:
 
     def _push(self, asked: np.ndarray) -> None:
         body, speed = self.body, self.data.qvel[self._dof]
-        self._torque += _STEP_S / body.motor_lag_s * (body.torque_scale * asked - self._torque)
+        share = 1.0 - np.exp(-_STEP_S / max(body.motor_lag_s, 1e-9))
+        self._torque += share * (body.torque_scale * asked - self._torque)
         limit = self.controller.gains["torque_limit_nm"]
         drop = limit / body.no_load_rad_s * speed
         self._torque = np.clip(self._torque, -limit - drop, limit - drop)
@@ -210,19 +210,23 @@ class Robot:
         return np.array([float(foot in touching) for foot in self._feet])
 
     def _fallen(self) -> bool:
-        w, x, y, _ = self.data.qpos[3:7]
-        return bool(1 - 2 * (x * x + y * y) < _FALLEN_COS or self.data.qpos[2] < _FALLEN_M or not np.isfinite(w))
+        _, x, y, _ = self.data.qpos[3:7]
+        gravity = np.array([0.0, 0.0, 2 * (x * x + y * y) - 1])
+        return bool(env.fallen(gravity, self.data.qpos[2])) or not np.isfinite(self.data.qpos).all()
 
 
 def _command(rng: np.random.Generator) -> np.ndarray:
     """Forward in m/s, sideways in m/s, turning in rad/s."""
-    command = rng.uniform(-1, 1, 3) * [1.0, 0.3, 0.8]
-    return np.zeros(3) if rng.uniform() < 0.1 else command
+    command = rng.uniform(-1, 1, 3) * _TASK.command_max
+    return np.zeros(3) if rng.uniform() < _TASK.zero_command_share else command
 
 
 def answer(place: Path, robot: Robot, seed: int) -> Sequence[bool]:
     """Walks as a request asks, and writes the log; which of the runs ended in a fall."""
     request = json.loads((place / "request.json").read_text())
+    for name in ("episodes", "seconds", "seed"):
+        if not isinstance(request.get(name), int | float) or (request[name] <= 0 and name != "seed"):
+            raise ValueError(f"{place / 'request.json'}: {name}: got {request.get(name)!r}, expected a positive number")
     player = Player(place / "policy" / "policy.npz")
     rngs = [np.random.default_rng((seed, request["seed"], index)) for index in range(request["episodes"])]
     walked = [robot.walk(f"run_{index:03d}", player, request["seconds"], rng) for index, rng in enumerate(rngs)]
@@ -249,10 +253,15 @@ def main(args: Args) -> None:
     while time.monotonic() - last < args.idle_s:
         for request in sorted(args.folder.glob("**/round_*/request.json")):
             place = request.parent
-            if not (place / "log").exists():
+            if (place / "log").exists() or (place / "refused.txt").exists():
+                continue
+            try:
                 falls = answer(place, robot, args.seed)
                 console.print(f"{place}: walked {len(falls)} times, fell {sum(falls)} times")
-                last = time.monotonic()
+            except (ValueError, OSError) as error:
+                (place / "refused.txt").write_text(f"{error}\n")
+                console.print(f"{place}: refused: {error}", highlight=False)
+            last = time.monotonic()
         time.sleep(0.5)
 
 

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from envs.logs.sampling import HELD, held, sampled
+from envs.logs.sampling import ASKED, HELD, held, sampled
 
 SUFFIXES = (".bag", ".mcap", ".db3")
 """Of files; a folder with a `metadata.yaml` is a bag as well."""
@@ -106,7 +106,7 @@ def _rows(path: Path, topics: Mapping[str, _Topic], of_rows: str) -> tuple[float
     for name, topic in topics.items():
         holes = np.diff(topic.time)
         wide = holes > _HOLE * np.median(holes)
-        if name == of_rows or all(ours.partition(".")[0] in HELD for ours in topic.values):
+        if name == of_rows or all(ours.partition(".")[0] in ASKED for ours in topic.values):
             continue
         after = np.clip(np.searchsorted(topic.time, stamps), 1, len(topic.time) - 1)
         stamps = stamps[~wide[after - 1] | (topic.time[after] == stamps)]

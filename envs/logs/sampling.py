@@ -2,8 +2,10 @@
 
 import numpy as np
 
-HELD = ("target", "action", "phase", "enabled", "cmd", "contact", "quat")
-"""Signals that stay until they change, or that mean nothing between two rows: never filtered, never mixed."""
+ASKED = ("target", "action", "phase", "enabled", "cmd")
+"""Signals that stay until they change."""
+HELD = (*ASKED, "contact", "quat")
+"""These, and what means nothing between two rows: never filtered, never mixed."""
 
 _FASTER = 1.25  # than it is asked for, from which on a signal is filtered
 

@@ -21,7 +21,9 @@ from jaxtune.types import Trajectory
 
 _NEEDED = ("q", "dq", "target", "action", "phase", "cmd", "gyro", "gravity", "vel")
 _READINGS = {"velocity": "vel", "gyro": "gyro", "gravity": "gravity", "joint": "q", "joint_velocity": "dq"}
-_SAME_RATE = 1.25  # rows and ticks are one where their rates differ by less
+_SAME_RATE = 0.02  # rows and ticks are one where their periods differ by a smaller share
+_FASTER = 1.5  # times as fast as ticks are rows between which ticks can be found
+_SILENCE = 10.5  # periods of the policy
 _HOLE = 1.5  # periods of the policy
 _UP_S = 0.5  # after a fall, for which it must stand to have got up
 _STEADY = 0.95  # share of ticks that are equally many rows apart, where rows and ticks keep step
@@ -75,9 +77,8 @@ def _at_ticks(run: Run, order: list[int]) -> dict[str, np.ndarray]:
     height = signals["pos"][:, 2] if "pos" in signals else np.full(len(run.time), np.inf)
     down = np.asarray(env.fallen(signals["gravity"], height)) | (signals.get("enabled", np.ones(len(height))) == 0)
     rows, aligned = _ticks(run.name, run.time, signals["action"])
-    if down[-1]:
-        # Who has fallen is asked for no more actions.
-        rows = np.union1d(rows, len(run.time) - 1)
+    # Who has fallen may be asked for no more actions.
+    rows = np.union1d(rows, 1 + np.flatnonzero(down[1:] & ~down[:-1]))
     if aligned:
         seen = {name: values[rows] for name, values in signals.items()} | {"time": run.time[rows]}
     else:
@@ -94,19 +95,23 @@ def _at_ticks(run: Run, order: list[int]) -> dict[str, np.ndarray]:
 def _ticks(name: str, time: np.ndarray, action: np.ndarray) -> tuple[np.ndarray, bool]:
     """Rows in which the policy spoke, and whether they are when it looked."""
     period, width = constants.POLICY_DT_S, float(np.median(np.diff(time)))
-    if width > _SAME_RATE * period:
-        raise ValueError(f"{name}: got {1 / width:.6g} rows a second, expected {1 / period:g} or more")
-    if width * _SAME_RATE >= period:
+    if abs(width / period - 1.0) < _SAME_RATE:
         return np.arange(len(time)), True
+    if width * _FASTER > period:
+        raise ValueError(
+            f"{name}: got {1 / width:.6g} rows a second, expected the policy's {1 / period:g}, or {_FASTER / period:g} "
+            "or more"
+        )
     rows = 1 + np.flatnonzero((np.diff(action, axis=0) != 0).any(axis=1))
     apart = np.diff(time[rows])
-    if len(rows) < 2 or abs(np.median(apart) / period - 1.0) > _SAME_RATE - 1.0:
+    if len(rows) < 2 or abs(np.median(apart) / period - 1.0) > 0.25:
         every = f"every {np.median(apart):.3g} s" if len(rows) > 1 else f"{len(rows)} time(s)"
         raise ValueError(f"{name}: 'action' changes {every}, expected every {period:g} s")
-    # A policy that says the same twice is not heard the second time.
+    # A policy that says the same twice is not heard the second time; one that is silent for long has stopped.
     unheard = [
         np.searchsorted(time, time[row] + np.arange(1, round(gap / period)) * period - 0.5 * width)
         for row, gap in zip(rows, apart, strict=False)
+        if gap < _SILENCE * period
     ]
     rows = np.unique(np.concatenate([rows, *unheard]))
     steady = np.diff(rows) == round(period / width)
@@ -114,11 +119,13 @@ def _ticks(name: str, time: np.ndarray, action: np.ndarray) -> tuple[np.ndarray,
 
 
 def _wanted_torque(run: Run, seen: dict[str, np.ndarray], order: list[int]) -> np.ndarray:
-    """What the joints' controller asks for, [ticks, joints] Nm, where nobody measured what came of it."""
+    """What the joints' controller has asked for, [ticks, joints] Nm, where nobody measured what came of it."""
     if run.controller.kind != "pd":
         raise ValueError(f"{run.name}: there is no 'tau', expected it beside a controller of type servo")
     kp, kd, limit = (run.controller.gains[name][order] for name in ("kp", "kd", "torque_limit_nm"))
-    return np.clip(kp * (seen["target"] - seen["q"]) - kd * seen["dq"], -limit, limit)
+    # Until now the target was that of the tick before.
+    target = np.concatenate([seen["target"][:1], seen["target"][:-1]])
+    return np.clip(kp * (target - seen["q"]) - kd * seen["dq"], -limit, limit)
 
 
 def _pieces(ticks: dict[str, np.ndarray]) -> list[tuple[np.ndarray, bool]]:

@@ -86,6 +86,20 @@ def test_the_player_walks_as_the_simulator_does(folder, played):
             np.testing.assert_allclose(target, drive.target[robot, step], atol=1e-4)
 
 
+def test_the_player_refuses_what_is_no_number(folder):
+    player = Player(folder / "policy.npz")
+    fine = {name: np.zeros(3) for name in ("velocity", "command", "gyro")}
+    fine |= {
+        "gravity": np.array([0, 0, -1.0]),
+        "joint": np.array(player.meta["stand_rad"]),
+        "joint_velocity": np.zeros(6),
+    }
+    before = player.step(**fine)
+    with pytest.raises(ValueError, match="gyro: got a number that is not finite"):
+        player.step(**fine | {"gyro": np.array([0.0, np.nan, 0.0])})
+    np.testing.assert_array_equal(player.target, before)
+
+
 def test_reference_and_observation_are_the_simulators(folder):
     player, rng = Player(folder / "policy.npz"), np.random.default_rng(0)
     sizes = {row["name"]: row["size"] for row in player.meta["observation"]}

@@ -176,6 +176,30 @@ def test_motors_off_are_a_fall(simulated):
     np.testing.assert_array_equal(found.trajectory.alive.sum(axis=1), [99])
 
 
+def test_a_fall_is_seen_after_the_policy_has_stopped(simulated):
+    _, log = simulated
+    run = faster(log.runs[2], 5)
+    onset = np.flatnonzero(run.signals["gravity"][:, 2] > -np.cos(np.pi / 4))[0]
+    action = run.signals["action"].copy()
+    action[onset - 2 :] = action[onset - 2]
+    stopped = replace(run, signals=run.signals | {"action": action})
+    found = recorded.episodes(replace(log, rate_hz=500.0, runs=(stopped,)), STEPS).trajectory
+    np.testing.assert_array_equal(found.fell, [True])
+
+
+def test_a_policy_that_stops_is_not_made_up(simulated):
+    _, log = simulated
+    run = faster(log.runs[0], 5)
+    action = run.signals["action"].copy()
+    action[300:700] = action[300]
+    paused = replace(run, signals=run.signals | {"action": action})
+    found = recorded.episodes(replace(log, rate_hz=500.0, runs=(paused,)), STEPS).trajectory
+    # 60 ticks before and the rest of 199 after 140, the first, the last and what borders on the pause left out.
+    assert found.alive.shape[0] == 2
+    np.testing.assert_allclose(found.alive.sum(axis=1), [58, 57], atol=2)
+    assert not found.fell.any()
+
+
 def test_a_long_run_is_several_episodes(simulated):
     _, log = simulated
     stays = log.runs[0]
@@ -192,7 +216,11 @@ def test_torque_that_was_not_measured_is_what_was_asked_for(simulated):
     run = log.runs[0]
     signals = {name: values for name, values in run.signals.items() if name != "tau"}
     found = recorded.episodes(replace(log, runs=(replace(run, signals=signals),)), STEPS)
-    asked = np.clip(60 * (run.signals["target"] - run.signals["q"]) - 2 * run.signals["dq"], -60, 60)
+    target = run.signals["target"]
+    target = np.concatenate([target[:1], target[:-1]])
+    asked = np.clip(60 * (target - run.signals["q"]) - 2 * run.signals["dq"], -60, 60)
+    # Of the log's own torques, at the end of a step: MuJoCo's are those of its last millisecond.
+    assert np.corrcoef(asked[1:90].ravel(), run.signals["tau"][1:90].ravel())[0, 1] > 0.98
     power = np.maximum(asked * run.signals["dq"], 0.0).sum(axis=1)
     alive = np.flatnonzero(found.trajectory.alive[0])
     np.testing.assert_allclose(found.power[0, alive], power[1 + alive], rtol=1e-4)
@@ -212,7 +240,11 @@ def without(log, *names):
         (lambda log: without(log, "vel"), "run_000: there is no 'vel', expected q, dq, target"),
         (lambda log: without(log, "gravity"), "run_000: there is no 'gravity'"),
         (lambda log: replace(log, runs=(still(log.runs[0]),)), r"run_000: 'action' changes 0 time\(s\)"),
-        (lambda log: replace(log, runs=(slow(log.runs[0]),)), "run_000: got 50 rows a second, expected 100 or more"),
+        (
+            lambda log: replace(log, runs=(slow(log.runs[0]),)),
+            "run_000: got 50 rows a second, expected the policy's 100",
+        ),
+        (lambda log: replace(log, runs=(faster(log.runs[0], 1.2),)), "run_000: got 120 rows a second, expected"),
         (lambda log: replace(log, runs=(lying(log.runs[0]),)), "got 1 without two ticks in a row"),
     ],
 )

@@ -289,7 +289,7 @@ def test_devices_share_the_work():
         "problem = toy.problem({'coulomb': 0.5})\n"
         "vectors = np.random.default_rng(0).uniform(0, 0.3, (7, len(toy.AXES))) * (np.arange(len(toy.AXES)) < 6)\n"
         "found = Residuals(problem, width=16)(vectors, problem.data['train'][0.1])\n"
-        "print(len(jax.devices()), found.shape, found.sum(), np.abs(found).max())\n"
+        "print(len(jax.devices()), *found.shape, *found.ravel())\n"
     )
     said = []
     for devices in (1, 2):
@@ -299,5 +299,5 @@ def test_devices_share_the_work():
         done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
         said.append(done.stdout.split())
     assert [line[0] for line in said] == ["1", "2"]
-    assert said[0][1:5] == said[1][1:5]
-    np.testing.assert_allclose(*(np.array(line[5:], float) for line in said), rtol=1e-4)
+    assert len(said[0]) > 1000
+    np.testing.assert_allclose(*(np.array(line[1:], float) for line in said), rtol=1e-4, atol=1e-6)
