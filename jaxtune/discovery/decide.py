@@ -121,7 +121,9 @@ def alike(lost: Mapping[str, np.ndarray], run: np.ndarray, errors: float) -> lis
 def bagged(fits: Mapping[str, Linear], run: np.ndarray) -> dict[str, float]:
     """How often each is best where it was not fitted, when segments are drawn with repetition and it is fitted again.
 
-    Near its fit a hypothesis is linear; so a draw costs the solution of one small system, and no simulation.
+    Near its fit a hypothesis is linear; so a draw costs the solution of one small system, and no simulation. A fit is
+    taken to be the best for all segments: a draw moves it by how it differs from them, not by what the slopes promise
+    of places where it has been and found it otherwise.
 
     Args:
       fits: residuals and slopes of all segments, flat, at each hypothesis' fit.
@@ -140,7 +142,7 @@ def bagged(fits: Mapping[str, Linear], run: np.ndarray) -> dict[str, float]:
         prior = np.diag(1.0 / fit.sd**2)
         steps = -np.linalg.solve(
             fit.weight * np.einsum("ds,sij->dij", times, normal, optimize=True) + prior + 1e-9 * np.eye(len(prior)),
-            (fit.weight * times @ pull + fit.offset @ prior)[..., None],
+            (fit.weight * (times - 1) @ pull)[..., None],
         )[..., 0]
         there = square + 2 * steps @ pull.T + np.einsum("di,sij,dj->ds", steps, normal, steps, optimize=True)
         lost.append(np.where(times == 0, np.sqrt(np.maximum(there, 0.0)), 0.0).sum(axis=1))

@@ -64,12 +64,17 @@ def test_the_better_hypothesis_wins_when_it_is_fitted_again():
     right, wrong = rng.standard_normal((2, 40, 5))
     # The right one explains its share of what is left once it is fitted; the wrong one has nothing to do with it.
     residual = 0.1 * rng.standard_normal((40, 5))
-    fits = {
+    start = {
         name: Linear((residual - 0.3 * right).ravel(), slope.reshape(-1, 1), np.zeros(1), np.ones(1), 1.0)
         for name, slope in {"right": right, "wrong": wrong}.items()
     }
-    chosen = decide.bagged(fits, run)
-    assert chosen == {"right": 1.0, "wrong": 0.0}
+    fits = {}
+    for name, fit in start.items():
+        step = fit.step()
+        fits[name] = Linear(fit.residual + fit.jacobian @ step, fit.jacobian, step, fit.sd, fit.weight)
+    assert decide.bagged(fits, run) == {"right": 1.0, "wrong": 0.0}
+    # Slopes that promise what a fit has not found are not believed.
+    assert decide.bagged({"found": fits["right"], "promised": start["right"]}, run) == {"found": 1.0, "promised": 0.0}
     alike = decide.bagged({"one": fits["wrong"], "other": fits["wrong"]}, run)
     assert sum(alike.values()) == 1.0
 
