@@ -1,4 +1,7 @@
-"""Damaged logs: an error that names the file, or what the file says; never a hang, never a wrong number in silence."""
+"""Damaged logs: an error that names the file, or what the file says; never a hang, never a wrong number in silence.
+
+Bags have no checksums to speak of: what is read of a damaged one is a log, and no more can be said.
+"""
 
 import csv
 import datetime
