@@ -113,8 +113,10 @@ def gait(path: Path, force: np.ndarray, phase: np.ndarray) -> None:
 def suspicions(path: Path, run: Run, joints: Sequence[str], titles: Sequence[str]) -> None:
     """A run as it was recorded: the clock, and every joint's position and target with what is suspected above."""
     figure, axes = plt.subplots(1 + len(joints), 1, figsize=(10, 1.6 * (2 + len(joints))), layout="constrained")
-    axes[0].plot(run.time[1:], 1e3 * np.diff(run.time), lw=0.8)
-    axes[0].set(ylabel="row to row, ms", yscale="log")
+    steps = 1e3 * np.diff(run.time)
+    axes[0].plot(run.time[1:], steps, lw=0.8)
+    # Rounding is no news.
+    axes[0].set(ylabel="row to row, ms", yscale="log", ylim=(0.3 * steps.min(), 3.0 * steps.max()))
     for index, (axis, joint) in enumerate(zip(axes[1:], joints, strict=True)):
         if "target" in run.signals:
             axis.plot(run.time, run.signals["target"][:, index], lw=0.8, color="tab:orange", label="target")
