@@ -1,5 +1,6 @@
 """Sizes of the experiments: what a preset buys, each number a field."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -38,6 +39,8 @@ class Preset:
     """Episodes of the full time limit over which a return is the mean."""
     scratch_updates: int = 3000
     """PPO updates of a policy trained from scratch."""
+    foreseen_episodes: int = 100
+    """Episodes in which is looked what a policy will do before a robot is asked for it."""
     chunk: int = 10
     """PPO updates between two lines of progress."""
     sweep: TunerConfig = field(
@@ -76,6 +79,7 @@ _SMOKE = Preset(
     epochs=2,
     tunings=2,
     evaluation_episodes=_TINY.set_episodes,  # of equal length too: one program measures and evaluates
+    foreseen_episodes=4,
     scratch_updates=2,
     chunk=2,
     sweep=_TINY,
@@ -123,3 +127,23 @@ def chosen(parameters: str) -> dict[str, domain.Entry]:
     """
     names = constants.PARAMETER_SETS.get(parameters) or tuple(name.strip() for name in parameters.split(","))
     return domain.select(constants.ENTRIES, names)
+
+
+def named_values(option: str, items: Sequence[str], entries: Mapping[str, domain.Entry]) -> dict[str, float]:
+    """Physical values by name, of `name=value`.
+
+    Raises:
+      ValueError: an item is not of this form, its name is not in the table, or its value is out of bounds.
+    """
+    found = {}
+    for item in items:
+        name, _, value = item.partition("=")
+        try:
+            found[name] = float(value)
+        except ValueError:
+            raise ValueError(f"{option}: got '{item}', expected name=value") from None
+        (entry,) = domain.select(entries, [name]).values()
+        low, high = entry.bounds
+        if not low <= found[name] <= high:
+            raise ValueError(f"{option}: got '{item}', expected {low:g} to {high:g}")
+    return found

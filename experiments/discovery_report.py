@@ -1,7 +1,5 @@
 """What discovery tells a person: a page with its pictures in it, and two tables."""
 
-import base64
-import io
 from pathlib import Path
 
 import jinja2
@@ -45,15 +43,9 @@ def write(path: Path, log: Log, question: Question, result: Result, summary: dic
         rungs=result.rungs,
         rejected=result.rejected,
         free=free,
-        pictures={name: _embedded(figure) for name, figure in pictures.items()},
+        pictures={name: plots.embedded(figure) for name, figure in pictures.items()},
     )
     path.write_text(page)
-
-
-def _embedded(figure) -> str:
-    file = io.BytesIO()
-    plots.write_png(figure, file)
-    return "data:image/png;base64," + base64.b64encode(file.getvalue()).decode()
 
 
 def show(console: Console, summary: dict, result: Result, free: dict) -> None:

@@ -15,10 +15,10 @@ from rich.table import Table
 
 from envs import domain
 from envs.biteno import constants, gait
-from envs.targets.protocol import Recording, Target
+from envs.targets.protocol import Asked, Recording, Target
 from experiments import checkpoint, film, plots
 from experiments.checkpoint import write_json
-from experiments.config import PRESETS, chosen, preset
+from experiments.config import PRESETS, chosen, named_values, preset
 from experiments.loop import Loop
 from experiments.targets import TARGETS
 from experiments.train import console, run, starting_policy
@@ -69,23 +69,12 @@ def check(args: Args) -> dict[str, float]:
         raise ValueError(f"episodes: got {args.episodes}, expected 1 or more")
     if not 0 <= args.push < float("inf"):
         raise ValueError(f"push: got {args.push}, expected a number that is not negative")
-    params = {}
-    for item in args.set:
-        name, _, value = item.partition("=")
-        try:
-            params[name] = float(value)
-        except ValueError:
-            raise ValueError(f"set: got '{item}', expected name=value") from None
-        (entry,) = domain.select(constants.ENTRIES, [name]).values()
-        low, high = entry.bounds
-        if not low <= params[name] <= high:
-            raise ValueError(f"set: got '{item}', expected {low:g} to {high:g}")
-    return params
+    return named_values("set", args.set, constants.ENTRIES)
 
 
-def measure(target: Target, key: jax.Array, act, count: int, steps: int, command=None) -> tuple[Trajectory, Recording]:
+def measure(target: Target, key: jax.Array, act, count: int, steps: int, asked=None) -> tuple[Trajectory, Recording]:
     """Episodes on the host, and the motion behind them."""
-    return jax.tree.map(np.asarray, target.record(key, act, count, steps, command))
+    return jax.tree.map(np.asarray, target.record(key, act, count, steps, asked))
 
 
 def judge(trajectory: Trajectory, recording: Recording) -> dict[str, float]:
@@ -113,8 +102,8 @@ def main(args: Args) -> None:
     targets = {name: TARGETS[args.target](loop.robot, values) for name, loop in loops.items()}
     key = jax.random.PRNGKey(args.seed)
     short, long = (round(seconds / constants.POLICY_DT_S) for seconds in (_GRID_S, task.episode_s))
-    command = np.array(GRID, np.float32)
-    grid = measure(targets["none"], key, act, len(command), short, command)
+    command = np.repeat(np.array(GRID, np.float32)[:, None], short, axis=1)
+    grid = measure(targets["none"], key, act, len(GRID), short, Asked(command=command))
     rows = {"grid": judge(*grid)}
     for name, target in targets.items():
         rows[name] = judge(*measure(target, jax.random.fold_in(key, len(rows)), act, args.episodes, long))

@@ -10,10 +10,10 @@ import jax.numpy as jnp
 from brax.envs.base import State
 
 from envs import biteno, domain
-from envs.biteno import BraxBiteno, constants
+from envs.biteno import BraxBiteno, constants, gait
 from envs.correction import Correction
-from envs.targets.mjx import MjxTarget, simulate
-from envs.targets.protocol import Act, Target
+from envs.targets.mjx import MjxTarget, rollout, simulate
+from envs.targets.protocol import Act, Asked, Target
 from experiments.config import Preset
 from jaxtune import dist as dists
 from jaxtune.baselines import Untuned
@@ -30,6 +30,7 @@ class Policy:
     robots: State
     radius: jax.Array  # its robots are drawn no wider than this around the centre, in search coordinates
     hidden: dict  # physical values by name of what its robots have and nobody tunes
+    asked: Asked | None = None  # what simulated episodes are asked for in turn, where measured ones are repeated
 
 
 class Loop:
@@ -105,7 +106,9 @@ class Loop:
 
     def simulate(self, key: jax.Array, policy: Policy, params: Mapping[str, jax.Array]) -> Trajectory:
         """One episode for each draw, [episodes] by name in search coordinates."""
-        return simulate(self.robot, key, self.act(policy), params, self.preset.episode_steps)
+        count = len(next(iter(params.values())))
+        asked = jax.tree.map(lambda leaf: leaf[jnp.arange(count) % len(leaf)], policy.asked)
+        return simulate(self.robot, key, self.act(policy), params, self.preset.episode_steps, asked)
 
     def play(self, target: Target) -> Callable[..., Trajectory]:
         """Whole episodes in a target, `(key, policy, count, steps) -> Trajectory`, compiled where it is in JAX."""
@@ -121,14 +124,33 @@ class Loop:
         trajectory = play(key, policy, self.preset.evaluation_episodes, steps)
         return float(trajectory.score.sum(axis=-1).mean()), int(trajectory.fell.sum())
 
-    def tuner(self, target: Target) -> Tuner:
-        """Algorithm 1 against a target, pure where the target is in JAX."""
+    def foresee(self, key: jax.Array, policy: Policy, dist: ParamDist, count: int, steps: int) -> dict[str, jax.Array]:
+        """What the policy does in robots drawn from the distribution.
+
+        Returns:
+          By name, over `count` episodes of `steps` steps: mean `return` under the weights of Table I, `fall_rate`, and
+          mean `power_w` while it walks.
+        """
+        key_params, key_episodes = jax.random.split(key)
+        params = domain.from_coordinates(self.entries, dists.sample(key_params, dist, count))
+        trajectory, power = rollout(
+            self.robot,
+            key_episodes,
+            self.act(policy),
+            params,
+            steps,
+            watch=lambda before, after, motion: gait.power(motion.torque, motion.qvel[6:]),
+        )
+        return walked(trajectory, power)
+
+    def tuner(self, target: Target | None = None) -> Tuner:
+        """Algorithm 1 against a target, pure where the target is in JAX; of none, measured sets come from outside."""
         count, steps = self.preset.tuner.set_episodes, self.preset.episode_steps
         return Tuner(
             config=self.preset.tuner,
             train_policy=lambda key, policy, dist: self.train(key, policy, dist, self.preset.epochs),
             simulate=self.simulate,
-            measure=lambda key, policy: target.episodes(key, self.act(policy), count, steps),
+            measure=target and (lambda key, policy: target.episodes(key, self.act(policy), count, steps)),
         )
 
     def step(self, machine: Tuner | Untuned, play: Callable[..., Trajectory]) -> Callable:
@@ -153,3 +175,13 @@ class Loop:
 
     def _act(self, learner: PPOState, obs: jax.Array, key: jax.Array):
         return self._ppo.act(learner)(obs, key)
+
+
+def walked(trajectory: Trajectory, power: jax.Array) -> dict[str, jax.Array]:
+    """What came of episodes, their power [episodes, time] in W beside them: mean return, share of falls, mean power."""
+    alive = trajectory.alive
+    return {
+        "return": trajectory.score.sum(axis=1).mean(),
+        "fall_rate": trajectory.fell.mean(),
+        "power_w": jnp.where(alive, power, 0.0).sum() / jnp.maximum(alive.sum(), 1),
+    }

@@ -6,6 +6,31 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from jaxtune import dist as dists
+from jaxtune.tuner import Info
+from jaxtune.types import Verdict
+
+
+def tuning(info: Info) -> dict:
+    """What happened in a tuning, for JSON: every call of the gate, and the update by parameter, in radii."""
+    calls = int(info.calls)
+    order = dists.names(info.dist)
+    gate = {name: np.asarray(value)[:calls] for name, value in info.gate.items()}
+    update = {
+        name: dict(zip(order, np.asarray(info.update[name]).tolist(), strict=True))
+        for name in ("step", "interval", "identifiable")
+    }
+    return {
+        "verdicts": [Verdict(int(verdict)).name.lower() for verdict in info.verdicts[:calls]],
+        "radius": np.asarray(info.radius)[:calls],
+        **gate,
+        **update,
+        "spm_loss": float(info.update.loss),
+        "measured_falls": int(info.measured_falls),
+        "not_finite": int(info.not_finite),
+        "training": {name: float(np.mean(value)) for name, value in info.train.items()},
+    }
+
 
 def sim2sim(args, results: dict[str, list[dict]], off: Sequence[str]) -> dict:
     """The summary of a run; `falls_in_target` counts falls in the closing evaluation, `measured_falls` while

@@ -15,7 +15,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from rich.progress import Progress
 
 from envs import domain
@@ -28,7 +27,6 @@ from experiments.loop import Loop, Policy
 from experiments.targets import TARGETS
 from experiments.train import bars, console, run, starting_policy
 from jaxtune import baselines, tuner
-from jaxtune import dist as dists
 from jaxtune.types import ParamDist, Verdict
 
 
@@ -223,7 +221,7 @@ class Runner:
                 self._must_have_walked(info)
             value, falls = self._loop.evaluate(key_evaluate, state.policy, self._play)
             line = {"method": name, "seed": seed, "tuning": index, "return": value, "falls": falls}
-            line |= self._describe(state.dist) | (self._tell(info) if info is not None else {})
+            line |= self._describe(state.dist) | (report.tuning(info) if info is not None else {})
             yield as_json(line | {"seconds": time.monotonic() - begin})
 
     def _must_have_walked(self, info: tuner.Info) -> None:
@@ -245,26 +243,6 @@ class Runner:
                 else abs(float(value) - truth[name])
                 for name, value in centre.items()
             },
-        }
-
-    @staticmethod
-    def _tell(info: tuner.Info) -> dict:
-        calls = int(info.calls)
-        order = dists.names(info.dist)
-        gate = {name: np.asarray(value)[:calls] for name, value in info.gate.items()}
-        update = {
-            name: dict(zip(order, np.asarray(info.update[name]).tolist(), strict=True))
-            for name in ("step", "interval", "identifiable")
-        }
-        return {
-            "verdicts": [Verdict(int(verdict)).name.lower() for verdict in info.verdicts[:calls]],
-            "radius": np.asarray(info.radius)[:calls],
-            **gate,
-            **update,
-            "spm_loss": float(info.update.loss),
-            "measured_falls": int(info.measured_falls),
-            "not_finite": int(info.not_finite),
-            "training": {name: float(np.mean(value)) for name, value in info.train.items()},
         }
 
 

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 
 from jaxtune.rules import GateInfo, no_gate_log, no_update, vote_update
 from jaxtune.tuner import Info, Tuner, TunerState
+from jaxtune.types import Trajectory
 
 
 def open_gate(key, config, collected, measured, knobs) -> GateInfo:
@@ -40,8 +41,14 @@ class Untuned:
     def step(self, key: jax.Array, state: TunerState) -> tuple[TunerState, Info]:
         """Trains the policy for as long as a tuning does."""
         state, metrics = self.tuner.train(key, state)
+        state, info = self.tune(key, state)
+        return state, info.replace(train=metrics)
+
+    def tune(self, key: jax.Array, state: TunerState, measured: Trajectory | None = None) -> tuple[TunerState, Info]:
+        """Nothing, whatever was measured."""
+        del key, measured
         return state, Info(
-            train=metrics,
+            train={},
             calls=jnp.zeros((), int),
             **no_gate_log(self.tuner.config),
             update=no_update(state.dist),

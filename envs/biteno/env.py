@@ -311,9 +311,9 @@ class Biteno:
         )
 
     @staticmethod
-    def ask(state: State, command: jax.Array) -> State:
-        """The same robot under another command [3]."""
-        return state.replace(command=command, obs=sensing.with_command(state.obs, command))
+    def ask(state: State, command: jax.Array, phase: jax.Array) -> State:
+        """The same robot under another command [3], its gait clock at another phase [2]."""
+        return state.replace(command=command, phase=phase, obs=sensing.with_request(state.obs, command, phase))
 
     def _push(self, key: jax.Array, qvel: jax.Array, steps: jax.Array) -> jax.Array:
         if not self.config.push_mps:

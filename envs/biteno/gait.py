@@ -139,10 +139,15 @@ def quality(
         "turn_error_radps": np.abs(error[:, 2]).mean() if len(error) else np.nan,
         "slip_mps": (speed * (contact & living)).sum() * constants.POLICY_DT_S / seconds,
         "torque_nm": np.sqrt((torque[alive] ** 2).mean()),
-        "power_w": np.maximum(torque * qvel[..., 6:], 0.0).sum(axis=-1)[alive].mean(),
+        "power_w": power(torque, qvel[..., 6:])[alive].mean(),
         "falls_per_20s": fell.sum() / seconds * 20.0,
         "friction_use_p99": np.quantile(use, 0.99) if use.size else np.nan,
     }
+
+
+def power(torque: jax.Array, joint_velocity: jax.Array) -> jax.Array:
+    """Mechanical power in W of torques [..., 6] in Nm at velocities in rad/s, braking not regained."""
+    return jnp.maximum(torque * joint_velocity, 0.0).sum(axis=-1)
 
 
 def _clearance(height: np.ndarray, contact: np.ndarray, living: np.ndarray) -> float:

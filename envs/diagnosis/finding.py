@@ -5,6 +5,8 @@ from dataclasses import dataclass
 MEASURED = ("q", "dq", "tau")
 """What sensors say of joints."""
 
+_WRONG = ("swapped joints", "flipped sign", "degrees", "radians twice", "millinewtonmetres")
+
 
 @dataclass(frozen=True)
 class Finding:
@@ -19,3 +21,8 @@ class Finding:
     """How much, in the unit of the sentence."""
     sentence: str
     """For a person, with what to do about it."""
+
+    @property
+    def wrong(self) -> bool:
+        """Whether numbers mean something else than the log says: nothing can be learnt from it as it is."""
+        return self.kind in _WRONG

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs.biteno import Biteno, CorrectedBiteno, Drive, Motion, State
-from envs.targets.protocol import Act, Recording, watch
+from envs.targets.protocol import Act, Asked, Recording, watch
 from jaxtune.types import Trajectory
 
 
@@ -50,19 +50,21 @@ class HostTarget:
         return self.record(key, act, count, steps)[0]
 
     def record(
-        self, key: jax.Array, act: Act, count: int, steps: int, command: jax.Array | None = None
+        self, key: jax.Array, act: Act, count: int, steps: int, asked: Asked | None = None
     ) -> tuple[Trajectory, Recording]:
-        """The same with the motion behind it, each episode under a command [episodes, 3] that stays, if given."""
+        """The same with the motion behind it."""
         act = act if isinstance(act, jax.tree_util.Partial) else jax.tree_util.Partial(act)
         keys = jax.vmap(jax.random.split)(jax.random.split(key, count))
         step_keys = np.asarray(jax.vmap(lambda key: jax.random.split(key, steps))(keys[:, 1]))
         state = self._reset(keys[:, 0])
+        if asked is not None and asked.phase is not None:
+            state = self._ask(state, asked.command[:, 0], asked.phase)
         self._engine.start(state)
         alive = np.ones(count, bool)
         not_finite = np.zeros(count, bool)
         records = []
         for index in range(steps):
-            state = state if command is None else self._ask(state, command)
+            state = state if asked is None else self._ask(state, asked.command[:, index], state.phase)
             action = self._choose(act, state.obs, step_keys[:, index])
             drive = self._drive(state, action)
             motion = self._engine.move(state, drive)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from envs import domain
 from envs.biteno import Biteno
-from envs.targets.protocol import Act, Recording, watch
+from envs.targets.protocol import Act, Asked, Recording, watch
 from jaxtune.types import Named, Trajectory
 
 _CHUNK = 256  # small batches are fastest on a CPU; larger ones are worked off in turn
@@ -21,7 +21,7 @@ def rollout(
     act: Act,
     params: domain.Params,
     steps: int,
-    command: jax.Array | None = None,
+    asked: Asked | None = None,
     watch: Callable[..., Any] = lambda before, after, motion: (),
 ) -> tuple[Trajectory, Any]:
     """Plays one episode for every parameter draw.
@@ -34,7 +34,7 @@ def rollout(
       act: the policy.
       params: physical values by name, each [episodes].
       steps: length of an episode.
-      command: [episodes, 3], for the whole episode in the stead of those that are drawn.
+      asked: commands, and starts of the gait clock, in the stead of those that are drawn.
       watch: what is recorded of a step, `(state before, state after, motion) -> pytree`.
 
     Returns:
@@ -44,7 +44,7 @@ def rollout(
     params = jax.lax.optimization_barrier(dict(params))
     count = next(iter(params.values())).shape[0]
     episode = jax.vmap(lambda *drawn: _episode(robot, act, steps, watch, *drawn))
-    inputs = (jax.random.split(key, count), params) + (() if command is None else (command,))
+    inputs = (jax.random.split(key, count), params) + (() if asked is None else (asked,))
     if count <= _CHUNK:
         return episode(*inputs)
     # Chunks of equal size; the last one is filled up with repetitions.
@@ -56,12 +56,15 @@ def rollout(
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:count], stacked)
 
 
-def _episode(robot, act, steps, watch, key, params, command=None) -> tuple[Trajectory, Any]:
+def _episode(robot, act, steps, watch, key, params, asked=None) -> tuple[Trajectory, Any]:
     key_reset, key_act = jax.random.split(key)
+    state = robot.reset(params, key_reset)
+    if asked is not None and asked.phase is not None:
+        state = robot.ask(state, asked.command[0], asked.phase)
 
-    def step(carry, key):
-        state, alive = carry
-        state = state if command is None else robot.ask(state, command)
+    def step(carry, now):
+        (state, alive), (key, command) = carry, now
+        state = state if command is None else robot.ask(state, command, state.phase)
         action, _ = act(state.obs, key)
         following, motion = robot.move(params, state, action)
         broke = alive & (following.not_finite > 0)
@@ -69,8 +72,8 @@ def _episode(robot, act, steps, watch, key, params, command=None) -> tuple[Traje
         record = (state.obs, action, alive & ~broke, score, broke), watch(state, following, motion)
         return (following, alive & (following.done == 0)), record
 
-    start = (robot.reset(params, key_reset), jnp.asarray(True))
-    (_, alive), (record, watched) = jax.lax.scan(step, start, jax.random.split(key_act, steps))
+    during = (jax.random.split(key_act, steps), None if asked is None else asked.command)
+    (_, alive), (record, watched) = jax.lax.scan(step, (state, jnp.asarray(True)), during)
     obs, action, valid, score, broke = record
     trajectory = Trajectory(obs=obs, action=action, alive=valid, score=score, fell=~alive, not_finite=broke.any())
     return trajectory, watched
@@ -89,15 +92,17 @@ class MjxTarget:
         return rollout(self.robot, key, act, self._params(count), steps)[0]
 
     def record(
-        self, key: jax.Array, act: Act, count: int, steps: int, command: jax.Array | None = None
+        self, key: jax.Array, act: Act, count: int, steps: int, asked: Asked | None = None
     ) -> tuple[Trajectory, Recording]:
-        """The same with the motion behind it, each episode under a command [episodes, 3] that stays, if given."""
-        return rollout(self.robot, key, act, self._params(count), steps, command, watch)
+        """The same with the motion behind it."""
+        return rollout(self.robot, key, act, self._params(count), steps, asked, watch)
 
     def _params(self, count: int) -> dict:
         return {name: jnp.full(count, value, jnp.float32) for name, value in self.params.items()}
 
 
-def simulate(robot: Biteno, key: jax.Array, act: Act, coordinates: Named, steps: int) -> Trajectory:
+def simulate(
+    robot: Biteno, key: jax.Array, act: Act, coordinates: Named, steps: int, asked: Asked | None = None
+) -> Trajectory:
     """Plays one episode for every draw of the tuner's distribution, [episodes] by name in search coordinates."""
-    return rollout(robot, key, act, domain.from_coordinates(robot.entries, coordinates), steps)[0]
+    return rollout(robot, key, act, domain.from_coordinates(robot.entries, coordinates), steps, asked)[0]

@@ -14,6 +14,14 @@ Act = Callable[[jax.Array, jax.Array], tuple[jax.Array, dict]]
 
 
 @chex.dataclass(frozen=True)
+class Asked:
+    """What episodes are asked for, in the stead of what would be drawn."""
+
+    command: jax.Array  # [episodes, time, 3] m/s, m/s, rad/s
+    phase: jax.Array | None = None  # [episodes, 2] cycles, where the gait clock starts; drawn where None
+
+
+@chex.dataclass(frozen=True)
 class Recording:
     """Motion behind the steps of a `Trajectory`, [episodes, time, ...]; what it says of a step is its end."""
 
@@ -46,6 +54,6 @@ class Target(Protocol):
         """Measures `count` episodes of `steps` policy steps."""
 
     def record(
-        self, key: jax.Array, act: Act, count: int, steps: int, command: jax.Array | None = None
+        self, key: jax.Array, act: Act, count: int, steps: int, asked: Asked | None = None
     ) -> tuple[Trajectory, Recording]:
-        """The same with the motion behind it, each episode under a command [episodes, 3] that stays, if given."""
+        """The same with the motion behind it."""

@@ -6,6 +6,7 @@ before it, and so is the last one of a piece that does not end in a fall, becaus
 """
 
 from functools import partial
+from itertools import chain
 
 import chex
 import jax
@@ -17,6 +18,7 @@ from envs.biteno import constants, env, gait, rewards
 from envs.logs import Log, Run
 from envs.logs.format import JOINT_SIGNALS
 from envs.logs.sampling import HELD, sampled
+from envs.targets.protocol import Asked
 from jaxtune.types import Trajectory
 
 _NEEDED = ("q", "dq", "target", "action", "phase", "cmd", "gyro", "gravity", "vel")
@@ -34,15 +36,19 @@ class Recorded:
     """Measured episodes, and what a simulation needs to repeat them."""
 
     trajectory: Trajectory
-    command: jax.Array  # [episodes, time, 3] m/s, m/s, rad/s
-    phase: jax.Array  # [episodes, time, 2] cycles
+    asked: Asked
     power: jax.Array  # [episodes, time] W, mechanical, braking not regained
 
 
-def episodes(log: Log, steps: int) -> Recorded:
+def episodes(log: Log, steps: int, most: int | None = None) -> Recorded:
     """Turns a log of a walking BITeno into episodes of `steps` policy steps.
 
     A longer piece of a run becomes several episodes; a shorter one is filled up with steps that are not alive.
+
+    Args:
+      log: of one or more runs.
+      steps: length of an episode.
+      most: episodes taken of a run, the first ones; all where None.
 
     Raises:
       ValueError: the log is of another robot or policy, lacks a signal, or has no two ticks in a row.
@@ -56,11 +62,38 @@ def episodes(log: Log, steps: int) -> Recorded:
     found = []
     for run in log.runs:
         ticks = _at_ticks(run, order)
-        for rows, fell in _pieces(ticks):
-            found += _chunks(_steps(ticks, rows, fell), steps)
+        chunks = [_chunks(_steps(ticks, rows, fell), steps) for rows, fell in _pieces(ticks)]
+        found += list(chain.from_iterable(chunks))[:most]
     if not found:
         raise ValueError(f"runs: got {len(log.runs)} without two ticks in a row, expected a robot that walks")
     return _as_simulated(jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *found))
+
+
+def beginning(recorded: Recorded, count: int, steps: int) -> Recorded:
+    """The first `steps` of the first `count` episodes.
+
+    Raises:
+      ValueError: there are fewer.
+    """
+    there = len(recorded.power)
+    if there < count:
+        raise ValueError(f"runs: got {there} episode(s), expected {count} or more")
+    cut = lambda leaf: leaf[:count, :steps]  # noqa: E731
+    trajectory, asked = recorded.trajectory, recorded.asked
+    # Who still stands when the cut comes has not fallen before it.
+    fell = (trajectory.fell & ~trajectory.alive[:, steps:].any(axis=1))[:count]
+    return Recorded(
+        trajectory=Trajectory(
+            obs=cut(trajectory.obs),
+            action=cut(trajectory.action),
+            alive=cut(trajectory.alive),
+            score=cut(trajectory.score),
+            fell=fell,
+            not_finite=trajectory.not_finite[:count],
+        ),
+        asked=Asked(command=cut(asked.command), phase=asked.phase[:count]),
+        power=cut(recorded.power),
+    )
 
 
 def _at_ticks(run: Run, order: list[int]) -> dict[str, np.ndarray]:
@@ -190,6 +223,8 @@ def _as_simulated(steps: dict) -> Recorded:
         joint_reference=each(gait.joint_reference)(now["phase"], now["cmd"]),
     )
     alive, fell = steps["alive"], steps["fell"].any(axis=1)
+    # Who repeats an episode may stay up for longer.
+    held = jnp.minimum(jnp.arange(alive.shape[1]), alive.sum(axis=1, keepdims=True) - 1)
     return Recorded(
         trajectory=Trajectory(
             obs=obs,
@@ -199,7 +234,6 @@ def _as_simulated(steps: dict) -> Recorded:
             fell=fell,
             not_finite=jnp.zeros_like(fell),
         ),
-        command=now["cmd"],
-        phase=now["phase"],
-        power=jnp.where(alive, jnp.maximum(now["tau"] * now["dq"], 0.0).sum(axis=-1), 0.0),
+        asked=Asked(command=jnp.take_along_axis(now["cmd"], held[..., None], axis=1), phase=now["phase"][:, 0]),
+        power=jnp.where(alive, gait.power(now["tau"], now["dq"]), 0.0),
     )

@@ -9,6 +9,7 @@ import reference
 from envs.biteno import Biteno, constants
 from envs.targets import mujoco_c
 from envs.targets.mjx import MjxTarget
+from envs.targets.protocol import Asked
 
 VALUES = reference.params(left_thigh_mass=1.5, torque_scale=0.8, foot_friction=0.7, action_delay_s=0.004)
 COUNT, STEPS = 3, 40
@@ -24,9 +25,12 @@ def restless(obs, key):
 def recorded(robot):
     """The same episodes in MuJoCo C and in MJX."""
     command = jnp.array([[0.5, 0.0, 0.0], [0.0, 0.2, 0.0], [0.0, 0.0, 0.6]])
-    here = mujoco_c.target(robot, VALUES, threads=2).record(KEY, restless, COUNT, STEPS, command)
+    # Half way through each takes the next one's.
+    command = jnp.repeat(jnp.stack([command, jnp.roll(command, 1, axis=0)], axis=1), STEPS // 2, axis=1)
+    asked = Asked(command=command, phase=jnp.array([[0.0, 0.5], [0.25, 0.75], [0.6, 0.1]]))
+    here = mujoco_c.target(robot, VALUES, threads=2).record(KEY, restless, COUNT, STEPS, asked)
     there = MjxTarget(robot=robot, params=VALUES)
-    return here, jax.jit(lambda key: there.record(key, restless, COUNT, STEPS, command))(KEY)
+    return here, jax.jit(lambda key: there.record(key, restless, COUNT, STEPS, asked))(KEY)
 
 
 def test_episodes_are_those_of_mjx(recorded):
@@ -50,10 +54,13 @@ def test_forces_of_the_floor_push_up_alike(recorded):
     assert motion.foot_force[..., 2].max() > 50.0
 
 
-def test_a_command_that_stays_is_seen_and_paid_for(recorded):
-    (here, motion), _ = recorded
-    np.testing.assert_allclose(here.obs[..., 3:6], motion.command * jnp.array([2.0, 2.0, 0.25]), atol=1e-6)
-    assert np.all(motion.command[:, 0] == motion.command[:, -1])
+def test_what_is_asked_for_is_seen_and_paid_for(recorded):
+    for trajectory, motion in recorded:
+        np.testing.assert_allclose(trajectory.obs[..., 3:6], motion.command * jnp.array([2.0, 2.0, 0.25]), atol=1e-6)
+        np.testing.assert_array_equal(motion.command[0, [0, 19, 20]], [[0.5, 0, 0], [0.5, 0, 0], [0, 0, 0.6]])
+        # Sine and cosine of the clocks at the start, and a step of 0.0175 cycles later.
+        np.testing.assert_allclose(trajectory.obs[1, 0, 36:], [1, 0, -1, 0], atol=1e-6)
+        np.testing.assert_allclose(motion.phase[:, 0, 0], [0.0175, 0.2675, 0.6175], atol=1e-6)
 
 
 def test_falls_are_masked_as_in_mjx(robot):

@@ -207,8 +207,43 @@ def test_a_long_run_is_several_episodes(simulated):
     parts = recorded.episodes(replace(log, runs=(stays,)), 80)
     assert parts.trajectory.obs.shape == (3, 80, 40)
     np.testing.assert_array_equal(parts.trajectory.alive.sum(axis=1), [80, 80, STEPS - 3 - 160])
-    for one, other in ((parts.trajectory.obs, whole.trajectory.obs), (parts.command, whole.command)):
+    for one, other in ((parts.trajectory.obs, whole.trajectory.obs), (parts.asked.command, whole.asked.command)):
         np.testing.assert_allclose(one.reshape(240, -1)[: STEPS - 3], other[0, : STEPS - 3], atol=1e-6)
+
+
+def test_of_every_run_the_first_episode_may_be_enough(simulated):
+    trajectory, log = simulated
+    whole = recorded.episodes(log, STEPS)
+    first = recorded.episodes(log, 80, most=1)
+    np.testing.assert_array_equal(first.trajectory.obs, whole.trajectory.obs[:, :80])
+    # Of the runs that fall, those that fall within it.
+    short = np.asarray(whole.trajectory.alive.sum(axis=1)) <= 80
+    np.testing.assert_array_equal(first.trajectory.fell, whole.trajectory.fell & short)
+
+
+def test_beginnings_are_those_of_longer_episodes(simulated):
+    _, log = simulated
+    whole = recorded.episodes(log, STEPS)
+    steps = int(whole.trajectory.alive[3].sum())
+    for length in (steps - 1, steps, steps + 1):
+        cut = recorded.beginning(whole, 4, length)
+        same_length = recorded.episodes(log, length, most=1)
+        jax.tree.map(np.testing.assert_array_equal, cut, same_length)
+        assert cut.trajectory.fell[3] == (length >= steps)
+    assert recorded.beginning(whole, 2, 50).power.shape == (2, 50)
+    with pytest.raises(ValueError, match=r"runs: got 4 episode\(s\), expected 5 or more"):
+        recorded.beginning(whole, 5, 50)
+
+
+def test_who_repeats_an_episode_is_asked_for_the_same_until_its_end_and_on(simulated):
+    _, log = simulated
+    found = recorded.episodes(log, STEPS)
+    for episode in (0, 2):
+        obs, alive = found.trajectory.obs[episode], int(found.trajectory.alive[episode].sum())
+        command = found.asked.command[episode] * jnp.array([2.0, 2.0, 0.25])
+        np.testing.assert_allclose(command[:alive], obs[:alive, 3:6], atol=1e-6)
+        np.testing.assert_array_equal(command[alive:], jnp.broadcast_to(command[alive - 1], (STEPS - alive, 3)))
+        np.testing.assert_allclose(sensing.clock(found.asked.phase[episode]), obs[0, 36:], atol=1e-6)
 
 
 def test_torque_that_was_not_measured_is_what_was_asked_for(simulated):

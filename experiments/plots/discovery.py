@@ -1,0 +1,132 @@
+"""Pictures of logs, and of what is missing in a model."""
+
+import textwrap
+from collections.abc import Sequence
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+from envs.logs import Run
+from experiments.plots.base import save
+
+
+def suspicions(path: Path, run: Run, joints: Sequence[str], titles: Sequence[str]) -> None:
+    """A run as it was recorded: the clock, and every joint's position and target with what is suspected above."""
+    figure, axes = plt.subplots(1 + len(joints), 1, figsize=(10, 1.6 * (2 + len(joints))), layout="constrained")
+    steps = 1e3 * np.diff(run.time)
+    axes[0].plot(run.time[1:], steps, lw=0.8)
+    # Rounding is no news.
+    axes[0].set(ylabel="row to row, ms", yscale="log", ylim=(0.3 * steps.min(), 3.0 * steps.max()))
+    for index, (axis, joint) in enumerate(zip(axes[1:], joints, strict=True)):
+        if "target" in run.signals:
+            axis.plot(run.time, run.signals["target"][:, index], lw=0.8, color="tab:orange", label="target")
+        axis.plot(run.time, run.signals["q"][:, index], lw=0.8, color="tab:blue", label="q")
+        axis.set(ylabel=f"{joint}, rad", xlim=(run.time[0], run.time[-1]))
+    axes[1].legend(loc="upper right")
+    axes[-1].set(xlabel="s")
+    figure.suptitle("\n".join(textwrap.fill(title, 120) for title in titles) or "nothing is suspected", fontsize=9)
+    save(figure, path)
+
+
+def heat_map(cells: Sequence[dict]) -> plt.Figure:
+    """Excess over the floor by joint and regime, one panel a signal."""
+    signals = list(dict.fromkeys(cell["signal"] for cell in cells))
+    regimes = sorted({cell["regime"] for cell in cells})
+    joints = sorted({cell["joint"] for cell in cells})
+    figure, axes = plt.subplots(
+        1,
+        len(signals),
+        figsize=(1.5 + 4.2 * len(signals), 2.4 + 0.45 * len(joints)),
+        layout="constrained",
+        squeeze=False,
+        sharey=True,
+    )
+    top = max(cell["excess_floor_units"] for cell in cells)
+    for axis, signal in zip(axes[0], signals, strict=True):
+        grid = np.full((len(joints), len(regimes)), np.nan)
+        for cell in cells:
+            if cell["signal"] == signal:
+                grid[joints.index(cell["joint"]), regimes.index(cell["regime"])] = cell["excess_floor_units"]
+        image = axis.imshow(grid, cmap="magma_r", vmin=0.0, vmax=max(top, 1.0), aspect="auto")
+        for (row, column), value in np.ndenumerate(grid):
+            if np.isfinite(value):
+                colour = "white" if value > 0.6 * max(top, 1.0) else "black"
+                axis.text(column, row, f"{value:.1f}", ha="center", va="center", color=colour, fontsize=8)
+        axis.set(title=signal, xticks=range(len(regimes)), yticks=range(len(joints)))
+        axis.set_xticklabels(regimes, rotation=30, ha="right")
+        axis.set_yticklabels(joints)
+    figure.colorbar(image, ax=axes, label="floor units above the floor", shrink=0.8)
+    return figure
+
+
+def traces(runs: Sequence[dict], joints: Sequence[str], most: int = 6) -> plt.Figure:
+    """Measured and simulated positions of whole runs, sealed ones first and framed in red; the worst joint of each."""
+    shown = sorted(runs, key=lambda run: run["split"] != "sealed")[:most]
+    columns = 2 if len(shown) > 1 else 1
+    rows = -(-len(shown) // columns)
+    figure, axes = plt.subplots(rows, columns, figsize=(12, 2.6 * rows), layout="constrained", squeeze=False)
+    for axis in axes.flat[len(shown) :]:
+        axis.axis("off")
+    for axis, run in zip(axes.flat, shown, strict=False):
+        joint = int(np.abs(run["null"] - run["measured"]).mean(axis=0).argmax())
+        axis.plot(run["time"], run["measured"][:, joint], color="black", lw=1.5, label="measured")
+        axis.plot(run["time"], run["null"][:, joint], color="tab:orange", lw=1.0, label="parameters fitted again")
+        axis.plot(run["time"], run["after"][:, joint], color="tab:blue", lw=1.0, label="corrected model")
+        error = run["error_rad"]
+        axis.set_title(
+            f"{run['run']} ({run['split']}): {joints[joint]}, {error['null']:.3f} -> {error['after']:.3f} rad",
+            fontsize=9,
+        )
+        axis.set(xlabel="s", ylabel="rad")
+        axis.grid(alpha=0.3)
+        if run["split"] == "sealed":
+            for spine in axis.spines.values():
+                spine.set(color="tab:red", linewidth=1.8)
+    axes[0, 0].legend(fontsize=8)
+    return figure
+
+
+def ladder(rungs: Sequence) -> plt.Figure:
+    """Gain of every accepted effect beside what healthy logs gain by chance."""
+    figure, axis = plt.subplots(figsize=(8, 1.5 + 0.5 * len(rungs)), layout="constrained")
+    place = np.arange(len(rungs))
+    axis.barh(place, [rung.evidence.gain for rung in rungs], color="tab:blue", height=0.5, label="gain")
+    axis.plot([rung.thresholds.gain for rung in rungs], place, "|", color="black", ms=22, mew=2, label="threshold")
+    axis.set(yticks=place, xscale="log", xlabel="fall of the loss on train")
+    axis.set_yticklabels([rung.hypothesis.key for rung in rungs])
+    axis.invert_yaxis()
+    axis.legend(fontsize=8, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2)
+    return figure
+
+
+def confusion(path: Path, rows: Sequence[dict]) -> None:
+    """What was hidden against what was named, a panel for every severity."""
+    severities = sorted({row["asked"] for row in rows})
+    said = lambda row: row["named"] or row["verdict"].replace("_", " ")  # noqa: E731
+    hidden = sorted({row["effect"] or "nothing" for row in rows})
+    named = sorted({said(row) for row in rows})
+    figure, axes = plt.subplots(
+        1,
+        len(severities),
+        figsize=(2 + (1.2 + 0.28 * len(named)) * len(severities), 2 + 0.26 * len(hidden)),
+        layout="constrained",
+        squeeze=False,
+        sharey=True,
+    )
+    for axis, severity in zip(axes[0], severities, strict=True):
+        grid = np.zeros((len(hidden), len(named)))
+        for row in rows:
+            if row["asked"] == severity:
+                grid[hidden.index(row["effect"] or "nothing"), named.index(said(row))] += 1
+        axis.imshow(grid, cmap="Blues", aspect="auto")
+        for (line, column), count in np.ndenumerate(grid):
+            if count:
+                colour = "white" if count > 0.6 * grid.max() else "black"
+                axis.text(column, line, int(count), ha="center", va="center", fontsize=7, color=colour)
+        title = f"{severity:g} floor units" if severity else "nothing hidden"
+        axis.set(title=title, xticks=range(len(named)), yticks=range(len(hidden)), xlabel="named")
+        axis.set_xticklabels(named, rotation=90, fontsize=7)
+        axis.set_yticklabels(hidden, fontsize=7)
+    axes[0, 0].set_ylabel("hidden")
+    save(figure, path)

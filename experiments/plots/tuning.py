@@ -1,0 +1,193 @@
+"""Pictures of training and tuning."""
+
+import textwrap
+from collections.abc import Sequence
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+from experiments.plots.base import COLOURS, save, spread
+
+_MARKS = {"accept": "o", "widen": "^", "unexplained": "X", "radius_exhausted": "s", "not_finite": "x"}
+
+
+def training(path: Path, curve: Sequence[dict]) -> None:
+    """Reward, Table I return and falls over the steps of a training run."""
+    steps = np.array([line["steps"] for line in curve]) / 1e6
+    panels = {
+        "per second": {"trained reward": "reward", "Table I": "score"},
+        "share": {
+            "linear tracking": "linear_tracking",
+            "angular tracking": "angular_tracking",
+            "feet against the clock (of 2)": "clock_contact",
+        },
+        "episode ends per 20 s": {"ends": "done"},
+    }
+    scales = {"per second": 100.0, "share": 1.0, "episode ends per 20 s": 2000.0}
+    figure, axes = plt.subplots(1, 3, figsize=(12, 3.2), layout="constrained")
+    for axis, (label, series) in zip(axes, panels.items(), strict=True):
+        for name, key in series.items():
+            axis.plot(steps, scales[label] * np.array([line[key] for line in curve]), label=name)
+        axis.set(xlabel="million steps", ylabel=label)
+        axis.grid(alpha=0.3)
+        axis.legend()
+    axes[2].set_yscale("log")
+    save(figure, path)
+
+
+def sim2sim(out: Path, results: dict[str, list[dict]], off: Sequence[str], epochs: int) -> None:
+    """After the paper's Figs. 3 and 4: return, parameter error, and the gate over the tunings."""
+    _returns(out / "return.png", results, epochs)
+    _errors(out / "param_error.png", results, off or list(next(iter(results.values()))[0]["lines"][0]["param_error"]))
+    _each_error(out / "param_error_each.png", results)
+    if any(line.get("verdicts") for runs in results.values() for run in runs for line in run["lines"]):
+        _gate(out / "gate.png", results)
+
+
+def sweep(path: Path, grid: np.ndarray, rows: Sequence[str], columns: Sequence[str], titles: Sequence[str]) -> None:
+    """One heat map for each panel of `grid` [panels, rows, columns]; `titles` holds row, column and panel names."""
+    row_label, column_label, *panels = titles
+    figure, axes = plt.subplots(
+        1, len(panels), figsize=(1.5 + 3.2 * len(panels), 3.4), layout="constrained", squeeze=False, sharey=True
+    )
+    finite = grid[np.isfinite(grid)]
+    low, high = (finite.min(), finite.max()) if finite.size else (0.0, 1.0)
+    for axis, values, title in zip(axes[0], grid, panels, strict=True):
+        image = axis.imshow(values, cmap="viridis_r", vmin=low, vmax=high, aspect="auto")
+        axis.set(xlabel=column_label, title=title)
+        axis.set_xticks(range(len(columns)), columns)
+        axis.set_yticks(range(len(rows)), rows)
+        for (row, column), value in np.ndenumerate(values):
+            dark = np.isfinite(value) and value > (low + high) / 2
+            axis.text(column, row, f"{value:.2f}", ha="center", va="center", color="white" if dark else "black")
+    axes[0, 0].set_ylabel(row_label)
+    figure.colorbar(image, ax=axes, label="mean parameter error at the end")
+    save(figure, path)
+
+
+def rounds(history: Sequence[dict]) -> plt.Figure:
+    """Predicted and measured return, falls and power, and every parameter with its interval, over the rounds."""
+    when = np.arange(len(history) + 1)
+    names = list(history[0]["tuning"]["moved"])
+    labels = {"return": "return", "fall_rate": "share of walks that fall", "power_w": "power, W"}
+    columns = max(len(labels), len(names))
+    figure, axes = plt.subplots(2, columns, figsize=(2.4 * columns, 5), layout="constrained", squeeze=False)
+    for axis in axes[0, len(labels) :]:
+        axis.axis("off")
+    for axis in axes[1, len(names) :]:
+        axis.axis("off")
+    for axis, (name, label) in zip(axes[0], labels.items(), strict=False):
+        predicted = [line["predicted"][name] for line in history] + [history[-1]["next"][name]]
+        axis.plot(when, predicted, "o--", color="tab:gray", ms=4, label="predicted")
+        axis.plot(
+            when[:-1], [line["measured"][name] for line in history], "o-", color="tab:blue", ms=4, label="measured"
+        )
+        axis.set(title=label, xticks=when)
+    axes[0, 0].legend(fontsize=8)
+    axes[0, 1].set_ylim(-0.05, 1.05)
+    for axis, name in zip(axes[1], names, strict=False):
+        moved = [line["tuning"]["moved"][name] for line in history]
+        axis.plot(when, [moved[0]["before"], *(ends["after"] for ends in moved)], "o-", color="tab:blue", ms=4)
+        known = [(place, ends) for place, ends in zip(when[1:], moved, strict=True) if ends["low"] is not None]
+        axis.vlines(
+            [p for p, _ in known], [e["low"] for _, e in known], [e["high"] for _, e in known], color="tab:blue"
+        )
+        axis.set(title=name, xlabel="round", xticks=when)
+    for axis in axes.flat:
+        axis.grid(alpha=0.3)
+    return figure
+
+
+def transfer(path: Path, results: dict[str, list[dict]]) -> None:
+    """After the paper's Fig. 6: return, falls and power of the robot's walks over the rounds, by method."""
+    labels = {"return": "return of a walk", "fall_rate": "share of walks that fall", "power_w": "mechanical power, W"}
+    figure, axes = plt.subplots(1, len(labels), figsize=(12, 3.6), layout="constrained")
+    for axis, (key, label) in zip(axes, labels.items(), strict=True):
+        for name, runs in results.items():
+            values = np.array([[line["measured"][key] for line in one["rounds"]] for one in runs])
+            spread(axis, np.arange(values.shape[1]), values, name)
+            ends = np.mean([one["end"][key] for one in runs])
+            axis.plot(values.shape[1], ends, "*", ms=10, color=COLOURS[name])
+        axis.set(xlabel="round (stars: evaluation at the end)", ylabel=label)
+    axes[0].legend()
+    save(figure, path)
+
+
+def _returns(path: Path, results: dict[str, list[dict]], epochs: int) -> None:
+    figure, axis = plt.subplots(figsize=(6, 4), layout="constrained")
+    for name, runs in results.items():
+        values = np.array([[line["return"] for line in run["lines"]] for run in runs])
+        spread(axis, np.arange(values.shape[1]) * epochs, values, name)
+    axis.set(xlabel="PPO epochs (dots: tunings)", ylabel="return in the target, Table I weights (at most 70)")
+    axis.legend()
+    save(figure, path)
+
+
+def _errors(path: Path, results: dict[str, list[dict]], off: Sequence[str]) -> None:
+    figure, axis = plt.subplots(figsize=(6, 4), layout="constrained")
+    for name, runs in results.items():
+        values = np.array([[np.mean([line["param_error"][p] for p in off]) for line in run["lines"]] for run in runs])
+        spread(axis, np.arange(values.shape[1]), values, name)
+    axis.set(xlabel="tunings", ylabel="mean of |estimate / truth - 1|", ylim=(0, None))
+    axis.set_title(textwrap.fill(f"over {', '.join(off)}", 100), fontsize=7)
+    axis.legend()
+    save(figure, path)
+
+
+def _each_error(path: Path, results: dict[str, list[dict]]) -> None:
+    names = list(next(iter(results.values()))[0]["lines"][0]["param_error"])
+    figure, axes = plt.subplots(
+        1, len(names), figsize=(2.2 * len(names) + 1, 3), layout="constrained", sharey=True, squeeze=False
+    )
+    for axis, parameter in zip(axes[0], names, strict=True):
+        for name, runs in results.items():
+            values = np.array([[line["param_error"][parameter] for line in run["lines"]] for run in runs])
+            spread(axis, np.arange(values.shape[1]), values, name)
+        axis.set_title(parameter, fontsize=9)
+        axis.set_xlabel("tunings")
+    axes[0, 0].set(ylabel="|estimate / truth - 1|", ylim=(0, None))
+    axes[0, -1].legend(fontsize=8)
+    save(figure, path)
+
+
+def _gate(path: Path, results: dict[str, list[dict]]) -> None:
+    figure, (above, below) = plt.subplots(2, 1, figsize=(8, 5.5), layout="constrained", sharex=True)
+    used = set()
+    for name, runs in results.items():
+        if any(line.get("verdicts") for run in runs for line in run["lines"]):
+            above.plot([], [], color=COLOURS[name], label=name)
+        for run in runs:
+            calls = [
+                (line["tuning"] + place / (len(line["verdicts"]) + 1), line, place)
+                for line in run["lines"]
+                for place in range(len(line.get("verdicts", ())))
+            ]
+            when = [call[0] for call in calls]
+            above.plot(when, [line["radius"][i] for _, line, i in calls], color=COLOURS[name], alpha=0.6)
+            gated = [(t, line, i) for t, line, i in calls if line["p_value"][i] is not None]
+            below.plot(
+                [t for t, *_ in gated], [line["novelty"][i] for _, line, i in gated], color=COLOURS[name], alpha=0.6
+            )
+            below.plot(
+                [t for t, *_ in gated],
+                [line["threshold"][i] for _, line, i in gated],
+                color="tab:red",
+                lw=0.8,
+                alpha=0.6,
+            )
+            for moment, line, place in calls:
+                verdict = line["verdicts"][place]
+                label = None if verdict in used else verdict
+                used.add(verdict)
+                above.plot(moment, line["radius"][place], _MARKS[verdict], color=COLOURS[name], label=label)
+                if line["p_value"][place] is not None:
+                    below.plot(moment, line["novelty"][place], _MARKS[verdict], color=COLOURS[name])
+    below.plot([], [], color="tab:red", lw=0.8, label="threshold")
+    above.set(ylabel="largest radius, log space", ylim=(0, None))
+    above.legend(fontsize=8)
+    below.set(xlabel="tunings (fractions: gate calls within one)", ylabel="novelty, mean rank", ylim=(0, 1.05))
+    below.legend(fontsize=8)
+    for axis in (above, below):
+        axis.grid(alpha=0.3)
+    save(figure, path)

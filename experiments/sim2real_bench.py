@@ -1,0 +1,187 @@
+"""The paper's last experiment (Fig. 6) on a stand-in robot: `python -m experiments.sim2real_bench --out DIR`.
+
+The learner starts with all masses at half of the robot's, and a policy that was trained there. The robot is a process
+of its own (`experiments.robot_stub`) that lacks nothing a robot has: delay, lag, noise, drift, another friction. Nobody
+learns from the walks in which policies are evaluated at the end; those of the rounds are what tuning is paid with.
+"""
+
+import json
+import subprocess
+import sys
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import jax
+import numpy as np
+from rich.table import Table
+
+from envs import logs
+from envs.biteno import constants
+from envs.targets import recorded
+from experiments import checkpoint, export, plots, sim2real
+from experiments.checkpoint import write_json
+from experiments.config import preset
+from experiments.loop import walked
+from experiments.robot_stub import Body
+from experiments.rounds import Simulator, Terms, request, wait
+from experiments.train import console, policy_config, run, starting_policy
+from jaxtune.tuner import knobs
+
+METHODS = ("ours", "spm", "dr", "oracle")
+_DR_RADIUS = 0.4
+_ANSWER_S = 1800.0
+_EVALUATION_SEED = 999_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class Args:
+    """Compares what methods make of a robot that answers through log files."""
+
+    out: Path = Path("runs/sim2real_bench")
+    """Folder; the same command with the same folder goes on where it was."""
+    methods: tuple[str, ...] = METHODS
+    """Which of ours, spm, dr, oracle."""
+    seeds: int = 3
+    """Number of seeds, from 0."""
+    rounds: int = 5
+    """Rounds of every method."""
+    mass: float = 0.5
+    """Where the learner's masses start, as a multiple of the robot's."""
+    walk_s: float = 10.0
+    """Length of a walk."""
+    evaluation: int = 20
+    """Walks in which a policy is evaluated before the first round and after the last."""
+    preset: str = "cpu"
+    """Sizes: smoke, cpu or gpu."""
+    noise: float = 0.2
+    """Noise of simulated sensors, in units of `sensing.NOISE`."""
+
+
+def check(args: Args) -> None:
+    """Reads the arguments.
+
+    Raises:
+      ValueError: names the field, the value and what is allowed.
+    """
+    for name in args.methods:
+        if name not in METHODS:
+            raise ValueError(f"methods: got '{name}', expected some of {', '.join(METHODS)}")
+    for option in ("seeds", "rounds", "evaluation"):
+        if getattr(args, option) < 1:
+            raise ValueError(f"{option}: got {getattr(args, option)}, expected 1 or more")
+
+
+def asked(args: Args, method: str, seed: int) -> sim2real.Args:
+    """The command that plays a method's rounds."""
+    body = Body()
+    names = [name for name in constants.PARAMETER_SETS["whole_body"] if name.endswith("_mass")]
+    mass = 1.0 if method == "oracle" else args.mass
+    start = [f"{name}={mass * (body.trunk_mass if name == 'trunk_mass' else body.leg_mass)}" for name in names]
+    known = {
+        "ours": {"method": "ours"},
+        "spm": {"method": "spm"},
+        "dr": {"method": "dr", "radius": _DR_RADIUS},
+        "oracle": {"method": "dr", "radius": preset(args.preset).policy_radius},
+    }
+    if method == "oracle":
+        start.append(f"foot_friction={body.foot_friction}")
+    return sim2real.Args(
+        out=args.out / f"{method}_{seed}",
+        rounds=args.rounds,
+        policy=str(args.out / f"start_{seed}"),
+        start=tuple(start),
+        noise=args.noise,
+        preset=args.preset,
+        # A stand-in may fall: what that costs is what is measured.
+        terms=Terms(walk_s=args.walk_s, force=True, timeout_s=_ANSWER_S, seed=seed),
+        **known[method],
+    )
+
+
+def prepare(args: Args, learner: Simulator, seed: int) -> None:
+    """Trains the policy that every method of a seed starts with: the one that ships, where the learner starts."""
+    place = args.out / f"start_{seed}"
+    if (place / "config.json").exists():
+        return
+    loop = learner.loop
+    start = sim2real.check(asked(args, "ours", seed))[2]
+    dist = loop.dist(start, loop.preset.policy_radius)
+    state = learner.machines["ours"].init(starting_policy("walk", loop), dist, knobs())
+    state, _ = learner.train(jax.random.PRNGKey(_EVALUATION_SEED + seed), state)
+    checkpoint.save(place, state.policy.learner, policy_config(loop))
+
+
+@contextmanager
+def robot(folder: Path):
+    """The stand-in, as a process of its own."""
+    command = [sys.executable, "-m", "experiments.robot_stub", "--folder", str(folder), "--idle-s", str(_ANSWER_S)]
+    with (folder / "robot.log").open("a") as said:
+        process = subprocess.Popen(command, stdout=said, stderr=said, cwd=Path(__file__).parent.parent)
+        try:
+            yield process
+        finally:
+            process.terminate()
+            process.wait()
+
+
+def evaluate(args: Args, learner: Simulator, policy: Path, name: str) -> dict:
+    """Return, falls and power of a policy over walks that nobody learns from."""
+    place = args.out / "evaluation" / f"round_{name}"
+    found = place / "evaluation.json"
+    if not found.exists():
+        export.export(place / "policy", starting_policy(str(policy), learner.loop).learner, learner.loop.preset)
+        request(place, args.evaluation, args.walk_s, _EVALUATION_SEED)
+        wait(place, _ANSWER_S)
+        steps = round(args.walk_s / constants.POLICY_DT_S)
+        walks = recorded.beginning(recorded.episodes(logs.read(place / "log"), steps, most=1), args.evaluation, steps)
+        write_json(found, walked(walks.trajectory, walks.power))
+    return json.loads(found.read_text())
+
+
+def main(args: Args) -> None:
+    """Plays what has not been played, evaluates, prints and draws."""
+    check(args)
+    checkpoint.set_up_compiler(preset(args.preset).xla_flags)
+    identity = asdict(args)
+    for option in ("out", "methods", "seeds"):
+        del identity[option]
+    checkpoint.open_run(args.out, identity)
+    learner = sim2real.simulator(asked(args, "ours", 0))
+    results: dict[str, list[dict]] = {name: [] for name in args.methods}
+    with robot(args.out):
+        for seed in range(args.seeds):
+            prepare(args, learner, seed)
+            before = evaluate(args, learner, args.out / f"start_{seed}", f"start_{seed}")
+            for name in args.methods:
+                command = asked(args, name, seed)
+                rounds = sim2real.play(command, learner)
+                last = command.out / f"round_{args.rounds:03d}" / "learner"
+                after = evaluate(args, learner, last, f"{name}_{seed}")
+                results[name].append({"rounds": rounds, "start": before, "end": after})
+                write_json(args.out / "summary.json", {"methods": results, "versions": checkpoint.versions()})
+    plots.transfer(args.out / "fig6.png", results)
+    show(args, results)
+
+
+def show(args: Args, results: dict[str, list[dict]]) -> None:
+    """Prints a row for every method: means over seeds."""
+    table = Table(title=f"masses at {args.mass:g}X, mean over {args.seeds} seed(s), {args.evaluation} walks each")
+    for column in ("method", "return", "share that falls", "power, W", "masses at the end", "robot's walks", "falls"):
+        table.add_column(column, justify="left" if column == "method" else "right")
+    for name, runs in results.items():
+        change = [
+            f"{np.mean([one['start'][key] for one in runs]):.2f} -> {np.mean([one['end'][key] for one in runs]):.2f}"
+            for key in ("return", "fall_rate", "power_w")
+        ]
+        moved = [one["rounds"][-1]["tuning"]["moved"] for one in runs]
+        masses = np.mean([[ends["after"] for key, ends in one.items() if key.endswith("_mass")] for one in moved])
+        measured = [line["measured"] for one in runs for line in one["rounds"]]
+        walks = sum(one["episodes"] for one in measured) / len(runs)
+        falls = sum(one["episodes"] * one["fall_rate"] for one in measured) / len(runs)
+        table.add_row(name, *change, f"{masses:.2f}", f"{walks:.0f}", f"{falls:.1f}")
+    console.print(table)
+
+
+if __name__ == "__main__":
+    run(main, Args)
