@@ -21,7 +21,8 @@ from experiments.question import HORIZONS_S, Question, ask
 from experiments.train import bars, console, run
 from jaxtune.discovery.fit import Fit
 from jaxtune.discovery.problem import Hypothesis
-from jaxtune.discovery.workflow import Discovery, Result
+from jaxtune.discovery.result import Result
+from jaxtune.discovery.workflow import Discovery
 
 _SHOWN = 12  # cells in the summary
 

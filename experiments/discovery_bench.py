@@ -33,7 +33,8 @@ from experiments.question import HORIZONS_S, Question, ask
 from experiments.train import console, run
 from jaxtune.discovery.measure import refitted, slopes
 from jaxtune.discovery.problem import Residuals
-from jaxtune.discovery.workflow import Calibration, Discovery
+from jaxtune.discovery.result import Calibration
+from jaxtune.discovery.workflow import Discovery
 
 ARM = Path(__file__).parent / "arm.xml"
 

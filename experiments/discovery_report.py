@@ -9,7 +9,7 @@ from rich.table import Table
 from envs.logs import Log
 from experiments import plots
 from experiments.question import Question
-from jaxtune.discovery.workflow import Result
+from jaxtune.discovery.result import Result
 
 _PAGE = Path(__file__).parent / "discovery_report.html"
 

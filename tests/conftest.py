@@ -1,13 +1,26 @@
 """What all tests share: single precision, silence of others' deprecations, and whatever takes long to compile."""
 
+import datetime
 import os
 import warnings
 
 import jax
 import pytest
+from hypothesis import HealthCheck, settings
 
 # The precision that everything runs in, whatever the environment says.
 jax.config.update("jax_enable_x64", False)
+
+# `--hypothesis-profile thorough` looks longer.
+for name, examples in {"quick": 300, "thorough": 2000}.items():
+    settings.register_profile(
+        name,
+        max_examples=examples,
+        deadline=datetime.timedelta(seconds=10),
+        suppress_health_check=list(HealthCheck),
+        derandomize=True,
+    )
+settings.load_profile("quick")
 
 
 def pytest_configure(config):

@@ -14,7 +14,8 @@ import pytest
 
 from jaxtune.discovery import workflow
 from jaxtune.discovery.problem import Hypothesis, Problem, Residuals, Segments
-from jaxtune.discovery.workflow import Discovery, Settings
+from jaxtune.discovery.result import Settings
+from jaxtune.discovery.workflow import Discovery
 
 AXES = ("mass", "damping", "coulomb", "push", "nothing", "cubic", "wild")
 HORIZONS = (0.1, 0.2, 0.4)
