@@ -39,11 +39,11 @@ class Args:
     """Compares what methods make of a robot that answers through log files."""
 
     out: Path = Path("runs/sim2real_bench")
-    """Folder; the same command with the same folder goes on where it was."""
+    """Folder; the same command with the same folder goes on where it was, and others of its seeds may run beside it."""
     methods: tuple[str, ...] = METHODS
     """Which of ours, spm, dr, oracle."""
-    seeds: int = 3
-    """Number of seeds, from 0."""
+    seeds: tuple[int, ...] = (0, 1, 2)
+    """Seeds of everything random."""
     rounds: int = 5
     """Rounds of every method."""
     mass: float = 0.5
@@ -67,7 +67,9 @@ def check(args: Args) -> None:
     for name in args.methods:
         if name not in METHODS:
             raise ValueError(f"methods: got '{name}', expected some of {', '.join(METHODS)}")
-    for option in ("seeds", "rounds", "evaluation"):
+    if not args.methods or not args.seeds:
+        raise ValueError("methods, seeds: got none, expected one or more of each")
+    for option in ("rounds", "evaluation"):
         if getattr(args, option) < 1:
             raise ValueError(f"{option}: got {getattr(args, option)}, expected 1 or more")
 
@@ -89,7 +91,7 @@ def asked(args: Args, method: str, seed: int) -> sim2real.Args:
     return sim2real.Args(
         out=args.out / f"{method}_{seed}",
         rounds=args.rounds,
-        policy=str(args.out / f"start_{seed}"),
+        policy=str(args.out / f"start_{seed}" / "learner"),
         start=tuple(start),
         noise=args.noise,
         preset=args.preset,
@@ -101,7 +103,7 @@ def asked(args: Args, method: str, seed: int) -> sim2real.Args:
 
 def prepare(args: Args, learner: Simulator, seed: int) -> None:
     """Trains the policy that every method of a seed starts with: the one that ships, where the learner starts."""
-    place = args.out / f"start_{seed}"
+    place = args.out / f"start_{seed}" / "learner"
     if (place / "config.json").exists():
         return
     loop = learner.loop
@@ -114,9 +116,18 @@ def prepare(args: Args, learner: Simulator, seed: int) -> None:
 
 @contextmanager
 def robot(folder: Path):
-    """The stand-in, as a process of its own."""
-    command = [sys.executable, "-m", "experiments.robot_stub", "--folder", str(folder), "--idle-s", str(_ANSWER_S)]
-    with (folder / "robot.log").open("a") as said:
+    """The stand-in, as a process of its own, while it is needed."""
+    folder.mkdir(parents=True, exist_ok=True)
+    command = [
+        sys.executable,
+        "-m",
+        "experiments.robot_stub",
+        "--folder",
+        str(folder.resolve()),
+        "--idle-s",
+        str(_ANSWER_S),
+    ]
+    with (folder.parent / f"robot_{folder.name}.log").open("a") as said:
         process = subprocess.Popen(command, stdout=said, stderr=said, cwd=Path(__file__).parent.parent)
         try:
             yield process
@@ -125,14 +136,15 @@ def robot(folder: Path):
             process.wait()
 
 
-def evaluate(args: Args, learner: Simulator, policy: Path, name: str) -> dict:
+def evaluate(args: Args, learner: Simulator, policy: Path) -> dict:
     """Return, falls and power of a policy over walks that nobody learns from."""
-    place = args.out / "evaluation" / f"round_{name}"
+    place = policy.parent / "round_evaluation"
     found = place / "evaluation.json"
     if not found.exists():
         export.export(place / "policy", starting_policy(str(policy), learner.loop).learner, learner.loop.preset)
         request(place, args.evaluation, args.walk_s, _EVALUATION_SEED)
-        wait(place, _ANSWER_S)
+        with robot(policy.parent):
+            wait(place, _ANSWER_S)
         steps = round(args.walk_s / constants.POLICY_DT_S)
         walks = recorded.beginning(recorded.episodes(logs.read(place / "log"), steps, most=1), args.evaluation, steps)
         write_json(found, walked(walks.trajectory, walks.power))
@@ -149,24 +161,23 @@ def main(args: Args) -> None:
     checkpoint.open_run(args.out, identity)
     learner = sim2real.simulator(asked(args, "ours", 0))
     results: dict[str, list[dict]] = {name: [] for name in args.methods}
-    with robot(args.out):
-        for seed in range(args.seeds):
-            prepare(args, learner, seed)
-            before = evaluate(args, learner, args.out / f"start_{seed}", f"start_{seed}")
-            for name in args.methods:
-                command = asked(args, name, seed)
+    for seed in args.seeds:
+        prepare(args, learner, seed)
+        before = evaluate(args, learner, args.out / f"start_{seed}" / "learner")
+        for name in args.methods:
+            command = asked(args, name, seed)
+            with robot(command.out):
                 rounds = sim2real.play(command, learner)
-                last = command.out / f"round_{args.rounds:03d}" / "learner"
-                after = evaluate(args, learner, last, f"{name}_{seed}")
-                results[name].append({"rounds": rounds, "start": before, "end": after})
-                write_json(args.out / "summary.json", {"methods": results, "versions": checkpoint.versions()})
+            after = evaluate(args, learner, command.out / f"round_{args.rounds:03d}" / "learner")
+            results[name].append({"seed": seed, "rounds": rounds, "start": before, "end": after})
+    write_json(args.out / "summary.json", {"methods": results, "versions": checkpoint.versions()})
     plots.transfer(args.out / "fig6.png", results)
     show(args, results)
 
 
 def show(args: Args, results: dict[str, list[dict]]) -> None:
     """Prints a row for every method: means over seeds."""
-    table = Table(title=f"masses at {args.mass:g}X, mean over {args.seeds} seed(s), {args.evaluation} walks each")
+    table = Table(title=f"masses at {args.mass:g}X, mean over {len(args.seeds)} seed(s), {args.evaluation} walks each")
     for column in ("method", "return", "share that falls", "power, W", "masses at the end", "robot's walks", "falls"):
         table.add_column(column, justify="left" if column == "method" else "right")
     for name, runs in results.items():
