@@ -15,6 +15,8 @@ import orbax.checkpoint as ocp
 
 _PACKAGES = ("jaxtune", "jax", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "orbax-checkpoint", "numpy")
 
+_DRAFT = ".tmp"  # of a file that is being written, or was when a run was killed
+
 
 def set_up_compiler(xla_flags: str) -> None:
     """Adds a preset's flags to XLA_FLAGS, and keeps what is compiled, so that a second run starts quicker.
@@ -76,7 +78,7 @@ def as_json(value: Any) -> Any:
 
 def write_json(path: Path, value: Any) -> None:
     """Writes JSON whole or not at all."""
-    draft = path.with_suffix(f".{os.getpid()}.tmp")
+    draft = path.with_suffix(f".{os.getpid()}{_DRAFT}")
     draft.write_text(json.dumps(as_json(value), indent=1) + "\n")
     draft.replace(path)
 
@@ -91,7 +93,7 @@ def open_run(out: Path, config: Any) -> None:
     path = out / "config.json"
     if path.exists():
         _same(f"out: {out} holds a run of another config", json.loads(path.read_text())["config"], wanted)
-    elif out.exists() and any(out.iterdir()):
+    elif out.exists() and any(item.suffix != _DRAFT for item in out.iterdir()):
         raise ValueError(f"out: {out} is not empty and holds no config.json; expected a new folder or an earlier run's")
     out.mkdir(parents=True, exist_ok=True)
     if not path.exists():

@@ -61,17 +61,26 @@ def meta(sizes: Preset) -> dict:
     }
 
 
+def needed():
+    """The package `onnx`, an extra: who only tunes in simulation needs none.
+
+    Raises:
+      ValueError: it is not there.
+    """
+    try:
+        import onnx
+    except ModuleNotFoundError as error:
+        raise ValueError("onnx: is not installed; expected `pip install 'jaxtune[onnx]'`") from error
+    return onnx
+
+
 def export(out: Path, learner: PPOState, sizes: Preset) -> None:
     """Writes the three files.
 
     Raises:
       ValueError: the package `onnx` is not there.
     """
-    # An extra: who only tunes needs none.
-    try:
-        import onnx
-    except ModuleNotFoundError as error:
-        raise ValueError("onnx: is not installed; expected `pip install 'jaxtune[onnx]'`") from error
+    onnx = needed()
     (mean, std), layers = jax.device_get(PPO.layers(learner))
     text = json.dumps(meta(sizes) | {"layers": len(layers)})
     out.mkdir(parents=True, exist_ok=True)

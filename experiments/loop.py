@@ -106,9 +106,13 @@ class Loop:
 
     def simulate(self, key: jax.Array, policy: Policy, params: Mapping[str, jax.Array]) -> Trajectory:
         """One episode for each draw, [episodes] by name in search coordinates."""
-        count = len(next(iter(params.values())))
+        count, steps = len(next(iter(params.values()))), self.preset.episode_steps
         asked = jax.tree.map(lambda leaf: leaf[jnp.arange(count) % len(leaf)], policy.asked)
-        return simulate(self.robot, key, self.act(policy), params, self.preset.episode_steps, asked)
+        whole = simulate(
+            self.robot, key, self.act(policy), params, steps if asked is None else asked.command.shape[1], asked
+        )
+        # A log tells of a robot from a few steps after it has begun to walk.
+        return jax.tree.map(lambda leaf: leaf[:, -steps:] if leaf.ndim > 1 else leaf, whole)
 
     def play(self, target: Target) -> Callable[..., Trajectory]:
         """Whole episodes in a target, `(key, policy, count, steps) -> Trajectory`, compiled where it is in JAX."""

@@ -1,14 +1,16 @@
 """Summaries and closing tables."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
+import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from envs import domain
 from jaxtune import dist as dists
 from jaxtune.tuner import Info
-from jaxtune.types import Verdict
+from jaxtune.types import ParamDist, Verdict
 
 
 def tuning(info: Info) -> dict:
@@ -30,6 +32,27 @@ def tuning(info: Info) -> dict:
         "not_finite": int(info.not_finite),
         "training": {name: float(np.mean(value)) for name, value in info.train.items()},
     }
+
+
+def moved(entries: Mapping[str, domain.Entry], before: ParamDist, after: ParamDist, info: Info) -> dict[str, dict]:
+    """What a tuning did to every parameter, in physical values by name.
+
+    `low` and `high` are ends of the interval that held-out sets have calibrated; nan where nothing was accepted, and
+    where it reaches past what was simulated, of which they say nothing.
+    """
+    update = info.update
+    low, high = dists.normalised_box(info.dist)
+    inside = (update.step - update.interval >= low) & (update.step + update.interval <= high)
+    half = dists.ravel(info.dist.radius) * jnp.where(inside, update.interval, jnp.nan)
+    half = dists.unravel(dists.names(after), half)
+    ends = {
+        "before": before.centre,
+        "after": after.centre,
+        "low": {name: centre - half[name] for name, centre in after.centre.items()},
+        "high": {name: centre + half[name] for name, centre in after.centre.items()},
+    }
+    found = {end: domain.from_coordinates(entries, values) for end, values in ends.items()}
+    return {name: {end: float(values[name]) for end, values in found.items()} for name in after.centre}
 
 
 def sim2sim(args, results: dict[str, list[dict]], off: Sequence[str]) -> dict:

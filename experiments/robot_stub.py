@@ -7,6 +7,7 @@ policy, falls where it falls, and writes `RUN/round_*/log`; nothing else of it c
 """
 
 import json
+import os
 import shutil
 import time
 from collections import deque
@@ -240,7 +241,7 @@ def answer(place: Path, robot: Robot, seed: int) -> Sequence[bool]:
         runs=tuple(run for run, _ in walked),
     )
     # Whole or not at all: who waits for the folder may read it at once.
-    draft = place / "log.partial"
+    draft = place / f"log.{os.getpid()}.partial"
     shutil.rmtree(draft, ignore_errors=True)
     write(log, draft, ".parquet")
     draft.rename(place / "log")
@@ -259,7 +260,11 @@ def main(args: Args) -> None:
                 falls = answer(place, robot, args.seed)
                 console.print(f"{place}: walked {len(falls)} times, fell {sum(falls)} times")
             except (ValueError, OSError) as error:
-                (place / "refused.txt").write_text(f"{error}\n")
+                if (place / "log").exists():  # another process was faster
+                    continue
+                draft = place / f"refused.{os.getpid()}.partial"
+                draft.write_text(f"{error}\n")
+                draft.rename(place / "refused.txt")
                 console.print(f"{place}: refused: {error}", highlight=False)
             last = time.monotonic()
         time.sleep(0.5)

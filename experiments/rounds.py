@@ -5,46 +5,63 @@
                   prediction.json  what simulation says of them
                   policy/          the policy, for the robot's computer
                   request.json     what the robot is asked for: how many walks, how long, and a seed
-                  log/             the robot's answer; `meta.yaml` comes last. Or refused.txt, which says why not
+                  log/             the robot's answer. Or refused.txt, which says why there is none
                   measured.json    what came of it, and what the doctor says
                   tuned/           the distribution after the verdict
-                  tuning.json      the verdict, and what moved
+                  tuning.json      the verdict, what moved, and what the tuned simulator says of the same policy
                   report.html
     RUN/round_001/start/           the policy trained on in what the tuning left, and so on
 
 Whatever a round makes is a file, and what is there is not made again.
 
-Falls are what a robot pays with. It is asked for nothing where too many of its walks are expected to end in one: by
-simulation, and where the gate did not let the last log pass by that log too, because then simulation knows no better.
+Falls are what a robot pays with. It is asked for nothing where too many of its walks are expected to end in one.
+Simulation alone is believed where the gate has accepted the last log, and where the tuned simulator has the policy that
+walked fall about as often as it did; else what was measured is expected again.
 """
 
 import json
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 
-from envs import domain, logs
+from envs import logs
 from envs.biteno import constants
+from envs.logs import Log
 from envs.targets import recorded
+from envs.targets.recorded import Recorded
 from experiments import checkpoint, doctor, export, report
 from experiments.checkpoint import write_json
-from experiments.loop import Loop, Policy, walked
+from experiments.expected import expected_falls, measured
+from experiments.loop import Loop, Policy
+from experiments.robot_folder import request, wait
 from experiments.train import console, policy_config
 from jaxtune import baselines, tuner
-from jaxtune import dist as dists
-from jaxtune.tuner import Info, Tuner, TunerState
-from jaxtune.types import ParamDist
+from jaxtune.tuner import Tuner, TunerState
 
-METHODS: dict[str, Callable[[Tuner], Tuner | baselines.Untuned]] = {
-    "ours": lambda machine: machine,
-    "spm": baselines.spm,
-    "dr": lambda machine: baselines.Untuned(tuner=machine),
+
+@dataclass(frozen=True)
+class Method:
+    """How a distribution is tuned, and how wide a policy trains in it."""
+
+    tuner: Callable[[Tuner], Tuner | baselines.Untuned]
+    policy: Callable[[Policy, float], Policy] = lambda policy, radius: policy
+
+
+METHODS = {
+    "ours": Method(lambda machine: machine),
+    "spm": Method(baselines.spm),
+    "dr": Method(
+        lambda machine: baselines.Untuned(tuner=machine),
+        lambda policy, radius: policy.replace(radius=jnp.full_like(policy.radius, radius)),
+    ),
 }
-_LOOK_S = 1.0  # between two looks for a log
-_SPARE_S = 0.05  # of a walk, for the ticks at its ends of which nobody knows what was before or after them
+
+_STRANGE = 0.25  # share of the actions' size by which they may differ from the policy's
+_KEYS = 7  # of the rounds, apart from what else begins with the seed
 
 
 class Simulator:
@@ -52,10 +69,13 @@ class Simulator:
 
     def __init__(self, loop: Loop):
         self.loop = loop
-        self.machines = {name: method(loop.tuner()) for name, method in METHODS.items()}
+        self.machines = {name: method.tuner(loop.tuner()) for name, method in METHODS.items()}
         self.tune = {name: jax.jit(machine.tune) for name, machine in self.machines.items()}
         self.train = jax.jit(loop.tuner().train)
         self.foresee = jax.jit(loop.foresee, static_argnums=(3, 4))
+        self.act = jax.jit(
+            lambda policy, obs: jax.vmap(lambda one: loop.act(policy)(one, jax.random.PRNGKey(0))[0])(obs)
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,7 +87,9 @@ class Terms:
     max_fall_rate: float = 0.2
     """The robot is asked for nothing where more of its walks are expected to end in a fall."""
     force: bool = False
-    """Ask all the same, and learn from logs that the doctor thinks are wrong."""
+    """Ask all the same."""
+    trust_log: bool = False
+    """Learn from a log even if the doctor thinks it means something else, or another policy has walked."""
     timeout_s: float = 3600.0
     """How long a log is waited for."""
     seed: int = 0
@@ -82,16 +104,28 @@ class Run:
       terms: what the robot is asked for.
       simulator: the learner's side.
       method: one of `METHODS`.
-      policy, dist: what the first round begins with.
+      policy: what the first round begins with.
+      start: middle of the first distribution, physical values by name.
+      radius: of the first distribution, in log space.
     """
 
-    def __init__(self, out: Path, terms: Terms, simulator: Simulator, method: str, policy: Policy, dist: ParamDist):
+    def __init__(
+        self,
+        out: Path,
+        terms: Terms,
+        simulator: Simulator,
+        method: str,
+        policy: Policy,
+        start: Mapping[str, float],
+        radius: float,
+    ):
         self._out, self._terms, self._simulator, self._loop = out, terms, simulator, simulator.loop
         self._tune = simulator.tune[method]
-        self._first = simulator.machines[method].init(policy, dist, tuner.knobs())
+        policy = METHODS[method].policy(policy, radius)
+        self._first = simulator.machines[method].init(policy, self._loop.dist(start, radius), tuner.knobs())
         self._steps = round(terms.walk_s / constants.POLICY_DT_S)
 
-    def round(self, index: int, history: Sequence[dict]) -> dict:
+    def round(self, index: int, history: Sequence[Mapping]) -> dict:
         """Plays a round, or reads what an earlier call left of it.
 
         Args:
@@ -99,8 +133,9 @@ class Run:
           history: what is known of the rounds before it.
 
         Returns:
-          `predicted` and `measured` return, share of falls and power; `tuning`: the verdict and what moved; `next`:
-          what is predicted of the round that follows; `expected_falls` in it.
+          `predicted` and `measured` return, share of falls and power; `tuning`: the verdict, what moved, and the same
+          numbers of the same policy in the tuned simulator, `explained`; `next`: what is predicted of the round that
+          follows; `expected_falls` in it.
 
         Raises:
           ValueError: the robot is not asked to walk, has not answered, or its log cannot be learnt from.
@@ -109,8 +144,9 @@ class Run:
         state = self._start(index, lambda: self._first)
         predicted = self._foreseen(index, state)
         if not (place / "tuning.json").exists():
-            self._permit(index, predicted, history)
-            self._ask(index, state)
+            if not (place / "log").exists():
+                self._permit(index, predicted, history)
+                self._ask(index, state)
             wait(place, self._terms.timeout_s)
             self._learn(index, state)
         tuned = checkpoint.load(place / "tuned", self._first, {})
@@ -123,7 +159,8 @@ class Run:
         return self._out / f"round_{index:03d}"
 
     def _key(self, index: int, use: int) -> jax.Array:
-        return jax.random.fold_in(jax.random.fold_in(jax.random.PRNGKey(self._terms.seed), index), use)
+        key = jax.random.fold_in(jax.random.PRNGKey(self._terms.seed), _KEYS)
+        return jax.random.fold_in(jax.random.fold_in(key, index), use)
 
     def _start(self, index: int, make: Callable[[], TunerState]) -> TunerState:
         place = self._place(index)
@@ -134,17 +171,21 @@ class Run:
         # Read back even if just made: a run that goes on has no other state than one that was never stopped.
         return checkpoint.load(place / "start", self._first, {})
 
+    def _foresee(self, key: jax.Array, state: TunerState) -> dict:
+        count = self._loop.preset.foreseen_episodes
+        return self._simulator.foresee(key, state.policy, state.dist, count, self._steps) | {"episodes": count}
+
     def _foreseen(self, index: int, state: TunerState) -> dict:
         path = self._place(index) / "prediction.json"
         if not path.exists():
-            count = self._loop.preset.foreseen_episodes
-            found = self._simulator.foresee(self._key(index, 0), state.policy, state.dist, count, self._steps)
-            write_json(path, found | {"episodes": count})
+            write_json(path, self._foresee(self._key(index, 0), state))
         return json.loads(path.read_text())
 
-    def _permit(self, index: int, predicted: Mapping, history: Sequence[dict]) -> None:
+    def _permit(self, index: int, predicted: Mapping, history: Sequence[Mapping]) -> None:
         rate, most = expected_falls(predicted, history), self._terms.max_fall_rate
         if rate > most and not self._terms.force:
+            # An earlier call may have asked on other terms.
+            (self._place(index) / "request.json").unlink(missing_ok=True)
             raise ValueError(
                 f"round {index}: the robot is not asked to walk: {rate:.0%} of its walks are expected to end in a fall "
                 f"({predicted['fall_rate']:.0%} in simulation), and {most:.0%} may (max_fall_rate; force overrides)"
@@ -163,68 +204,39 @@ class Run:
         """From a log to the next distribution."""
         place, preset = self._place(index), self._loop.preset
         log = logs.read(place / "log")
+        walks = recorded.episodes(log, self._steps, most=1)
         said = doctor.summary(doctor.examine(log))
-        wrong = [finding.sentence for finding, runs in said if finding.wrong and 2 * len(runs) > len(log.runs)]
-        if wrong and not self._terms.force:
-            raise ValueError(f"{place / 'log'}: {'; '.join(wrong)} (force learns from it all the same)")
-        walks = recorded.beginning(recorded.episodes(log, self._steps, most=1), preset.tuner.set_episodes, self._steps)
-        seconds = float(walks.trajectory.alive.sum()) * constants.POLICY_DT_S
+        if not self._terms.trust_log:
+            self._check(place / "log", log, walks, state.policy, said)
+        walks = recorded.beginning(walks, preset.tuner.set_episodes, self._steps)
         suspected = [{"sentence": finding.sentence, "runs": runs} for finding, runs in said]
-        numbers = {"episodes": preset.tuner.set_episodes, "seconds": seconds, "suspected": suspected}
-        write_json(place / "measured.json", walked(walks.trajectory, walks.power) | numbers)
+        write_json(place / "measured.json", measured(walks) | {"suspected": suspected})
         start = recorded.beginning(walks, preset.tuner.set_episodes, preset.episode_steps)
         repeating = state.replace(policy=state.policy.replace(asked=start.asked))
         tuned, info = self._tune(self._key(index, 1), repeating, start.trajectory)
-        checkpoint.save(place / "tuned", tuned.replace(policy=state.policy), {})
+        tuned = tuned.replace(policy=state.policy)
+        checkpoint.save(place / "tuned", tuned, {})
+        told = report.tuning(info) | {"moved": report.moved(self._loop.entries, state.dist, tuned.dist, info)}
+        told |= {"compared_s": preset.episode_steps * constants.POLICY_DT_S}
         # Last: what is there need not be learnt again.
-        told = report.tuning(info) | {"moved": moved(self._loop, state.dist, tuned.dist, info)}
-        write_json(place / "tuning.json", told)
+        write_json(place / "tuning.json", told | {"explained": self._foresee(self._key(index, 3), tuned)})
 
+    def _check(self, place: Path, log: Log, walks: Recorded, policy: Policy, said) -> None:
+        """Nothing is learnt from numbers that mean something else, or from another policy's walks.
 
-def moved(loop: Loop, before: ParamDist, after: ParamDist, info: Info) -> dict[str, dict]:
-    """What a tuning did to every parameter, in physical values by name."""
-    interval = dists.unravel(dists.names(after), dists.ravel(info.dist.radius) * info.update.interval)
-    ends = {
-        "before": before.centre,
-        "after": after.centre,
-        "low": {name: centre - interval[name] for name, centre in after.centre.items()},
-        "high": {name: centre + interval[name] for name, centre in after.centre.items()},
-    }
-    found = {end: domain.from_coordinates(loop.entries, values) for end, values in ends.items()}
-    return {name: {end: float(values[name]) for end, values in found.items()} for name in after.centre}
-
-
-def expected_falls(predicted: Mapping, history: Sequence[Mapping]) -> float:
-    """Share of walks that are expected to end in a fall."""
-    if not history:
-        return predicted["fall_rate"]
-    verdicts = history[-1]["tuning"]["verdicts"]
-    covered = not verdicts or verdicts[-1] == "accept"
-    return predicted["fall_rate"] if covered else max(predicted["fall_rate"], history[-1]["measured"]["fall_rate"])
-
-
-def request(place: Path, episodes: int, seconds: float, seed: int) -> None:
-    """Asks the robot for walks with the policy that is there: whoever finds the request may begin."""
-    write_json(place / "request.json", {"episodes": episodes, "seconds": seconds + _SPARE_S, "seed": seed})
-
-
-def wait(place: Path, timeout_s: float) -> None:
-    """Waits for a log that is whole: it has its `meta.yaml`, and nothing of it changes between two looks.
-
-    Raises:
-      ValueError: the robot has refused, or has not answered in time.
-    """
-    begin, before = time.monotonic(), None
-    while True:
-        if (place / "refused.txt").exists():
-            raise ValueError(f"{place / 'refused.txt'}: {(place / 'refused.txt').read_text().strip()}")
-        files = {path: (path.stat().st_size, path.stat().st_mtime_ns) for path in (place / "log").rglob("*")}
-        if place / "log" / "meta.yaml" in files and files == before:
-            return
-        if time.monotonic() - begin > timeout_s:
-            raise ValueError(
-                f"{place / 'log'}: no log after {timeout_s:g} s, expected one as {place / 'request.json'} asks for; "
-                "put it there and give the same command again"
-            )
-        before = files
-        time.sleep(min(_LOOK_S, timeout_s))
+        Raises:
+          ValueError: says what is wrong.
+        """
+        wrong = [finding.sentence for finding, runs in said if finding.wrong and 2 * len(runs) > len(log.runs)]
+        task, given = self._loop.preset.task, log.policy or {}
+        for name, value in {"action_scale": task.action_scale, "base": task.base}.items():
+            if given.get(name, value) != value:
+                wrong.append(f"policy.{name}: got {given[name]}, expected {value}")
+        alive = np.asarray(walks.trajectory.alive)
+        done = np.asarray(walks.trajectory.action)[alive]
+        ours = np.asarray(self._simulator.act(policy, walks.trajectory.obs.reshape(-1, walks.trajectory.obs.shape[-1])))
+        strange = np.sqrt(((done - ours[alive.ravel()]) ** 2).mean() / np.maximum((done**2).mean(), 1e-12))
+        if strange > _STRANGE:
+            wrong.append(f"actions differ from what this round's policy does by {strange:.0%} of their size")
+        if wrong:
+            raise ValueError(f"{place}: {'; '.join(wrong)} (trust_log learns from it all the same)")

@@ -9,12 +9,11 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
 
-import jax.numpy as jnp
 import tyro
 
 from envs import correction, domain
 from envs.biteno import constants
-from experiments import checkpoint, sim2real_report
+from experiments import checkpoint, export, sim2real_report
 from experiments.config import Preset, chosen, named_values, preset
 from experiments.loop import Loop
 from experiments.rounds import METHODS, Run, Simulator, Terms
@@ -83,16 +82,17 @@ def simulator(args: Args) -> Simulator:
 def play(args: Args, learner: Simulator) -> list[dict]:
     """Plays the rounds that have not been played, and reports on each; what is known of them all."""
     start = check(args)[2]
+    export.needed()
     loop = learner.loop
+    # What is wrong with a policy is said before there is a folder; one from scratch is kept in it.
+    policy = None if args.policy == "scratch" else starting_policy(args.policy, loop)
     identity = {**asdict(args), "sizes": loop.preset, "terms": {"walk_s": args.terms.walk_s, "seed": args.terms.seed}}
     # Of a run that goes on, these may be others.
     for option in ("out", "rounds"):
         del identity[option]
     checkpoint.open_run(args.out, identity)
-    policy = starting_policy(args.policy, loop, args.out)
-    if args.method == "dr":
-        policy = policy.replace(radius=jnp.full_like(policy.radius, args.radius))
-    rounds = Run(args.out, args.terms, learner, args.method, policy, loop.dist(start, args.radius))
+    policy = policy or starting_policy(args.policy, loop, args.out)
+    rounds = Run(args.out, args.terms, learner, args.method, policy, start, args.radius)
     history: list[dict] = []
     for index in range(args.rounds):
         history.append(rounds.round(index, history))

@@ -23,14 +23,17 @@ from experiments import checkpoint, export, plots, sim2real
 from experiments.checkpoint import write_json
 from experiments.config import preset
 from experiments.loop import walked
+from experiments.robot_folder import request, wait
 from experiments.robot_stub import Body
-from experiments.rounds import Simulator, Terms, request, wait
+from experiments.rounds import Simulator, Terms
 from experiments.train import console, policy_config, run, starting_policy
 from jaxtune.tuner import knobs
 
 METHODS = ("ours", "spm", "dr", "oracle")
 _DR_RADIUS = 0.4
-_ANSWER_S = 1800.0
+_LEGS = ("abductor_mass", "thigh_mass", "shank_mass")
+_ANSWER_S = 900.0
+_DAY_S = 86400.0
 _EVALUATION_SEED = 999_000
 
 
@@ -39,7 +42,8 @@ class Args:
     """Compares what methods make of a robot that answers through log files."""
 
     out: Path = Path("runs/sim2real_bench")
-    """Folder; the same command with the same folder goes on where it was, and others of its seeds may run beside it."""
+    """Folder; the same command with the same folder goes on where it was. Other seeds may run beside it; a last call with
+    all of them writes summary and picture."""
     methods: tuple[str, ...] = METHODS
     """Which of ours, spm, dr, oracle."""
     seeds: tuple[int, ...] = (0, 1, 2)
@@ -67,6 +71,7 @@ def check(args: Args) -> None:
     for name in args.methods:
         if name not in METHODS:
             raise ValueError(f"methods: got '{name}', expected some of {', '.join(METHODS)}")
+        sim2real.check(asked(args, name, 0))
     if not args.methods or not args.seeds:
         raise ValueError("methods, seeds: got none, expected one or more of each")
     for option in ("rounds", "evaluation"):
@@ -77,27 +82,25 @@ def check(args: Args) -> None:
 def asked(args: Args, method: str, seed: int) -> sim2real.Args:
     """The command that plays a method's rounds."""
     body = Body()
-    names = [name for name in constants.PARAMETER_SETS["whole_body"] if name.endswith("_mass")]
-    mass = 1.0 if method == "oracle" else args.mass
-    start = [f"{name}={mass * (body.trunk_mass if name == 'trunk_mass' else body.leg_mass)}" for name in names]
-    known = {
-        "ours": {"method": "ours"},
-        "spm": {"method": "spm"},
-        "dr": {"method": "dr", "radius": _DR_RADIUS},
-        "oracle": {"method": "dr", "radius": preset(args.preset).policy_radius},
-    }
-    if method == "oracle":
-        start.append(f"foot_friction={body.foot_friction}")
+    truth = {"trunk_mass": body.trunk_mass, **dict.fromkeys(_LEGS, body.leg_mass)}
+    start = {name: args.mass * value for name, value in truth.items()}
+    # Who knows the robot trains with what it has, as far as the simulator can have it.
+    known = truth | {"foot_friction": body.foot_friction}
+    how = {
+        "ours": {"method": "ours", "start": start},
+        "spm": {"method": "spm", "start": start},
+        "dr": {"method": "dr", "start": start, "radius": _DR_RADIUS},
+        "oracle": {"method": "dr", "start": known, "radius": preset(args.preset).policy_radius},
+    }[method]
     return sim2real.Args(
         out=args.out / f"{method}_{seed}",
         rounds=args.rounds,
         policy=str(args.out / f"start_{seed}" / "learner"),
-        start=tuple(start),
         noise=args.noise,
         preset=args.preset,
         # A stand-in may fall: what that costs is what is measured.
         terms=Terms(walk_s=args.walk_s, force=True, timeout_s=_ANSWER_S, seed=seed),
-        **known[method],
+        **how | {"start": tuple(f"{name}={value:g}" for name, value in how["start"].items())},
     )
 
 
@@ -125,7 +128,7 @@ def robot(folder: Path):
         "--folder",
         str(folder.resolve()),
         "--idle-s",
-        str(_ANSWER_S),
+        str(_DAY_S),
     ]
     with (folder.parent / f"robot_{folder.name}.log").open("a") as said:
         process = subprocess.Popen(command, stdout=said, stderr=said, cwd=Path(__file__).parent.parent)

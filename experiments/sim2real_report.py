@@ -8,6 +8,7 @@ from rich.console import Console
 from rich.table import Table
 
 from experiments import plots
+from experiments.expected import surprise, verdict
 from experiments.rounds import Terms
 
 _PAGE = Path(__file__).parent / "sim2real_report.html"
@@ -23,12 +24,6 @@ VERDICTS = {
 _QUANTITIES = {"return": "return", "fall_rate": "share of walks that end in a fall", "power_w": "mechanical power, W"}
 
 
-def verdict(line: dict) -> str | None:
-    """How a round's tuning ended."""
-    verdicts = line["tuning"]["verdicts"]
-    return verdicts[-1] if verdicts and line["tuning"]["p_value"][-1] is not None else None
-
-
 def write(path: Path, history: Sequence[dict], terms: Terms) -> None:
     """Writes the page of the last round; whatever came from the log is escaped."""
     line = history[-1]
@@ -39,6 +34,7 @@ def write(path: Path, history: Sequence[dict], terms: Terms) -> None:
         meaning=VERDICTS[verdict(line)],
         quantities=_QUANTITIES,
         unknown=unknown(line),
+        surprise=surprise(line),
         safe=line["expected_falls"] <= terms.max_fall_rate,
         terms=terms,
         episodes=sum(one["measured"]["episodes"] for one in history),
@@ -58,11 +54,12 @@ def show(console: Console, history: Sequence[dict]) -> None:
     """Prints what the last round measured, what moved, and what is expected of the next."""
     line = history[-1]
     console.print(f"[bold]round {line['round']}: {verdict(line) or 'not asked'}[/bold]: {VERDICTS[verdict(line)]}")
-    table = Table("", "predicted", "measured", "predicted of the next")
+    table = Table("", "predicted", "measured", "same policy, tuned simulator", "predicted of the next")
+    columns = line["predicted"], line["measured"], line["tuning"]["explained"], line["next"]
     for name, label in _QUANTITIES.items():
-        table.add_row(label, *(f"{line[when][name]:.2f}" for when in ("predicted", "measured", "next")))
+        table.add_row(label, *(f"{column[name]:.2f}" for column in columns))
     console.print(table)
-    table = Table("parameter", "before", "after", "interval")
+    table = Table("parameter", "before", "after", "90 % interval")
     for name, ends in line["tuning"]["moved"].items():
         interval = "-" if ends["low"] is None else f"{ends['low']:.3f} to {ends['high']:.3f}"
         note = " (not identifiable from this log)" if name in unknown(line) else ""

@@ -11,9 +11,9 @@ _TOUCH_N = 1.0  # a foot touches the floor
 _PRESS_N = 10.0  # and presses on it enough for a ratio of forces to mean something
 
 
-def advance(phase: jax.Array) -> jax.Array:
-    """Moves the phases on by one policy step, in cycles."""
-    return jnp.mod(phase + constants.CLOCK_HZ * constants.POLICY_DT_S, 1.0)
+def advance(phase: jax.Array, steps: int = 1) -> jax.Array:
+    """Moves the phases on by policy steps, or back, in cycles."""
+    return jnp.mod(phase + steps * constants.CLOCK_HZ * constants.POLICY_DT_S, 1.0)
 
 
 def foot_reference(phase: jax.Array, command: jax.Array) -> jax.Array:

@@ -36,7 +36,7 @@ class Recorded:
     """Measured episodes, and what a simulation needs to repeat them."""
 
     trajectory: Trajectory
-    asked: Asked
+    asked: Asked  # from the run's first step on, a few before the trajectory's
     power: jax.Array  # [episodes, time] W, mechanical, braking not regained
 
 
@@ -59,14 +59,17 @@ def episodes(log: Log, steps: int, most: int | None = None) -> Recorded:
     if abs(rate * constants.POLICY_DT_S - 1.0) > 1e-6:
         raise ValueError(f"policy.rate_hz: got {rate:g}, expected {1.0 / constants.POLICY_DT_S:g}")
     order = [log.joints.index(joint) for joint in constants.JOINTS]
-    found = []
+    found, leads = [], []
     for run in log.runs:
         ticks = _at_ticks(run, order)
         chunks = [_chunks(_steps(ticks, rows, fell), steps) for rows, fell in _pieces(ticks)]
         found += list(chain.from_iterable(chunks))[:most]
+        # A first action that does not change is not heard.
+        unheard = 0.5 < (ticks["time"][0] - run.time[0]) / constants.POLICY_DT_S < 1.5
+        leads.append(2 if unheard else 1)
     if not found:
         raise ValueError(f"runs: got {len(log.runs)} without two ticks in a row, expected a robot that walks")
-    return _as_simulated(jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *found))
+    return _as_simulated(jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *found), max(leads))
 
 
 def beginning(recorded: Recorded, count: int, steps: int) -> Recorded:
@@ -80,6 +83,7 @@ def beginning(recorded: Recorded, count: int, steps: int) -> Recorded:
         raise ValueError(f"runs: got {there} episode(s), expected {count} or more")
     cut = lambda leaf: leaf[:count, :steps]  # noqa: E731
     trajectory, asked = recorded.trajectory, recorded.asked
+    lead = asked.command.shape[1] - trajectory.alive.shape[1]
     # Who still stands when the cut comes has not fallen before it.
     fell = (trajectory.fell & ~trajectory.alive[:, steps:].any(axis=1))[:count]
     return Recorded(
@@ -91,7 +95,7 @@ def beginning(recorded: Recorded, count: int, steps: int) -> Recorded:
             fell=fell,
             not_finite=trajectory.not_finite[:count],
         ),
-        asked=Asked(command=cut(asked.command), phase=asked.phase[:count]),
+        asked=Asked(command=asked.command[:count, : lead + steps], phase=asked.phase[:count]),
         power=cut(recorded.power),
     )
 
@@ -201,9 +205,9 @@ def _chunks(steps: dict, length: int) -> list[dict]:
     return [cut(start) for start in range(0, count, length)]
 
 
-@jax.jit
-def _as_simulated(steps: dict) -> Recorded:
-    """What the simulator would have told of steps [episodes, time]."""
+@partial(jax.jit, static_argnums=1)
+def _as_simulated(steps: dict, lead: int) -> Recorded:
+    """What the simulator would have told of steps [episodes, time] before which the robot has walked a few."""
     before, now, after = (steps[moment] for moment in ("before", "now", "after"))
     each = lambda function: jax.vmap(jax.vmap(function))  # noqa: E731
     obs = each(partial(sensing.observe, stand=jnp.asarray(constants.STAND_RAD)))(
@@ -224,7 +228,7 @@ def _as_simulated(steps: dict) -> Recorded:
     )
     alive, fell = steps["alive"], steps["fell"].any(axis=1)
     # Who repeats an episode may stay up for longer.
-    held = jnp.minimum(jnp.arange(alive.shape[1]), alive.sum(axis=1, keepdims=True) - 1)
+    held = jnp.clip(jnp.arange(-lead, alive.shape[1]), 0, alive.sum(axis=1, keepdims=True) - 1)
     return Recorded(
         trajectory=Trajectory(
             obs=obs,
@@ -234,6 +238,9 @@ def _as_simulated(steps: dict) -> Recorded:
             fell=fell,
             not_finite=jnp.zeros_like(fell),
         ),
-        asked=Asked(command=jnp.take_along_axis(now["cmd"], held[..., None], axis=1), phase=now["phase"][:, 0]),
+        asked=Asked(
+            command=jnp.take_along_axis(now["cmd"], held[..., None], axis=1),
+            phase=gait.advance(now["phase"][:, 0], -lead),
+        ),
         power=jnp.where(alive, gait.power(now["tau"], now["dq"]), 0.0),
     )

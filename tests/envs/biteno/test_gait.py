@@ -45,6 +45,7 @@ def test_a_foot_out_of_reach_is_answered_with_a_straight_leg():
 def test_the_clock_runs_at_its_rate_and_wraps():
     # 1.75 Hz x 0.01 s = 0.0175 of a cycle.
     np.testing.assert_allclose(gait.advance(jnp.array([0.2, 0.99])), [0.2175, 0.0075], atol=1e-6)
+    np.testing.assert_allclose(gait.advance(jnp.array([0.2175, 0.0075]), -1), [0.2, 0.99], atol=1e-6)
 
 
 def test_legs_stay_half_a_cycle_apart(fresh):

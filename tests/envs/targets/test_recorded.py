@@ -208,7 +208,10 @@ def test_a_long_run_is_several_episodes(simulated):
     parts = recorded.episodes(replace(log, runs=(stays,)), 80)
     assert parts.trajectory.obs.shape == (3, 80, 40)
     np.testing.assert_array_equal(parts.trajectory.alive.sum(axis=1), [80, 80, STEPS - 3 - 160])
-    for one, other in ((parts.trajectory.obs, whole.trajectory.obs), (parts.asked.command, whole.asked.command)):
+    for one, other in (
+        (parts.trajectory.obs, whole.trajectory.obs),
+        (parts.asked.command[:, 1:], whole.asked.command[:, 1:]),
+    ):
         np.testing.assert_allclose(one.reshape(240, -1)[: STEPS - 3], other[0, : STEPS - 3], atol=1e-6)
 
 
@@ -241,10 +244,22 @@ def test_who_repeats_an_episode_is_asked_for_the_same_until_its_end_and_on(simul
     found = recorded.episodes(log, STEPS)
     for episode in (0, 2):
         obs, alive = found.trajectory.obs[episode], int(found.trajectory.alive[episode].sum())
-        command = found.asked.command[episode] * jnp.array([2.0, 2.0, 0.25])
+        # The first row is the tick before the first step.
+        asked = found.asked.command[episode]
+        assert asked.shape == (STEPS + 1, 3)
+        np.testing.assert_array_equal(asked[0], asked[1])
+        command = asked[1:] * jnp.array([2.0, 2.0, 0.25])
         np.testing.assert_allclose(command[:alive], obs[:alive, 3:6], atol=1e-6)
         np.testing.assert_array_equal(command[alive:], jnp.broadcast_to(command[alive - 1], (STEPS - alive, 3)))
-        np.testing.assert_allclose(sensing.clock(found.asked.phase[episode]), obs[0, 36:], atol=1e-6)
+        np.testing.assert_allclose(sensing.clock(found.asked.phase[episode] + 0.0175), obs[0, 36:], atol=1e-6)
+
+
+def test_a_first_action_that_cannot_be_heard_is_a_step_too(simulated):
+    _, log = simulated
+    fast = replace(log, rate_hz=500.0, runs=tuple(faster(run, 5) for run in log.runs))
+    slow, found = recorded.episodes(log, STEPS), recorded.episodes(fast, STEPS)
+    assert found.asked.command.shape == (4, STEPS + 2, 3)
+    np.testing.assert_allclose(found.asked.phase, slow.asked.phase, atol=1e-6)
 
 
 def test_torque_that_was_not_measured_is_what_was_asked_for(simulated):

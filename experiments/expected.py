@@ -1,0 +1,48 @@
+"""What came of a robot's walks, and what is to be expected of the next ones."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from scipy.stats import binom
+
+from envs.biteno import constants
+from envs.targets.recorded import Recorded
+from experiments.loop import walked
+
+_SURPRISE = 0.05  # chance under which falls are not what simulation expects
+
+
+def measured(walks: Recorded) -> dict:
+    """What came of walks; those that end before their time and not in a fall are told apart."""
+    alive, fell = np.asarray(walks.trajectory.alive), np.asarray(walks.trajectory.fell)
+    return walked(walks.trajectory, walks.power) | {
+        "episodes": len(fell),
+        "seconds": alive.sum() * constants.POLICY_DT_S,
+        "cut_short": int((~alive[:, -1] & ~fell).sum()),
+    }
+
+
+def verdict(line: Mapping) -> str | None:
+    """How a round's tuning ended; None where nobody asked."""
+    tuning = line["tuning"]
+    return tuning["verdicts"][-1] if tuning["verdicts"] and tuning["p_value"][-1] is not None else None
+
+
+def surprise(line: Mapping) -> float:
+    """Chance of as many falls as were measured, if the tuned simulator were right."""
+    walks, simulated = line["measured"], line["tuning"]["explained"]
+    falls = round(walks["fall_rate"] * walks["episodes"]) + walks["cut_short"]
+    # Of few simulated walks one may have been lucky.
+    rate = (simulated["fall_rate"] * simulated["episodes"] + 1) / (simulated["episodes"] + 2)
+    return float(binom.sf(falls - 1, walks["episodes"], rate))
+
+
+def expected_falls(predicted: Mapping, history: Sequence[Mapping]) -> float:
+    """Share of walks that are expected to end in a fall; what ended before its time may have been one."""
+    if not history:
+        return predicted["fall_rate"]
+    line = history[-1]
+    if verdict(line) == "accept" and surprise(line) >= _SURPRISE:
+        return predicted["fall_rate"]
+    walks = line["measured"]
+    return max(predicted["fall_rate"], walks["fall_rate"] + walks["cut_short"] / walks["episodes"])
