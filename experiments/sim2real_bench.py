@@ -42,8 +42,8 @@ class Args:
     """Compares what methods make of a robot that answers through log files."""
 
     out: Path = Path("runs/sim2real_bench")
-    """Folder; the same command with the same folder goes on where it was. Other seeds may run beside it; a last call with
-    all of them writes summary and picture."""
+    """Folder; the same command with the same folder goes on where it was. Other seeds may run beside it; a last call
+    with all of them writes summary and picture."""
     methods: tuple[str, ...] = METHODS
     """Which of ours, spm, dr, oracle."""
     seeds: tuple[int, ...] = (0, 1, 2)
