@@ -80,12 +80,12 @@ def test_a_log_counts_when_it_is_whole(tmp_path, monkeypatch):
             (log / f"run_{len(looks)}.csv").write_text("t\n")
         elif len(looks) < 5:
             (log / "meta.yaml").write_text("robot: biteno\n" * len(looks))
+            (tmp_path / "refused.txt").write_text("another one was asked before")
 
     monkeypatch.setattr(robot_folder.time, "sleep", sleep)
-    # A log that is there is waited for, however little time there is, and counts more than an earlier refusal.
-    (tmp_path / "refused.txt").write_text("")
+    # A log that is there is waited for, however little time there is, and counts more than a refusal.
     monkeypatch.setattr(robot_folder.time, "monotonic", iter([0.0, 1.0, 2.0, 3.0]).__next__)
-    robot_folder.wait(tmp_path, 2.5)
+    robot_folder.wait(tmp_path, 3.5)
     # Last changed in the fourth pause; the fifth look has seen it so, and three more.
     assert len(looks) == 7
 
