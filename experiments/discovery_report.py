@@ -2,16 +2,13 @@
 
 from pathlib import Path
 
-import jinja2
 from rich.console import Console
 from rich.table import Table
 
 from envs.logs import Log
-from experiments import plots
+from experiments import plots, report
 from experiments.question import Question
 from jaxtune.discovery.result import Result
-
-_PAGE = Path(__file__).parent / "discovery_report.html"
 
 VERDICTS = {
     "named": "Something is missing in the model, and it has a name.",
@@ -26,9 +23,9 @@ def write(path: Path, log: Log, question: Question, result: Result, summary: dic
     pictures = {"where": plots.heat_map(result.where), "traces": plots.traces(free["runs"], log.joints)}
     if result.rungs:
         pictures["ladder"] = plots.ladder(result.rungs)
-    template = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined).from_string(_PAGE.read_text())
     effects = [*summary["effects"], *summary["parameter_changes"]]
-    page = template.render(
+    page = report.render(
+        "discovery_report.html",
         robot=log.robot,
         runs=len(log.runs),
         meaning=VERDICTS[summary["verdict"]],

@@ -1,8 +1,10 @@
-"""Summaries and closing tables."""
+"""Summaries, closing tables and pages."""
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import jax.numpy as jnp
+import jinja2
 import numpy as np
 from rich.console import Console
 from rich.table import Table
@@ -11,6 +13,13 @@ from envs import domain
 from jaxtune import dist as dists
 from jaxtune.tuner import Info
 from jaxtune.types import ParamDist, Verdict
+
+
+def render(name: str, **values) -> str:
+    """A page of a template of this folder; text that comes from a log is escaped."""
+    folder = jinja2.FileSystemLoader(Path(__file__).parent)
+    pages = jinja2.Environment(loader=folder, autoescape=True, undefined=jinja2.StrictUndefined)
+    return pages.get_template(name).render(**values)
 
 
 def tuning(info: Info) -> dict:

@@ -3,15 +3,12 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-import jinja2
 from rich.console import Console
 from rich.table import Table
 
-from experiments import plots
+from experiments import plots, report
 from experiments.expected import surprise, verdict
 from experiments.rounds import Terms
-
-_PAGE = Path(__file__).parent / "sim2real_report.html"
 
 VERDICTS = {
     "accept": "The simulator covers what was measured.",
@@ -27,8 +24,8 @@ _QUANTITIES = {"return": "return", "fall_rate": "share of walks that end in a fa
 def write(path: Path, history: Sequence[dict], terms: Terms) -> None:
     """Writes the page of the last round; whatever came from the log is escaped."""
     line = history[-1]
-    template = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined).from_string(_PAGE.read_text())
-    page = template.render(
+    page = report.render(
+        "sim2real_report.html",
         line=line,
         verdict=verdict(line),
         meaning=VERDICTS[verdict(line)],
