@@ -3,7 +3,8 @@
 It stands in for the real one. MuJoCo C moves it, with what the learner's simulator lacks: targets arrive late, motors
 lag and give less the faster they turn, encoders are rounded, the IMU is noisy and biased, the estimate of its velocity
 drifts, its floor is another. It finds `RUN/round_*/request.json` beside an exported policy, walks with `player.py`'s
-policy, falls where it falls, and writes `RUN/round_*/log`; nothing else of it can be seen.
+policy, falls where it falls, and writes `RUN/round_*/log`; nothing else of it can be seen. Where it finds targets that
+`experiments.excite` wrote, `RUN/**/hung/targets`, it hangs, plays them and writes `hung/log`.
 """
 
 import json
@@ -12,14 +13,15 @@ import shutil
 import time
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import mujoco
 import numpy as np
 
 from envs.biteno import TaskConfig, constants, env
-from envs.logs import Controller, Log, Run, write
+from envs.logs import Controller, Log, Run, read, write
+from envs.rig import hung
 from experiments.player import Player
 from experiments.train import console, run
 
@@ -76,10 +78,15 @@ class Args:
 
 
 class Robot:
-    """The body, one run at a time."""
+    """The body, one run at a time.
 
-    def __init__(self, body: Body):
-        self.body = body
+    Args:
+      body: what it is.
+      base: free, or fixed where it hangs.
+    """
+
+    def __init__(self, body: Body, base: str = "free"):
+        self.body, self._free = body, base == "free"
         spec = mujoco.MjSpec.from_file(str(constants.MODEL_PATH))
         for link in spec.bodies[1:]:
             for geom in link.geoms:
@@ -88,6 +95,7 @@ class Robot:
             friction = spec.geom(foot).friction
             spec.geom(foot).friction = [friction[0] * body.foot_friction, *friction[1:]]
         model = spec.compile()
+        # What it walks with; whoever hangs it says with what.
         self.controller = Controller(
             kind="pd",
             rate_hz=1.0 / _TICK_S,
@@ -97,6 +105,7 @@ class Robot:
                 "torque_limit_nm": model.actuator_forcerange[:, 1].copy(),
             },
         )
+        model = model if self._free else hung(spec)
         model.opt.timestep = _STEP_S
         model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         model.opt.iterations, model.opt.ls_iterations = 100, 50
@@ -136,7 +145,7 @@ class Robot:
                 )
             if step % per_tick == 0:
                 self._line.append(target)
-                asked = self._asked(self._line[0], seen)
+                asked = self._asked(self._line[0], seen, self.controller)
             if step % per_row == 0:
                 said = {"target": target, "action": player.action, "phase": player.phase, "cmd": command}
                 rows.append({"tau": self._torque.copy(), "enabled": 1.0, "contact": self._contact()} | seen | said)
@@ -157,15 +166,46 @@ class Robot:
         )
         return walked, fell
 
+    def play(self, asked: Run, rng: np.random.Generator) -> Run:
+        """Plays a run's targets while it hangs, from rest at the first of them.
+
+        Raises:
+          ValueError: the run's controller is none that it has.
+        """
+        if asked.controller.kind != "pd":
+            raise ValueError(f"{asked.name}: controller: got {asked.controller.kind}, expected pd")
+        self.data = mujoco.MjData(self.model)
+        self.data.qpos[self._qpos] = asked.signals["target"][0]
+        tick_s = 1.0 / asked.controller.rate_hz
+        self._begin(tick_s)
+        per_tick = max(1, round(tick_s / _STEP_S))
+        grid = np.arange(0.0, asked.time[-1] + _STEP_S, _STEP_S)
+        enabled = asked.signals.get("enabled", np.ones(len(asked.time)))
+        moved = []
+        for step, row in enumerate(np.searchsorted(asked.time, grid + 1e-9, side="right") - 1):
+            moved.append(np.stack([self.data.qpos[self._qpos], self.data.qvel[self._dof]]))
+            if step % per_tick == 0:
+                self._line.append(asked.signals["target"][row])
+                torque = enabled[row] * self._asked(self._line[0], self._joints(*moved[-1], rng), asked.controller)
+            self._push(torque)
+            mujoco.mj_step(self.model, self.data)
+        moved = np.stack(moved, axis=1)  # [2, steps, joints]
+        position, speed = (np.stack([np.interp(asked.time, grid, joint) for joint in one.T], axis=1) for one in moved)
+        return replace(asked, signals=dict(asked.signals) | self._joints(position, speed, rng))
+
+    def _begin(self, tick_s: float) -> None:
+        """At rest where it is, the targets on their way those of where it is."""
+        mujoco.mj_forward(self.model, self.data)
+        late = round(self.body.transport_s / tick_s)
+        self._torque = np.zeros(len(self._qpos))
+        self._line = deque([self.data.qpos[self._qpos].copy()] * (1 + late), maxlen=1 + late)
+
     def _stand_up(self, rng: np.random.Generator) -> None:
         self.data = mujoco.MjData(self.model)
         mujoco.mj_resetDataKeyframe(self.model, self.data, self.model.keyframe("home").id)
         self.data.qpos[self._qpos] += rng.uniform(-0.1, 0.1, len(self._qpos))
-        mujoco.mj_forward(self.model, self.data)
+        self._begin(_TICK_S)
         body = self.body
-        self._torque = np.zeros(len(self._qpos))
-        self._line = deque([self.data.qpos[self._qpos].copy()], maxlen=1 + round(body.transport_s / _TICK_S))
-        self._line.extend([self._line[0]] * round(body.transport_s / _TICK_S))
         self._bias = {
             "gyro": body.gyro_bias_rad_s * rng.standard_normal(3),
             "tilt": body.tilt_bias_rad * rng.standard_normal(3),
@@ -184,16 +224,22 @@ class Robot:
         self._bias["vel"] = stays * self._bias["vel"] + wander
         gravity = into_body @ np.array([0.0, 0.0, -1.0])
         gravity = gravity + np.cross(self._bias["tilt"], gravity)
-        return {
-            "q": np.round(data.qpos[self._qpos] / body.encoder_rad) * body.encoder_rad,
-            "dq": data.qvel[self._dof] + body.velocity_noise_rad_s * rng.standard_normal(len(self._dof)),
+        return self._joints(data.qpos[self._qpos], data.qvel[self._dof], rng) | {
             "gyro": data.qvel[3:6] + self._bias["gyro"] + body.gyro_noise_rad_s * rng.standard_normal(3),
             "gravity": gravity / np.linalg.norm(gravity),
             "vel": into_body @ data.qvel[:3] + self._bias["vel"],
         }
 
-    def _asked(self, target: np.ndarray, seen: dict[str, np.ndarray]) -> np.ndarray:
-        gains = self.controller.gains
+    def _joints(self, position: np.ndarray, speed: np.ndarray, rng: np.random.Generator) -> dict[str, np.ndarray]:
+        body = self.body
+        return {
+            "q": np.round(position / body.encoder_rad) * body.encoder_rad,
+            "dq": speed + body.velocity_noise_rad_s * rng.standard_normal(speed.shape),
+        }
+
+    @staticmethod
+    def _asked(target: np.ndarray, seen: dict[str, np.ndarray], controller: Controller) -> np.ndarray:
+        gains = controller.gains
         torque = gains["kp"] * (target - seen["q"]) - gains["kd"] * seen["dq"]
         return np.clip(torque, -gains["torque_limit_nm"], gains["torque_limit_nm"])
 
@@ -240,25 +286,40 @@ def answer(place: Path, robot: Robot, seed: int) -> Sequence[bool]:
         policy={name: meta[name] for name in ("rate_hz", "action_scale", "base")},
         runs=tuple(run for run, _ in walked),
     )
-    # Whole or not at all: who waits for the folder may read it at once.
+    _put(log, place)
+    return [fell for _, fell in walked]
+
+
+def hang(place: Path, robot: Robot, seed: int) -> Sequence[bool]:
+    """Plays what is in `targets` while hanging, and writes the log; which of the runs ended in a fall: none can."""
+    asked = read(place / "targets", measured=False)
+    rngs = [np.random.default_rng((seed, index)) for index in range(len(asked.runs))]
+    runs = tuple(robot.play(run, rng) for run, rng in zip(asked.runs, rngs, strict=True))
+    _put(replace(asked, runs=runs), place)
+    return [False] * len(runs)
+
+
+def _put(log: Log, place: Path) -> None:
+    """Whole or not at all: who waits for the folder may read it at once."""
     draft = place / f"log.{os.getpid()}.partial"
     shutil.rmtree(draft, ignore_errors=True)
     write(log, draft, ".parquet")
     draft.rename(place / "log")
-    return [fell for _, fell in walked]
 
 
 def main(args: Args) -> None:
     """Answers requests until none has come for a while."""
-    robot, last = Robot(args.body), time.monotonic()
+    walks, hangs = Robot(args.body), Robot(args.body, base="fixed")
+    last = time.monotonic()
     while time.monotonic() - last < args.idle_s:
-        for request in sorted(args.folder.glob("**/round_*/request.json")):
-            place = request.parent
+        asked = [(path.parent, answer, walks) for path in args.folder.glob("**/round_*/request.json")]
+        asked += [(path.parent.parent, hang, hangs) for path in args.folder.glob("**/hung/targets/meta.yaml")]
+        for place, does, robot in sorted(asked, key=lambda one: one[0]):
             if (place / "log").exists() or (place / "refused.txt").exists():
                 continue
             try:
-                falls = answer(place, robot, args.seed)
-                console.print(f"{place}: walked {len(falls)} times, fell {sum(falls)} times")
+                fell = does(place, robot, args.seed)
+                console.print(f"{place}: {len(fell)} runs, {sum(fell)} falls")
             except (ValueError, OSError) as error:
                 if (place / "log").exists():  # another process was faster
                     continue

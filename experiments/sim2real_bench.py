@@ -56,6 +56,8 @@ class Args:
     """Length of a walk."""
     evaluation: int = 20
     """Walks in which a policy is evaluated before the first round and after the last."""
+    model: Path | None = None
+    """Folder of a corrected model that discovery wrote of the robot, for every method; the nominal one where None."""
     preset: str = "cpu"
     """Sizes: smoke, cpu or gpu."""
     noise: float = 0.2
@@ -96,6 +98,7 @@ def asked(args: Args, method: str, seed: int) -> sim2real.Args:
         out=args.out / f"{method}_{seed}",
         rounds=args.rounds,
         policy=str(args.out / f"start_{seed}" / "learner"),
+        model=args.model,
         noise=args.noise,
         preset=args.preset,
         # A stand-in may fall: what that costs is what is measured.

@@ -23,11 +23,12 @@ _UNIT_NORM = 0.05  # how far a unit vector may be from one
 _RATE_RATIO = 2.0  # between nominal and recorded rate
 
 
-def read(folder: Path) -> Log:
+def read(folder: Path, measured: bool = True) -> Log:
     """Reads a log.
 
     Args:
       folder: of meta.yaml and the runs.
+      measured: False where nothing was yet, and these are the targets that a robot is to play.
 
     Raises:
       ValueError: names the file, the row (of data, from 1) or the key, what was found and what was expected.
@@ -55,7 +56,7 @@ def read(folder: Path) -> Log:
         rate_hz=meta.rate_hz,
         joints=meta.joints,
         policy=meta.policy,
-        runs=tuple(_run(path, meta) for path in paths),
+        runs=tuple(_run(path, meta, measured) for path in paths),
     )
 
 
@@ -101,7 +102,7 @@ def _as_meta(controller: Controller) -> dict:
     return {"type": controller.kind, "rate_hz": controller.rate_hz, **gains}
 
 
-def _run(path: Path, meta: Meta) -> Run:
+def _run(path: Path, meta: Meta, measured: bool) -> Run:
     columns = read_bag(path, meta.columns) if is_bag(path) else READERS[path.suffix](path)
     for name, values in columns.items():
         refuse_first(path, name, values, ~np.isfinite(values), "a finite number")
@@ -113,7 +114,7 @@ def _run(path: Path, meta: Meta) -> Run:
     rate = 1.0 / np.median(np.diff(time))
     if not 1 / _RATE_RATIO <= rate / meta.rate_hz <= _RATE_RATIO:
         raise ValueError(f"{path}, column 't': got {rate:.6g} rows a second, expected rate_hz, {meta.rate_hz:g}")
-    signals = _signals(path, columns, meta)
+    signals = _signals(path, columns, meta, measured)
     said = meta.runs.get(path.stem, {"controller": meta.controller})
     return Run(
         name=path.stem,
@@ -126,7 +127,7 @@ def _run(path: Path, meta: Meta) -> Run:
     )
 
 
-def _signals(path: Path, columns: dict[str, np.ndarray], meta: Meta) -> dict[str, np.ndarray]:
+def _signals(path: Path, columns: dict[str, np.ndarray], meta: Meta, measured: bool) -> dict[str, np.ndarray]:
     """Takes the signals out of the columns, in our units."""
     signals = {}
     for signal in (*JOINT_SIGNALS, *VECTOR_SIGNALS, *SCALAR_SIGNALS):
@@ -141,9 +142,9 @@ def _signals(path: Path, columns: dict[str, np.ndarray], meta: Meta) -> dict[str
         for name, one in zip(names, values, strict=True):
             check_values(path, signal, meta.columns.get(name, name), one)
         signals[signal] = np.stack(values, axis=1) if len(names) > 1 or "." in names[0] else values[0]
-    if "q" not in signals:
+    if measured and "q" not in signals:
         raise ValueError(f"{path}, column '{column_names('q', meta.joints)[0]}': is missing")
-    if not {"target", "tau"} & set(signals):
+    if not {"target", "tau"} & set(signals) or not (measured or "target" in signals):
         raise ValueError(f"{path}: there is neither '{column_names('target', meta.joints)[0]}' nor 'tau'")
     for signal in ("gravity", "quat"):
         if signal in signals:
