@@ -1,15 +1,16 @@
 """The paper's last experiment (Fig. 6) on a stand-in robot: `python -m experiments.sim2real_bench --out DIR`.
 
-The learner starts with all masses at half of the robot's, and a policy that was trained there. The robot is a process
-of its own (`experiments.robot_stub`) that lacks nothing a robot has: delay, lag, noise, drift, another friction. Nobody
-learns from the walks in which policies are evaluated at the end; those of the rounds are what tuning is paid with.
+The learner starts with all masses at half of the robot's, and a policy that was trained there, in the nominal model.
+The robot is a process of its own (`experiments.robot_stub`) that lacks nothing a robot has: delay, lag, noise, drift,
+another friction. Nobody learns from the walks in which policies are evaluated at the end; those of the rounds are what
+tuning is paid with.
 """
 
 import json
 import subprocess
 import sys
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import jax
@@ -57,7 +58,8 @@ class Args:
     evaluation: int = 20
     """Walks in which a policy is evaluated before the first round and after the last."""
     model: Path | None = None
-    """Folder of a corrected model that discovery wrote of the robot, for every method; the nominal one where None."""
+    """Folder of a corrected model that discovery wrote of the robot, for what every method learns in from the first
+    round on; the nominal one where None."""
     preset: str = "cpu"
     """Sizes: smoke, cpu or gpu."""
     noise: float = 0.2
@@ -108,7 +110,7 @@ def asked(args: Args, method: str, seed: int) -> sim2real.Args:
 
 
 def prepare(args: Args, learner: Simulator, seed: int) -> None:
-    """Trains the policy that every method of a seed starts with: the one that ships, where the learner starts."""
+    """Trains the policy that every method of a seed starts with: the one that ships, at masses that are wrong."""
     place = args.out / f"start_{seed}" / "learner"
     if (place / "config.json").exists():
         return
@@ -166,9 +168,10 @@ def main(args: Args) -> None:
         del identity[option]
     checkpoint.open_run(args.out, identity)
     learner = sim2real.simulator(asked(args, "ours", 0))
+    nominal = learner if args.model is None else sim2real.simulator(replace(asked(args, "ours", 0), model=None))
     results: dict[str, list[dict]] = {name: [] for name in args.methods}
     for seed in args.seeds:
-        prepare(args, learner, seed)
+        prepare(args, nominal, seed)
         before = evaluate(args, learner, args.out / f"start_{seed}" / "learner")
         for name in args.methods:
             command = asked(args, name, seed)

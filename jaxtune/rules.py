@@ -33,7 +33,9 @@ class TunerConfig:
     max_widenings: int = 6
     """Widenings within one tuning."""
     patience: int = 3
-    """Calls in a row without a new least novelty after which the verdict is `unexplained`."""
+    """Calls in a row that came no closer after which the verdict is `unexplained`."""
+    least_fall: float = 0.01
+    """A call comes closer where the novelty, a mean rank, falls by more than this below its least; less is chance."""
     coverage: float = 0.9
     """Share of held-out sets whose truth lies within the interval of the posterior update."""
     min_radius: float = 0.1

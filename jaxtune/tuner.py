@@ -165,8 +165,8 @@ class Tuner:
             dist = carry["dist"]
             collected = self.collect(key_collect, state.policy, dist)
             gate = self.verify(key_verify, self.config, collected, measured, state.knobs)
-            better = gate.novelty < carry["least"]
-            stalled = jnp.where(better, 0, carry["stalled"] + 1)
+            closer = gate.novelty < carry["least"] - self.config.least_fall
+            stalled = jnp.where(closer, 0, carry["stalled"] + 1)
             verdict = self._judge(gate, dist, calls, stalled)
             broken = collected.trajectory.not_finite.sum() + collected.held_out.not_finite.sum()
             wider = dists.widen(dist, state.knobs.widen_factor)
@@ -175,7 +175,8 @@ class Tuner:
                 "dist": jax.tree.map(lambda new, old: jnp.where(verdict == Verdict.WIDEN, new, old), wider, dist),
                 "collected": collected,
                 "verdict": verdict,
-                "least": jnp.fmin(gate.novelty, carry["least"]),
+                # Many small falls may add up to one that counts.
+                "least": jnp.where(closer, gate.novelty, carry["least"]),
                 "stalled": stalled,
                 "verdicts": carry["verdicts"].at[calls].set(verdict),
                 "radius": carry["radius"].at[calls].set(dists.ravel(dist.radius).max()),

@@ -143,6 +143,12 @@ def test_novelty_that_never_falls_is_unexplained(play):
     not_updated(state, info)
 
 
+def test_a_fall_that_may_be_chance_brings_a_set_no_closer(play):
+    expect(play(5.0, 4.994, 4.992, 0.5)[2], Verdict.WIDEN, Verdict.WIDEN, Verdict.UNEXPLAINED)
+    # What two calls bring together counts.
+    expect(play(5.0, 4.994, 4.988, 4.98, 0.5)[2], *[Verdict.WIDEN] * 4, Verdict.ACCEPT)
+
+
 def test_patience_is_for_calls_in_a_row(play):
     _, _, info = play(5.0, 6.0, 4.0, 4.5, 0.5)
     expect(info, *[Verdict.WIDEN] * 4, Verdict.ACCEPT)
