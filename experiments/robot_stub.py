@@ -179,7 +179,7 @@ class Robot:
         tick_s = 1.0 / asked.controller.rate_hz
         self._begin(tick_s)
         per_tick = max(1, round(tick_s / _STEP_S))
-        grid = np.arange(0.0, asked.time[-1] + _STEP_S, _STEP_S)
+        grid = np.arange(asked.time[0], asked.time[-1] + _STEP_S, _STEP_S)
         enabled = asked.signals.get("enabled", np.ones(len(asked.time)))
         moved = []
         for step, row in enumerate(np.searchsorted(asked.time, grid + 1e-9, side="right") - 1):
@@ -293,6 +293,8 @@ def answer(place: Path, robot: Robot, seed: int) -> Sequence[bool]:
 def hang(place: Path, robot: Robot, seed: int) -> Sequence[bool]:
     """Plays what is in `targets` while hanging, and writes the log; which of the runs ended in a fall: none can."""
     asked = read(place / "targets", measured=False)
+    if asked.joints != constants.JOINTS:
+        raise ValueError(f"{place / 'targets'}: joints: got {asked.joints}, expected {constants.JOINTS}")
     rngs = [np.random.default_rng((seed, index)) for index in range(len(asked.runs))]
     runs = tuple(robot.play(run, rng) for run, rng in zip(asked.runs, rngs, strict=True))
     _put(replace(asked, runs=runs), place)

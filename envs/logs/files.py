@@ -142,9 +142,10 @@ def _signals(path: Path, columns: dict[str, np.ndarray], meta: Meta, measured: b
         for name, one in zip(names, values, strict=True):
             check_values(path, signal, meta.columns.get(name, name), one)
         signals[signal] = np.stack(values, axis=1) if len(names) > 1 or "." in names[0] else values[0]
-    if measured and "q" not in signals:
-        raise ValueError(f"{path}, column '{column_names('q', meta.joints)[0]}': is missing")
-    if not {"target", "tau"} & set(signals) or not (measured or "target" in signals):
+    for signal in ("q",) if measured else ("target",):
+        if signal not in signals:
+            raise ValueError(f"{path}, column '{column_names(signal, meta.joints)[0]}': is missing")
+    if not {"target", "tau"} & set(signals):
         raise ValueError(f"{path}: there is neither '{column_names('target', meta.joints)[0]}' nor 'tau'")
     for signal in ("gravity", "quat"):
         if signal in signals:

@@ -1,6 +1,7 @@
 """The stand-in robot where it hangs; its walks are in test_export.py."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -55,7 +56,8 @@ def test_joints_follow_and_speeds_are_theirs(asked):
 
 def test_what_is_late_is_what_was_sent_later(asked):
     rows = round(0.01 * 500)
-    late = played(asked, replace(EXACT, transport_s=0.01))["q"]
+    # Whenever that is.
+    late = played(replace(asked, time=asked.time + 7.0), replace(EXACT, transport_s=0.01))["q"]
     target = asked.signals["target"]
     sent = {"target": np.concatenate([np.repeat(target[:1], rows, axis=0), target[:-rows]])}
     np.testing.assert_allclose(late, played(replace(asked, signals=dict(asked.signals) | sent), EXACT)["q"], atol=1e-6)
@@ -73,6 +75,14 @@ def test_it_has_no_servo(asked):
     servo = Controller(kind="servo", rate_hz=1000.0, gains={})
     with pytest.raises(ValueError, match="run_000: controller: got servo, expected pd"):
         played(replace(asked, controller=servo), EXACT)
+
+
+def test_it_plays_no_other_robots_targets(tmp_path):
+    arm = Path(excite.__file__).parent / "arm.xml"
+    excite.main(excite.Args(out=tmp_path / "targets", robot=str(arm), runs=4, seconds=1.0))
+    with pytest.raises(ValueError, match=r"joints: got .*shoulder.*, expected .*left_abad"):
+        robot_stub.hang(tmp_path, Robot(Body(), base="fixed"), 0)
+    assert not (tmp_path / "log").exists()
 
 
 def test_targets_are_no_log(place):
