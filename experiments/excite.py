@@ -174,7 +174,7 @@ def main(args: Args) -> None:
         shutil.copy(args.robot, args.out / name)
     console.print(
         f"{len(runs)} runs of {args.seconds:g} s for {', '.join(joints)} in {args.out}: play each run's targets, and "
-        "write what was measured into the same files (q.*, and dq.* where there is a sensor)"
+        "write what was measured into the same files or copies of them (q.*, and dq.* where there is a sensor)"
     )
 
 

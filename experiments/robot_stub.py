@@ -2,8 +2,8 @@
 
 It stands in for the real one. MuJoCo C moves it, with what the learner's simulator lacks: targets arrive late, motors
 lag and give less the faster they turn, encoders are rounded, the IMU is noisy and biased, the estimate of its velocity
-drifts, its floor is another. It finds `RUN/round_*/request.json` beside an exported policy, walks with `player.py`'s
-policy, falls where it falls, and writes `RUN/round_*/log`; nothing else of it can be seen. Where it finds targets that
+drifts, its floor is another. It finds `RUN/**/round_*/request.json` beside an exported policy, walks with `player.py`'s
+policy, falls where it falls, and writes `round_*/log`; nothing else of it can be seen. Where it finds targets that
 `experiments.excite` wrote, `RUN/**/hung/targets`, it hangs, plays them and writes `hung/log`.
 """
 
@@ -65,10 +65,10 @@ class Body:
 
 @dataclass(frozen=True, kw_only=True)
 class Args:
-    """Plays the robot: walks with the policies that a folder holds and writes logs."""
+    """Plays the robot: walks with the policies that a folder holds, hangs where it holds targets, and writes logs."""
 
     folder: Path
-    """Folder of requests, `round_*/request.json` beside `round_*/policy`."""
+    """Folder of requests, `round_*/request.json` beside `round_*/policy`, and of targets, `hung/targets`."""
     body: Body = field(default_factory=Body)
     """What the robot is."""
     idle_s: float = 3600.0
@@ -82,11 +82,11 @@ class Robot:
 
     Args:
       body: what it is.
-      base: free, or fixed where it hangs.
+      hangs: whether it hangs, to `play`; or it stands, to `walk`.
     """
 
-    def __init__(self, body: Body, base: str = "free"):
-        self.body, self._free = body, base == "free"
+    def __init__(self, body: Body, hangs: bool = False):
+        self.body = body
         spec = mujoco.MjSpec.from_file(str(constants.MODEL_PATH))
         for link in spec.bodies[1:]:
             for geom in link.geoms:
@@ -105,7 +105,7 @@ class Robot:
                 "torque_limit_nm": model.actuator_forcerange[:, 1].copy(),
             },
         )
-        model = model if self._free else hung(spec)
+        model = hung(spec) if hangs else model
         model.opt.timestep = _STEP_S
         model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         model.opt.iterations, model.opt.ls_iterations = 100, 50
@@ -170,15 +170,18 @@ class Robot:
         """Plays a run's targets while it hangs, from rest at the first of them.
 
         Raises:
-          ValueError: the run's controller is none that it has.
+          ValueError: the run's controller is none that it can have.
         """
-        if asked.controller.kind != "pd":
-            raise ValueError(f"{asked.name}: controller: got {asked.controller.kind}, expected pd")
+        tick_s = 1.0 / asked.controller.rate_hz
+        per_tick = round(tick_s / _STEP_S)
+        if asked.controller.kind != "pd" or not np.isclose(per_tick * _STEP_S, tick_s):
+            raise ValueError(
+                f"{asked.name}: controller: got {asked.controller.kind} at {asked.controller.rate_hz:g} Hz, expected "
+                f"pd with ticks that are multiples of {_STEP_S} s"
+            )
         self.data = mujoco.MjData(self.model)
         self.data.qpos[self._qpos] = asked.signals["target"][0]
-        tick_s = 1.0 / asked.controller.rate_hz
         self._begin(tick_s)
-        per_tick = max(1, round(tick_s / _STEP_S))
         grid = np.arange(asked.time[0], asked.time[-1] + _STEP_S, _STEP_S)
         enabled = asked.signals.get("enabled", np.ones(len(asked.time)))
         moved = []
@@ -290,15 +293,15 @@ def answer(place: Path, robot: Robot, seed: int) -> Sequence[bool]:
     return [fell for _, fell in walked]
 
 
-def hang(place: Path, robot: Robot, seed: int) -> Sequence[bool]:
-    """Plays what is in `targets` while hanging, and writes the log; which of the runs ended in a fall: none can."""
-    asked = read(place / "targets", measured=False)
-    if asked.joints != constants.JOINTS:
-        raise ValueError(f"{place / 'targets'}: joints: got {asked.joints}, expected {constants.JOINTS}")
-    rngs = [np.random.default_rng((seed, index)) for index in range(len(asked.runs))]
-    runs = tuple(robot.play(run, rng) for run, rng in zip(asked.runs, rngs, strict=True))
-    _put(replace(asked, runs=runs), place)
-    return [False] * len(runs)
+def hang(place: Path, robot: Robot, seed: int) -> None:
+    """Plays what is in `targets` while hanging, and writes the log."""
+    targets = read(place / "targets", measured=False)
+    for name, expected in {"joints": constants.JOINTS, "base": "fixed"}.items():
+        if getattr(targets, name) != expected:
+            raise ValueError(f"{place / 'targets'}: {name}: got {getattr(targets, name)}, expected {expected}")
+    rngs = [np.random.default_rng((seed, index)) for index in range(len(targets.runs))]
+    runs = tuple(robot.play(run, rng) for run, rng in zip(targets.runs, rngs, strict=True))
+    _put(replace(targets, runs=runs), place)
 
 
 def _put(log: Log, place: Path) -> None:
@@ -311,17 +314,17 @@ def _put(log: Log, place: Path) -> None:
 
 def main(args: Args) -> None:
     """Answers requests until none has come for a while."""
-    walks, hangs = Robot(args.body), Robot(args.body, base="fixed")
+    stands, hangs = Robot(args.body), Robot(args.body, hangs=True)
     last = time.monotonic()
     while time.monotonic() - last < args.idle_s:
-        asked = [(path.parent, answer, walks) for path in args.folder.glob("**/round_*/request.json")]
-        asked += [(path.parent.parent, hang, hangs) for path in args.folder.glob("**/hung/targets/meta.yaml")]
-        for place, does, robot in sorted(asked, key=lambda one: one[0]):
+        jobs = [(path.parent, answer, stands) for path in args.folder.glob("**/round_*/request.json")]
+        jobs += [(path.parent.parent, hang, hangs) for path in args.folder.glob("**/hung/targets/meta.yaml")]
+        for place, does, robot in sorted(jobs, key=lambda job: job[0]):
             if (place / "log").exists() or (place / "refused.txt").exists():
                 continue
             try:
-                fell = does(place, robot, args.seed)
-                console.print(f"{place}: {len(fell)} runs, {sum(fell)} falls")
+                does(place, robot, args.seed)
+                console.print(f"{place}: answered")
             except (ValueError, OSError) as error:
                 if (place / "log").exists():  # another process was faster
                     continue

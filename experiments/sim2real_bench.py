@@ -52,7 +52,7 @@ class Args:
     rounds: int = 5
     """Rounds of every method."""
     mass: float = 0.5
-    """Where the learner's masses start, as a multiple of the robot's."""
+    """Where the learner's masses start, as a multiple of the robot's, or of what a corrected model says these are."""
     walk_s: float = 10.0
     """Length of a walk."""
     evaluation: int = 20
@@ -186,7 +186,9 @@ def main(args: Args) -> None:
 
 def show(args: Args, results: dict[str, list[dict]]) -> None:
     """Prints a row for every method: means over seeds."""
-    table = Table(title=f"masses at {args.mass:g}X, mean over {len(args.seeds)} seed(s), {args.evaluation} walks each")
+    model = f"in {args.model}, " if args.model else ""
+    title = f"{model}masses at {args.mass:g}X, mean over {len(args.seeds)} seed(s), {args.evaluation} walks each"
+    table = Table(title=title)
     for column in ("method", "return", "share that falls", "power, W", "masses at the end", "robot's walks", "falls"):
         table.add_column(column, justify="left" if column == "method" else "right")
     for name, runs in results.items():

@@ -35,7 +35,9 @@ class TunerConfig:
     patience: int = 3
     """Calls in a row that came no closer after which the verdict is `unexplained`."""
     least_fall: float = 0.01
-    """A call comes closer where the novelty, a mean rank, falls by more than this below its least; less is chance."""
+    """Fall of the novelty, a mean rank, since the last call that came closer, above which another one does. Chosen: the
+    score of one set differs by about as much from call to call, and what falls by less is not on its way to be covered.
+    """
     coverage: float = 0.9
     """Share of held-out sets whose truth lies within the interval of the posterior update."""
     min_radius: float = 0.1

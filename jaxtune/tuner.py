@@ -165,7 +165,7 @@ class Tuner:
             dist = carry["dist"]
             collected = self.collect(key_collect, state.policy, dist)
             gate = self.verify(key_verify, self.config, collected, measured, state.knobs)
-            closer = gate.novelty < carry["least"] - self.config.least_fall
+            closer = gate.novelty < carry["closest"] - self.config.least_fall
             stalled = jnp.where(closer, 0, carry["stalled"] + 1)
             verdict = self._judge(gate, dist, calls, stalled)
             broken = collected.trajectory.not_finite.sum() + collected.held_out.not_finite.sum()
@@ -176,7 +176,7 @@ class Tuner:
                 "collected": collected,
                 "verdict": verdict,
                 # Many small falls may add up to one that counts.
-                "least": jnp.where(closer, gate.novelty, carry["least"]),
+                "closest": jnp.where(closer, gate.novelty, carry["closest"]),
                 "stalled": stalled,
                 "verdicts": carry["verdicts"].at[calls].set(verdict),
                 "radius": carry["radius"].at[calls].set(dists.ravel(dist.radius).max()),
@@ -193,7 +193,7 @@ class Tuner:
             "dist": state.dist,
             "collected": jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes),
             "verdict": jnp.asarray(Verdict.WIDEN, int),
-            "least": jnp.asarray(jnp.inf),
+            "closest": jnp.asarray(jnp.inf),
             "stalled": jnp.zeros((), int),
             "not_finite": jnp.zeros((), int),
             **no_gate_log(self.config),

@@ -56,7 +56,7 @@ def read(folder: Path, measured: bool = True) -> Log:
         rate_hz=meta.rate_hz,
         joints=meta.joints,
         policy=meta.policy,
-        runs=tuple(_run(path, meta, measured) for path in paths),
+        runs=tuple(_run(path, meta, "q" if measured else "target") for path in paths),
     )
 
 
@@ -94,7 +94,10 @@ def write(log: Log, folder: Path, suffix: str = ".csv") -> None:
             names = column_names(signal, log.joints)
             columns |= dict(zip(names, values.reshape(len(run.time), -1).T, strict=True))
         WRITERS[suffix](folder / f"{run.name}{suffix}", columns)
-    (folder / "meta.yaml").write_text(yaml.safe_dump(meta, sort_keys=False))
+    # Who finds it finds it whole, and all runs.
+    draft = folder / "meta.yaml.partial"
+    draft.write_text(yaml.safe_dump(meta, sort_keys=False))
+    draft.rename(folder / "meta.yaml")
 
 
 def _as_meta(controller: Controller) -> dict:
@@ -102,7 +105,7 @@ def _as_meta(controller: Controller) -> dict:
     return {"type": controller.kind, "rate_hz": controller.rate_hz, **gains}
 
 
-def _run(path: Path, meta: Meta, measured: bool) -> Run:
+def _run(path: Path, meta: Meta, needed: str) -> Run:
     columns = read_bag(path, meta.columns) if is_bag(path) else READERS[path.suffix](path)
     for name, values in columns.items():
         refuse_first(path, name, values, ~np.isfinite(values), "a finite number")
@@ -114,7 +117,7 @@ def _run(path: Path, meta: Meta, measured: bool) -> Run:
     rate = 1.0 / np.median(np.diff(time))
     if not 1 / _RATE_RATIO <= rate / meta.rate_hz <= _RATE_RATIO:
         raise ValueError(f"{path}, column 't': got {rate:.6g} rows a second, expected rate_hz, {meta.rate_hz:g}")
-    signals = _signals(path, columns, meta, measured)
+    signals = _signals(path, columns, meta, needed)
     said = meta.runs.get(path.stem, {"controller": meta.controller})
     return Run(
         name=path.stem,
@@ -127,7 +130,7 @@ def _run(path: Path, meta: Meta, measured: bool) -> Run:
     )
 
 
-def _signals(path: Path, columns: dict[str, np.ndarray], meta: Meta, measured: bool) -> dict[str, np.ndarray]:
+def _signals(path: Path, columns: dict[str, np.ndarray], meta: Meta, needed: str) -> dict[str, np.ndarray]:
     """Takes the signals out of the columns, in our units."""
     signals = {}
     for signal in (*JOINT_SIGNALS, *VECTOR_SIGNALS, *SCALAR_SIGNALS):
@@ -142,9 +145,8 @@ def _signals(path: Path, columns: dict[str, np.ndarray], meta: Meta, measured: b
         for name, one in zip(names, values, strict=True):
             check_values(path, signal, meta.columns.get(name, name), one)
         signals[signal] = np.stack(values, axis=1) if len(names) > 1 or "." in names[0] else values[0]
-    for signal in ("q",) if measured else ("target",):
-        if signal not in signals:
-            raise ValueError(f"{path}, column '{column_names(signal, meta.joints)[0]}': is missing")
+    if needed not in signals:
+        raise ValueError(f"{path}, column '{column_names(needed, meta.joints)[0]}': is missing")
     if not {"target", "tau"} & set(signals):
         raise ValueError(f"{path}: there is neither '{column_names('target', meta.joints)[0]}' nor 'tau'")
     for signal in ("gravity", "quat"):

@@ -29,18 +29,36 @@ def asked(place):
 
 
 def played(asked, body):
-    return Robot(body, base="fixed").play(asked, np.random.default_rng(0)).signals
+    return Robot(body, hangs=True).play(asked, np.random.default_rng(0)).signals
 
 
-def test_it_answers_with_a_log(place):
-    assert robot_stub.hang(place, Robot(Body(), base="fixed"), 0) == [False] * 4
+def test_it_finds_targets_and_answers_with_a_log(place):
+    robot_stub.main(robot_stub.Args(folder=place.parent, idle_s=1.0))
     asked, log = logs.read(place / "targets", measured=False), logs.read(place / "log")
     assert log.base == "fixed"
     assert [run.split for run in log.runs] == [run.split for run in asked.runs]
-    for one, other in zip(asked.runs, log.runs, strict=True):
+    for index, (one, other) in enumerate(zip(asked.runs, log.runs, strict=True)):
+        # It is the same robot whenever it is asked, with noise of its own in every run.
+        again = Robot(Body(), hangs=True).play(one, np.random.default_rng((0, index)))
         np.testing.assert_allclose(other.time, one.time)
-        np.testing.assert_allclose(other.signals["target"], one.signals["target"], atol=1e-6)
-        assert other.signals["q"].shape == other.signals["dq"].shape == one.signals["target"].shape
+        for signal in ("q", "dq", "target", "enabled"):
+            np.testing.assert_allclose(other.signals[signal], again.signals[signal], atol=1e-9)
+
+
+def test_its_sensors_are_those_of_its_walks(asked):
+    body = Body()
+    signals = played(asked, body)
+    steps = signals["q"] / body.encoder_rad
+    np.testing.assert_allclose(steps, np.round(steps), atol=1e-6)
+    quiet = played(asked, replace(body, velocity_noise_rad_s=0.0))
+    # Both come to the same joints, but for what noise does through the controller.
+    assert 0.8 * body.velocity_noise_rad_s < np.std(signals["dq"] - quiet["dq"]) < 1.5 * body.velocity_noise_rad_s
+
+
+def test_its_motors_are_those_of_its_walks(asked):
+    exact = played(asked, EXACT)["q"]
+    assert np.abs(played(asked, replace(EXACT, motor_lag_s=0.02))["q"] - exact).max() > 0.02
+    assert np.abs(played(asked, replace(EXACT, no_load_rad_s=1.0))["q"] - exact).max() > 0.02
 
 
 def test_joints_follow_and_speeds_are_theirs(asked):
@@ -71,20 +89,29 @@ def test_motors_that_are_off_hold_nothing(asked):
     assert np.abs(signals["q"][-1] - signals["q"][0]).max() > 0.1
 
 
-def test_it_has_no_servo(asked):
-    servo = Controller(kind="servo", rate_hz=1000.0, gains={})
-    with pytest.raises(ValueError, match="run_000: controller: got servo, expected pd"):
-        played(replace(asked, controller=servo), EXACT)
+def test_it_has_no_other_controller(asked):
+    for kind, rate in (("servo", 1000.0), ("pd", 300.0)):
+        other = Controller(kind=kind, rate_hz=rate, gains=asked.controller.gains)
+        with pytest.raises(ValueError, match=rf"run_000: controller: got {kind} at {rate:g} Hz, expected pd"):
+            played(replace(asked, controller=other), EXACT)
 
 
-def test_it_plays_no_other_robots_targets(tmp_path):
-    arm = Path(excite.__file__).parent / "arm.xml"
-    excite.main(excite.Args(out=tmp_path / "targets", robot=str(arm), runs=4, seconds=1.0))
-    with pytest.raises(ValueError, match=r"joints: got .*shoulder.*, expected .*left_abad"):
-        robot_stub.hang(tmp_path, Robot(Body(), base="fixed"), 0)
-    assert not (tmp_path / "log").exists()
+def test_it_refuses_other_robots_targets(tmp_path):
+    arm, place = Path(excite.__file__).parent / "arm.xml", tmp_path / "hung"
+    excite.main(excite.Args(out=place / "targets", robot=str(arm), runs=4, seconds=1.0))
+    robot_stub.main(robot_stub.Args(folder=tmp_path, idle_s=1.0))
+    assert "joints: got ('shoulder', 'elbow'), expected ('left_abad'" in (place / "refused.txt").read_text()
+    assert not (place / "log").exists()
 
 
 def test_targets_are_no_log(place):
     with pytest.raises(ValueError, match=r"q\.left_abad"):
         logs.read(place / "targets")
+
+
+def test_a_log_without_targets_cannot_be_played(place, tmp_path):
+    measured = logs.read(place / "targets", measured=False)
+    runs = [replace(run, signals={"q": run.signals["target"], "tau": run.signals["target"]}) for run in measured.runs]
+    logs.write(replace(measured, runs=tuple(runs)), tmp_path / "log")
+    with pytest.raises(ValueError, match=r"target\.left_abad"):
+        logs.read(tmp_path / "log", measured=False)

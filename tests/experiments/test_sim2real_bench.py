@@ -1,0 +1,62 @@
+"""The benchmark with the stand-in robot, and what a corrected model is worth to it."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import experiments
+from experiments import checkpoint, sim2real, sim2real_bench
+from experiments.sim2real_bench import Args, asked, evaluate, robot
+
+PACKAGE = Path(experiments.__file__).parent
+# What discovery wrote after the stand-in had hung.
+FOUND = PACKAGE / "results" / "stand_in" / "found" / "model"
+
+
+class Asked(Exception):
+    """Enough is known."""
+
+
+def test_every_method_learns_in_the_model_that_was_found_from_a_policy_of_the_nominal_one(tmp_path, monkeypatch):
+    args = Args(out=tmp_path, preset="smoke", walk_s=0.8, model=FOUND)
+    assert {asked(args, name, 0).model for name in sim2real_bench.METHODS} == {FOUND}
+    prepared = []
+
+    def prepare(args, learner, seed):
+        prepared.append(learner)
+        raise Asked
+
+    # Flags are for a process of its own.
+    monkeypatch.setattr(checkpoint, "set_up_compiler", lambda flags: None)
+    monkeypatch.setattr(sim2real, "simulator", lambda args: args.model)
+    monkeypatch.setattr(sim2real_bench, "prepare", prepare)
+    for model in (FOUND, None):
+        with pytest.raises(Asked):
+            sim2real_bench.main(Args(out=tmp_path / str(model is None), preset="smoke", walk_s=0.8, model=model))
+    assert prepared == [None, None]
+
+
+def learnt(out, *options):
+    """The policy that a round leaves, trained on from the one that ships, masses as they are."""
+    command = [sys.executable, "-m", "experiments.sim2real", "--out", str(out), "--rounds", "1", "--force"]
+    command += ["--method", "dr", "--radius", "0.1", "--timeout-s", "120", *options]
+    # Tests compile in haste, which is not worth it here.
+    environment = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
+    with robot(out):
+        subprocess.run(command, cwd=PACKAGE.parent, env=environment, check=True)
+    return out / "round_001" / "learner"
+
+
+@pytest.mark.slow
+def test_a_policy_trained_in_the_model_that_was_found_walks_better(tmp_path):
+    args = Args(out=tmp_path, evaluation=40)
+    learner = sim2real.simulator(asked(args, "ours", 0))
+    without = evaluate(args, learner, learnt(tmp_path / "without"))
+    with_it = evaluate(args, learner, learnt(tmp_path / "with", "--model", str(FOUND)))
+    print(f"without: {without}\nwith: {with_it}")
+    assert with_it["fall_rate"] <= 0.1
+    assert without["fall_rate"] >= with_it["fall_rate"] + 0.25
+    assert with_it["return"] > 1.2 * without["return"]
