@@ -92,6 +92,9 @@ def _read_npz(path: Path) -> dict[str, np.ndarray]:
     except Exception as error:  # a damaged archive fails in many ways
         raise ValueError(f"{path}: {type(error).__name__}: {error}") from error
     for name, values in columns.items():
+        # What is in an archive and is no array comes as bytes.
+        if not isinstance(values, np.ndarray):
+            raise ValueError(f"{path}, column '{name}': got {type(values).__name__}, expected an array")
         if values.ndim != 1 or values.dtype.kind not in "fiub":
             raise ValueError(
                 f"{path}, column '{name}': got shape {values.shape} of {values.dtype}, expected one row of numbers"

@@ -1,6 +1,7 @@
 """Logs: what was written is read, in the model's units and axes; what is damaged is refused by file, row and column."""
 
 import dataclasses
+import zipfile
 
 import numpy as np
 import pytest
@@ -329,3 +330,11 @@ def test_splits_are_what_the_log_says_where_it_does(tmp_path):
 def test_too_few_conditions_to_split_are_named(tmp_path):
     with pytest.raises(ValueError, match=r"2 run\(s\) of conditions a, b, expected three"):
         logs.splits(many(tmp_path, [{"condition": "a"}, {"condition": "b"}]))
+
+
+def test_what_is_no_array_in_an_archive_is_refused(tmp_path):
+    put(tmp_path / "log", name="run_000.npz")
+    with zipfile.ZipFile(tmp_path / "log" / "run_000.npz", "a") as archive:
+        archive.writestr("notes.npy", "walked well")
+    with pytest.raises(ValueError, match=r"run_000\.npz, column 'notes': got bytes, expected an array"):
+        logs.read(tmp_path / "log")
