@@ -1,66 +1,26 @@
 """A robot that answers only through files: `python -m experiments.robot_stub --folder RUN`.
 
-It stands in for the real one. MuJoCo C moves it, with what the learner's simulator lacks: targets arrive late, motors
-lag and give less the faster they turn, encoders are rounded, the IMU is noisy and biased, the estimate of its velocity
-drifts, its floor is another. It finds `RUN/**/round_*/request.json` beside an exported policy, walks with `player.py`'s
-policy, falls where it falls, and writes `round_*/log`; nothing else of it can be seen. Where it finds targets that
-`experiments.excite` wrote, `RUN/**/hung/targets`, it hangs, plays them and writes `hung/log`.
+It stands in for the real one; what its body is like says `robot_body`. It finds `RUN/**/round_*/request.json` beside an
+exported policy, walks with `player.py`'s policy, falls where it falls, and writes `round_*/log`; nothing else of it can
+be seen. Where it finds targets that `experiments.excite` wrote, `RUN/**/hung/targets`, it hangs, plays them and writes
+`hung/log`.
 """
 
 import json
 import os
 import shutil
 import time
-from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-import mujoco
 import numpy as np
 
-from envs.biteno import TaskConfig, constants, env
-from envs.logs import Controller, Log, Run, read, write
-from envs.rig import hung
+from envs.biteno import constants
+from envs.logs import Log, read, write
 from experiments.player import Player
+from experiments.robot_body import ROW_S, Body, Robot
 from experiments.train import console, run
-
-_STEP_S = 0.0005
-_TICK_S = 0.001  # of the joints' controllers
-_ROW_S = 0.002
-_TASK = TaskConfig()  # what it is asked to do
-
-
-@dataclass(frozen=True, kw_only=True)
-class Body:
-    """What the robot is; multipliers of the nominal model where no unit says otherwise."""
-
-    trunk_mass: float = 1.0
-    """Mass of the trunk."""
-    leg_mass: float = 1.0
-    """Mass of the six moving links."""
-    foot_friction: float = 0.75
-    """Friction of the feet."""
-    transport_s: float = 0.01
-    """How late targets arrive."""
-    motor_lag_s: float = 0.004
-    """Time constant of the torque."""
-    no_load_rad_s: float = 30.0
-    """Speed at which a motor gives nothing."""
-    torque_scale: float = 1.0
-    """Torque for the same current."""
-    encoder_rad: float = 2 * np.pi / 2**14
-    """Step of the encoders."""
-    velocity_noise_rad_s: float = 0.05
-    """Of the joints' velocities."""
-    gyro_noise_rad_s: float = 0.02
-    """Of the gyro."""
-    gyro_bias_rad_s: float = 0.01
-    """Standard deviation of what it says at rest, drawn for every run."""
-    tilt_bias_rad: float = 0.01
-    """Standard deviation of the error of the estimated direction of gravity, drawn for every run."""
-    drift_mps: float = 0.05
-    """Standard deviation of the velocity estimate's wandering error."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,200 +37,6 @@ class Args:
     """Of its noise and, with the request's own, of its commands."""
 
 
-class Robot:
-    """The body, one run at a time.
-
-    Args:
-      body: what it is.
-      hangs: whether it hangs, to `play`; or it stands, to `walk`.
-    """
-
-    def __init__(self, body: Body, hangs: bool = False):
-        self.body = body
-        spec = mujoco.MjSpec.from_file(str(constants.MODEL_PATH))
-        for link in spec.bodies[1:]:
-            for geom in link.geoms:
-                geom.mass *= body.trunk_mass if link.name == "trunk" else body.leg_mass
-        for foot in constants.FEET:
-            friction = spec.geom(foot).friction
-            spec.geom(foot).friction = [friction[0] * body.foot_friction, *friction[1:]]
-        model = spec.compile()
-        # What it walks with; whoever hangs it says with what.
-        self.controller = Controller(
-            kind="pd",
-            rate_hz=1.0 / _TICK_S,
-            gains={
-                "kp": model.actuator_gainprm[:, 0].copy(),
-                "kd": -model.actuator_biasprm[:, 2].copy(),
-                "torque_limit_nm": model.actuator_forcerange[:, 1].copy(),
-            },
-        )
-        model = hung(spec) if hangs else model
-        model.opt.timestep = _STEP_S
-        model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-        model.opt.iterations, model.opt.ls_iterations = 100, 50
-        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION
-        self.model = model
-        joints = [model.joint(name) for name in constants.JOINTS]
-        self._qpos = np.array([joint.qposadr[0] for joint in joints])
-        self._dof = np.array([joint.dofadr[0] for joint in joints])
-        self._feet = [model.geom(foot).id for foot in constants.FEET]
-
-    def walk(self, name: str, player: Player, seconds: float, rng: np.random.Generator) -> tuple[Run, bool]:
-        """Walks from standing until the time is over or the robot has fallen.
-
-        Returns:
-          The run, and whether it fell.
-        """
-        self._stand_up(rng)
-        player.reset(rng.uniform())
-        per_tick, per_row = round(_TICK_S / _STEP_S), round(_ROW_S / _STEP_S)
-        per_policy = round(constants.POLICY_DT_S / _STEP_S)
-        command, rows, fell = _command(rng), [], False
-        for step in range(round(seconds / _STEP_S)):
-            if step % round(_TASK.command_s / _STEP_S) == 0 and step:
-                command = _command(rng)
-            if step % per_tick == 0:
-                seen = self._look(rng)
-            if step % per_policy == 0:
-                if step:
-                    player.tick()
-                target = player.step(
-                    velocity=seen["vel"],
-                    command=command,
-                    gyro=seen["gyro"],
-                    gravity=seen["gravity"],
-                    joint=seen["q"],
-                    joint_velocity=seen["dq"],
-                )
-            if step % per_tick == 0:
-                self._line.append(target)
-                asked = self._asked(self._line[0], seen, self.controller)
-            if step % per_row == 0:
-                said = {"target": target, "action": player.action, "phase": player.phase, "cmd": command}
-                rows.append({"tau": self._torque.copy(), "enabled": 1.0, "contact": self._contact()} | seen | said)
-            self._push(asked)
-            mujoco.mj_step(self.model, self.data)
-            if self._fallen():
-                fell = True
-                rows.append(rows[-1] | self._look(rng) | {"enabled": 0.0})
-                break
-        signals = {signal: np.stack([row[signal] for row in rows]).astype(float) for signal in rows[0]}
-        walked = Run(
-            name=name,
-            condition="walk",
-            split=None,
-            controller=self.controller,
-            time=_ROW_S * np.arange(len(rows)),
-            signals=signals,
-        )
-        return walked, fell
-
-    def play(self, asked: Run, rng: np.random.Generator) -> Run:
-        """Plays a run's targets while it hangs, from rest at the first of them.
-
-        Raises:
-          ValueError: the run's controller is none that it can have.
-        """
-        tick_s = 1.0 / asked.controller.rate_hz
-        per_tick = round(tick_s / _STEP_S)
-        if asked.controller.kind != "pd" or not np.isclose(per_tick * _STEP_S, tick_s):
-            raise ValueError(
-                f"{asked.name}: controller: got {asked.controller.kind} at {asked.controller.rate_hz:g} Hz, expected "
-                f"pd with ticks that are multiples of {_STEP_S} s"
-            )
-        self.data = mujoco.MjData(self.model)
-        self.data.qpos[self._qpos] = asked.signals["target"][0]
-        self._begin(tick_s)
-        grid = np.arange(asked.time[0], asked.time[-1] + _STEP_S, _STEP_S)
-        enabled = asked.signals.get("enabled", np.ones(len(asked.time)))
-        moved = []
-        for step, row in enumerate(np.searchsorted(asked.time, grid + 1e-9, side="right") - 1):
-            moved.append(np.stack([self.data.qpos[self._qpos], self.data.qvel[self._dof]]))
-            if step % per_tick == 0:
-                self._line.append(asked.signals["target"][row])
-                torque = enabled[row] * self._asked(self._line[0], self._joints(*moved[-1], rng), asked.controller)
-            self._push(torque)
-            mujoco.mj_step(self.model, self.data)
-        moved = np.stack(moved, axis=1)  # [2, steps, joints]
-        position, speed = (np.stack([np.interp(asked.time, grid, joint) for joint in one.T], axis=1) for one in moved)
-        return replace(asked, signals=dict(asked.signals) | self._joints(position, speed, rng))
-
-    def _begin(self, tick_s: float) -> None:
-        """At rest where it is, the targets on their way those of where it is."""
-        mujoco.mj_forward(self.model, self.data)
-        late = round(self.body.transport_s / tick_s)
-        self._torque = np.zeros(len(self._qpos))
-        self._line = deque([self.data.qpos[self._qpos].copy()] * (1 + late), maxlen=1 + late)
-
-    def _stand_up(self, rng: np.random.Generator) -> None:
-        self.data = mujoco.MjData(self.model)
-        mujoco.mj_resetDataKeyframe(self.model, self.data, self.model.keyframe("home").id)
-        self.data.qpos[self._qpos] += rng.uniform(-0.1, 0.1, len(self._qpos))
-        self._begin(_TICK_S)
-        body = self.body
-        self._bias = {
-            "gyro": body.gyro_bias_rad_s * rng.standard_normal(3),
-            "tilt": body.tilt_bias_rad * rng.standard_normal(3),
-            "vel": body.drift_mps * rng.standard_normal(3),
-        }
-
-    def _look(self, rng: np.random.Generator) -> dict[str, np.ndarray]:
-        """What the sensors say."""
-        body, data = self.body, self.data
-        turn = np.zeros(9)
-        mujoco.mju_quat2Mat(turn, data.qpos[3:7])
-        into_body = turn.reshape(3, 3).T
-        # The error of the velocity estimate wanders over seconds.
-        stays = np.exp(-_TICK_S / 2.0)
-        wander = body.drift_mps * np.sqrt(1 - stays**2) * rng.standard_normal(3)
-        self._bias["vel"] = stays * self._bias["vel"] + wander
-        gravity = into_body @ np.array([0.0, 0.0, -1.0])
-        gravity = gravity + np.cross(self._bias["tilt"], gravity)
-        return self._joints(data.qpos[self._qpos], data.qvel[self._dof], rng) | {
-            "gyro": data.qvel[3:6] + self._bias["gyro"] + body.gyro_noise_rad_s * rng.standard_normal(3),
-            "gravity": gravity / np.linalg.norm(gravity),
-            "vel": into_body @ data.qvel[:3] + self._bias["vel"],
-        }
-
-    def _joints(self, position: np.ndarray, speed: np.ndarray, rng: np.random.Generator) -> dict[str, np.ndarray]:
-        body = self.body
-        return {
-            "q": np.round(position / body.encoder_rad) * body.encoder_rad,
-            "dq": speed + body.velocity_noise_rad_s * rng.standard_normal(speed.shape),
-        }
-
-    @staticmethod
-    def _asked(target: np.ndarray, seen: dict[str, np.ndarray], controller: Controller) -> np.ndarray:
-        gains = controller.gains
-        torque = gains["kp"] * (target - seen["q"]) - gains["kd"] * seen["dq"]
-        return np.clip(torque, -gains["torque_limit_nm"], gains["torque_limit_nm"])
-
-    def _push(self, asked: np.ndarray) -> None:
-        body, speed = self.body, self.data.qvel[self._dof]
-        share = 1.0 - np.exp(-_STEP_S / max(body.motor_lag_s, 1e-9))
-        self._torque += share * (body.torque_scale * asked - self._torque)
-        limit = self.controller.gains["torque_limit_nm"]
-        drop = limit / body.no_load_rad_s * speed
-        self._torque = np.clip(self._torque, -limit - drop, limit - drop)
-        self.data.qfrc_applied[self._dof] = self._torque
-
-    def _contact(self) -> np.ndarray:
-        touching = {int(geom) for pair in self.data.contact.geom for geom in pair}
-        return np.array([float(foot in touching) for foot in self._feet])
-
-    def _fallen(self) -> bool:
-        _, x, y, _ = self.data.qpos[3:7]
-        gravity = np.array([0.0, 0.0, 2 * (x * x + y * y) - 1])
-        return bool(env.fallen(gravity, self.data.qpos[2])) or not np.isfinite(self.data.qpos).all()
-
-
-def _command(rng: np.random.Generator) -> np.ndarray:
-    """Forward in m/s, sideways in m/s, turning in rad/s."""
-    command = rng.uniform(-1, 1, 3) * _TASK.command_max
-    return np.zeros(3) if rng.uniform() < _TASK.zero_command_share else command
-
-
 def answer(place: Path, robot: Robot, seed: int) -> Sequence[bool]:
     """Walks as a request asks, and writes the log; which of the runs ended in a fall."""
     request = json.loads((place / "request.json").read_text())
@@ -284,7 +50,7 @@ def answer(place: Path, robot: Robot, seed: int) -> Sequence[bool]:
     log = Log(
         robot=meta["robot"],
         base="free",
-        rate_hz=1.0 / _ROW_S,
+        rate_hz=1.0 / ROW_S,
         joints=tuple(meta["joints"]),
         policy={name: meta[name] for name in ("rate_hz", "action_scale", "base")},
         runs=tuple(run for run, _ in walked),

@@ -24,8 +24,8 @@ from experiments import checkpoint, export, plots, sim2real
 from experiments.checkpoint import write_json
 from experiments.config import preset
 from experiments.loop import walked
+from experiments.robot_body import Body
 from experiments.robot_folder import request, wait
-from experiments.robot_stub import Body
 from experiments.rounds import Simulator, Terms
 from experiments.train import console, policy_config, run, starting_policy
 from jaxtune.tuner import knobs

@@ -19,6 +19,7 @@ from experiments import export, robot_stub
 from experiments.config import preset
 from experiments.loop import Loop
 from experiments.player import Player
+from experiments.robot_body import Body, Robot
 from experiments.train import starting_policy
 
 
@@ -130,7 +131,7 @@ def test_a_robot_needs_numpy_alone(folder):
     assert np.abs(np.array(json.loads(done.stdout)) - constants.STAND_RAD).max() < 0.6
 
 
-IDEAL = robot_stub.Body(
+IDEAL = Body(
     foot_friction=1.0,
     transport_s=0.0,
     motor_lag_s=0.0005,
@@ -149,7 +150,7 @@ def asked(folder, place, body, episodes=2, seconds=4.0):
     place.mkdir()
     (place / "policy").symlink_to(folder)
     (place / "request.json").write_text(json.dumps({"episodes": episodes, "seconds": seconds, "seed": 0}))
-    falls = robot_stub.answer(place, robot_stub.Robot(body), seed=0)
+    falls = robot_stub.answer(place, Robot(body), seed=0)
     return falls, logs.read(place / "log")
 
 

@@ -20,6 +20,7 @@ from experiments import (
     sim2real_bench,
     sim2real_report,
 )
+from experiments.robot_body import Body, Robot
 from experiments.rounds import Run, Terms
 from experiments.train import starting_policy
 
@@ -183,7 +184,7 @@ def learner():
 @pytest.fixture
 def answered(monkeypatch):
     """A robot that answers at once, in this process."""
-    robot = robot_stub.Robot(robot_stub.Body())
+    robot = Robot(Body())
 
     def wait(place, timeout_s):
         if not (place / "log").exists():
