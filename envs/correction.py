@@ -1,5 +1,6 @@
 """A corrected model as it lies in a folder: an MJCF, and a JSON of the effects that MuJoCo has no form for."""
 
+import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -21,6 +22,12 @@ class Correction:
     """Of the MJCF."""
     effects: Mapping[str, Mapping[str, Mapping[str, float]]]
     """Physical values by effect, place and parameter, of what MuJoCo has no form for."""
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of what it says, wherever it lies."""
+        said = self.path.read_bytes() + json.dumps(self.effects, sort_keys=True).encode()
+        return hashlib.sha256(said).hexdigest()
 
     @property
     def rows(self) -> tuple[Effect, ...]:

@@ -82,7 +82,7 @@ def targets(args: Args) -> dict:
         try:
             play = loop.play(make(loop.robot, domain.nominal(loop.entries)))
         except ValueError as error:
-            console.print(f"left out: {error}")
+            console.print(f"left out: {error}", markup=False)
             continue
         seconds = []
         for _ in range(2):

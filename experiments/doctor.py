@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from rich.markup import escape
 from rich.table import Table
 
 from envs import models
@@ -32,12 +33,14 @@ def examine(log: Log) -> dict[str, list[Finding]]:
 
 
 def summary(found: dict[str, Sequence[Finding]]) -> list[tuple[Finding, list[str]]]:
-    """Every suspicion once, and the runs that share it, the most common first."""
-    shared: dict[tuple, tuple[Finding, list[str]]] = {}
+    """Every suspicion once, in the words of its first finding, and the runs that share it, the most common first."""
+    shared: dict[tuple, tuple[Finding, dict[str, int]]] = {}
     for name, findings in found.items():
         for finding in findings:
-            shared.setdefault((finding.kind, finding.signal, finding.joints), (finding, []))[1].append(name)
-    return sorted(shared.values(), key=lambda one: -len(one[1]))
+            times = shared.setdefault((finding.kind, finding.signal, finding.joints), (finding, {}))[1]
+            times[name] = times.get(name, 0) + 1
+    names = lambda times: [name if count == 1 else f"{name} ({count} times)" for name, count in times.items()]  # noqa: E731
+    return [(one, names(times)) for one, times in sorted(shared.values(), key=lambda one: -len(one[1]))]
 
 
 def main(args: Args) -> None:
@@ -56,9 +59,9 @@ def main(args: Args) -> None:
     if not said:
         console.print(f"nothing is suspected in {len(log.runs)} run(s); picture in {out}")
         return
-    table = Table("what is suspected", "runs", title=str(args.log))
+    table = Table("what is suspected", "runs", title=escape(str(args.log)))
     for finding, names in said:
-        table.add_row(finding.sentence, f"{len(names)} of {len(log.runs)}: {', '.join(names[:3])}")
+        table.add_row(escape(finding.sentence), f"{len(names)} of {len(log.runs)}: {', '.join(names[:3])}")
     console.print(table)
     console.print(f"picture of {worst.name} in {out}")
 

@@ -133,7 +133,7 @@ def main(args: Args) -> None:
         if args.video:
             film.gif(args.out / "walk.gif", loops["none"].robot.mj_model, recording.qpos)
     except film.NoPicture as error:
-        console.print(f"no film: {error}")
+        console.print(f"no film: {error}", markup=False)
 
 
 if __name__ == "__main__":

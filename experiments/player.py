@@ -24,7 +24,7 @@ class Player:
     """
 
     def __init__(self, path: str | Path, phase: float = 0.0):
-        with np.load(path, allow_pickle=False) as stored:
+        with open(path, "rb") as file, np.load(file, allow_pickle=False) as stored:
             self.meta = json.loads(str(stored["meta"]))
             arrays = {name: stored[name] for name in stored.files if name != "meta"}
         self._mean, self._std = arrays["mean"], arrays["std"]

@@ -7,6 +7,7 @@ from experiments.checkpoint import write_json
 
 _LOOK_S = 1.0  # between two looks for a log
 _QUIET_LOOKS = 3  # after which a log that has not changed is whole
+_RESTLESS_S = 60.0  # that a log may go on changing when time is up
 _SPARE_S = 0.05  # of a walk, for the ticks at its ends of which nobody knows what was before or after them
 
 
@@ -19,11 +20,11 @@ def wait(place: Path, timeout_s: float) -> None:
     """Waits for a log that is whole: it has its `meta.yaml`, and nothing of it has changed for some looks.
 
     Raises:
-      ValueError: the robot has refused, or has not answered in time.
+      ValueError: the robot has refused, or has not answered in time, or does not stop writing.
     """
     begin, before, quiet = time.monotonic(), None, 0
     while True:
-        files = _content(place / "log")
+        files, waited = _content(place / "log"), time.monotonic() - begin
         there = place / "log" / "meta.yaml" in files
         quiet = quiet + 1 if there and files == before else 0
         if quiet == _QUIET_LOOKS:
@@ -31,10 +32,15 @@ def wait(place: Path, timeout_s: float) -> None:
         refused = place / "refused.txt"
         if not there and refused.exists():
             raise ValueError(f"{refused}: {refused.read_text().strip()} (remove the file to ask again)")
-        if not there and time.monotonic() - begin > timeout_s:
+        if not there and waited > timeout_s:
             raise ValueError(
                 f"{place / 'log'}: no log after {timeout_s:g} s, expected one as {place / 'request.json'} asks for; "
                 "put it there and give the same command again"
+            )
+        if waited > timeout_s + _RESTLESS_S:
+            raise ValueError(
+                f"{place / 'log'}: still changes {_RESTLESS_S:g} s after the time that it had, expected files that are "
+                "closed before meta.yaml is written"
             )
         before = files
         time.sleep(_LOOK_S)

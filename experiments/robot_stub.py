@@ -7,9 +7,11 @@ be seen. Where it finds targets that `experiments.excite` wrote, `RUN/**/hung/ta
 """
 
 import json
+import math
 import os
 import shutil
 import time
+import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -39,11 +41,12 @@ class Args:
 
 def answer(place: Path, robot: Robot, seed: int) -> Sequence[bool]:
     """Walks as a request asks, and writes the log; which of the runs ended in a fall."""
-    request = json.loads((place / "request.json").read_text())
-    for name in ("episodes", "seconds", "seed"):
-        if not isinstance(request.get(name), int | float) or (request[name] <= 0 and name != "seed"):
-            raise ValueError(f"{place / 'request.json'}: {name}: got {request.get(name)!r}, expected a positive number")
-    player = Player(place / "policy" / "policy.npz")
+    request = _request(place / "request.json")
+    exported = place / "policy" / "policy.npz"
+    try:
+        player = Player(exported)
+    except (KeyError, TypeError, zipfile.BadZipFile) as error:
+        raise ValueError(f"{exported}: {error!r}, expected what experiments.export writes") from error
     rngs = [np.random.default_rng((seed, request["seed"], index)) for index in range(request["episodes"])]
     walked = [robot.walk(f"run_{index:03d}", player, request["seconds"], rng) for index, rng in enumerate(rngs)]
     meta = player.meta
@@ -57,6 +60,20 @@ def answer(place: Path, robot: Robot, seed: int) -> Sequence[bool]:
     )
     _put(log, place)
     return [fell for _, fell in walked]
+
+
+def _request(path: Path) -> dict:
+    request = json.loads(path.read_text())
+    checks = {
+        "episodes": ("a positive integer", lambda value: isinstance(value, int) and value > 0),
+        "seconds": ("a positive number", lambda value: isinstance(value, int | float) and 0 < value < math.inf),
+        "seed": ("an integer that is not negative", lambda value: isinstance(value, int) and value >= 0),
+    }
+    for name, (expected, fits) in checks.items():
+        value = request.get(name) if isinstance(request, dict) else None
+        if not fits(value):
+            raise ValueError(f"{path}: {name}: got {value!r}, expected {expected}")
+    return request
 
 
 def hang(place: Path, robot: Robot, seed: int) -> None:
@@ -97,7 +114,7 @@ def main(args: Args) -> None:
                 draft = place / f"refused.{os.getpid()}.partial"
                 draft.write_text(f"{error}\n")
                 draft.rename(place / "refused.txt")
-                console.print(f"{place}: refused: {error}", highlight=False)
+                console.print(f"{place}: refused: {error}", highlight=False, markup=False)
             last = time.monotonic()
         time.sleep(0.5)
 

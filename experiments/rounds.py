@@ -16,7 +16,7 @@ Whatever a round makes is a file, and what is there is not made again.
 
 Falls are what a robot pays with. It is asked for nothing where too many of its walks are expected to end in one.
 Simulation alone is believed where the gate has accepted the last log, and where the tuned simulator has the policy that
-walked fall about as often as it did; else what was measured is expected again.
+walked fall about as often as it did; else what was measured is expected again. In the first round nothing was measured.
 """
 
 import json
@@ -204,14 +204,18 @@ class Run:
         """From a log to the next distribution."""
         place, preset = self._place(index), self._loop.preset
         log = logs.read(place / "log")
-        walks = recorded.episodes(log, self._steps, most=1)
+        if len(log.runs) != preset.tuner.set_episodes:
+            raise ValueError(
+                f"{place / 'log'}: got {len(log.runs)} run(s), expected the {preset.tuner.set_episodes} walks that "
+                f"{place / 'request.json'} asks for, in a run each"
+            )
+        walks = recorded.episodes(log, self._steps)
         said = doctor.summary(doctor.examine(log))
         if not self._terms.trust_log:
             self._check(place / "log", log, walks, state.policy, said)
-        walks = recorded.beginning(walks, preset.tuner.set_episodes, self._steps)
         suspected = [{"sentence": finding.sentence, "runs": runs} for finding, runs in said]
-        write_json(place / "measured.json", measured(walks) | {"suspected": suspected})
-        start = recorded.beginning(walks, preset.tuner.set_episodes, preset.episode_steps)
+        write_json(place / "measured.json", measured(walks, self._steps) | {"suspected": suspected})
+        start = recorded.beginning(walks, preset.episode_steps)
         repeating = state.replace(policy=state.policy.replace(asked=start.asked))
         tuned, info = self._tune(self._key(index, 1), repeating, start.trajectory)
         tuned = tuned.replace(policy=state.policy)

@@ -87,6 +87,8 @@ def play(args: Args, learner: Simulator) -> list[dict]:
     # What is wrong with a policy is said before there is a folder; one from scratch is kept in it.
     policy = None if args.policy == "scratch" else starting_policy(args.policy, loop)
     identity = {**asdict(args), "sizes": loop.preset, "terms": {"walk_s": args.terms.walk_s, "seed": args.terms.seed}}
+    # A folder may hold another model by the time a run goes on.
+    identity["model_sha256"] = args.model and correction.read(args.model).digest
     # Of a run that goes on, these may be others.
     for option in ("out", "rounds"):
         del identity[option]

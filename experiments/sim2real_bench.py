@@ -17,7 +17,7 @@ import jax
 import numpy as np
 from rich.table import Table
 
-from envs import logs
+from envs import correction, logs
 from envs.biteno import constants
 from envs.targets import recorded
 from experiments import checkpoint, export, plots, sim2real
@@ -154,8 +154,7 @@ def evaluate(args: Args, learner: Simulator, policy: Path) -> dict:
         with robot(policy.parent):
             wait(place, _ANSWER_S)
         steps = round(args.walk_s / constants.POLICY_DT_S)
-        walks = recorded.beginning(recorded.episodes(logs.read(place / "log"), steps, most=1), args.evaluation, steps)
-        write_json(found, walked(walks.trajectory, walks.power))
+        write_json(found, walked(*recorded.whole(recorded.episodes(logs.read(place / "log"), steps), steps)))
     return json.loads(found.read_text())
 
 
@@ -163,7 +162,7 @@ def main(args: Args) -> None:
     """Plays what has not been played, evaluates, prints and draws."""
     check(args)
     checkpoint.set_up_compiler(preset(args.preset).xla_flags)
-    identity = asdict(args)
+    identity = asdict(args) | {"model_sha256": args.model and correction.read(args.model).digest}
     for option in ("out", "methods", "seeds"):
         del identity[option]
     checkpoint.open_run(args.out, identity)

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import tyro
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from envs import correction, domain
@@ -113,7 +114,7 @@ def run(main, args_type) -> None:
     try:
         main(args)
     except ValueError as error:
-        console.print(f"[red]error:[/red] {error}", highlight=False)
+        console.print(f"[red]error:[/red] {escape(str(error))}", highlight=False)
         raise SystemExit(2) from error
 
 

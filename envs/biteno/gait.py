@@ -78,6 +78,16 @@ def foot_motion(qpos: jax.Array, qvel: jax.Array) -> tuple[jax.Array, jax.Array]
     return qpos[:3] + offset, velocity
 
 
+def height(gravity: jax.Array, joint: jax.Array) -> jax.Array:
+    """Of the trunk over flat ground that its lower foot stands on, m; in the air, less than it is.
+
+    Args:
+      gravity: [3] projected gravity.
+      joint: [6] rad.
+    """
+    return constants.FOOT_RADIUS_M + (_foot_in_trunk(joint.reshape(2, 3)) @ gravity).max()
+
+
 def _foot_in_trunk(joint: jax.Array) -> jax.Array:
     hips = jnp.stack([jnp.zeros(2), jnp.asarray(constants.HIP_Y_M), jnp.zeros(2)], axis=-1)
     thigh, shank = joint[:, 1], joint[:, 1] + joint[:, 2]

@@ -6,9 +6,11 @@
       action.left_knee: /policy.data[2]
 
 The rows are the messages of one topic: that of the actions where there is one, else that of the positions. What other
-topics say is sampled there. Time is the stamp in the headers where all messages have one, else that of the recorder; it
-starts at zero. A run begins where the last of its topics begins and ends where the first of them ends; rows that fall
-into a hole of a measured topic are left out, which leaves a hole in the time stamps.
+topics say is sampled there; what else a policy says is of the tick to whose action it is nearest. Time is the stamp in
+the headers where all messages have one, else that of the recorder; it starts at zero. A run begins where the last of
+its topics begins and ends where the first measured one ends: rows go on for a while after the last action, because a
+policy may fall silent before its robot falls. Rows in a hole of a measured topic are left out, which leaves a hole in
+the time stamps.
 """
 
 import re
@@ -19,13 +21,14 @@ from typing import Any
 
 import numpy as np
 
-from envs.logs.sampling import ASKED, HELD, held, sampled
+from envs.logs.sampling import ASKED, HELD, SAID, held, sampled
 
 SUFFIXES = (".bag", ".mcap", ".db3")
 """Of files; a folder with a `metadata.yaml` is a bag as well."""
 
 _PLACE = re.compile(r"(?P<topic>/[^.\[\]\s]+)\.(?P<field>\w+(?:\.\w+)*)(?:\[(?P<index>[^\[\]]+)\])?")
 _HOLE = 3.5  # times a topic's period
+_MORE_ROWS = 500  # after the last message of the topic that gives them, at most
 
 
 def is_bag(path: Path) -> bool:
@@ -60,6 +63,15 @@ class _Topic:
     values: Mapping[str, np.ndarray]
     """[messages] by our name of the column."""
 
+    @property
+    def signals(self) -> set[str]:
+        """Of whose columns some are heard on it."""
+        return {_signal(ours) for ours in self.values}
+
+
+def _signal(column: str) -> str:
+    return column.partition(".")[0]
+
 
 def read_bag(path: Path, columns: Mapping[str, str]) -> dict[str, np.ndarray]:
     """Reads the columns that are asked for.
@@ -87,27 +99,39 @@ def read_bag(path: Path, columns: Mapping[str, str]) -> dict[str, np.ndarray]:
     if not of_rows:
         raise ValueError(f"{path}: columns: got none of 'q.*', expected where in the bag the positions are")
     topics = _heard(path, places)
-    rows, start, time = _rows(path, topics, places[of_rows[0]].topic)
+    ticks = places[of_rows[0]].topic
+    period, start, time = _rows(path, topics, ticks)
     found = {"t": time}
-    for topic in topics.values():
+    for name, topic in topics.items():
+        at = 1e-9 * (topic.time - start)
+        # Said in one tick, on two topics: one of them is heard first.
+        late = 0.5 * period if name != ticks and topics[ticks].signals & {*SAID} else 0.0
         for ours, values in topic.values.items():
-            at = 1e-9 * (topic.time - start)
-            slow = ours.partition(".")[0] in HELD
-            found[columns[ours]] = held(at, values, time) if slow else sampled(at, values, time, rows)
+            if _signal(ours) in HELD:
+                found[columns[ours]] = held(at, values, time + late if _signal(ours) in SAID else time)
+            else:
+                found[columns[ours]] = sampled(at, values, time, period)
     return found
 
 
 def _rows(path: Path, topics: Mapping[str, _Topic], of_rows: str) -> tuple[float, int, np.ndarray]:
     """The period of the rows and the first stamp, ns, and times [rows], s from there."""
+    measured = {name: topic for name, topic in topics.items() if topic.signals - {*ASKED}}
+    for name in dict.fromkeys([of_rows, *measured]):
+        if len(topics[name].time) < 2:
+            raise ValueError(f"{path}, topic '{name}': got 1 message, expected 2 or more")
     start = max(int(topic.time[0]) for topic in topics.values())
-    end = min(int(topic.time[-1]) for topic in topics.values())
+    end = min(int(topic.time[-1]) for topic in measured.values())
     stamps = topics[of_rows].time
+    period = int(np.median(np.diff(stamps)))
+    more = min((end - int(stamps[-1])) // period, _MORE_ROWS)
+    stamps = np.append(stamps, stamps[-1] + period * np.arange(1, 1 + more))
     stamps = stamps[(stamps >= start) & (stamps <= end)]
-    for name, topic in topics.items():
+    for name, topic in measured.items():
+        if name == of_rows:
+            continue
         holes = np.diff(topic.time)
         wide = holes > _HOLE * np.median(holes)
-        if name == of_rows or all(ours.partition(".")[0] in ASKED for ours in topic.values):
-            continue
         after = np.clip(np.searchsorted(topic.time, stamps), 1, len(topic.time) - 1)
         stamps = stamps[~wide[after - 1] | (topic.time[after] == stamps)]
     if len(stamps) < 2:
@@ -158,8 +182,8 @@ def _read(message: Any, recorded: int, topic: str, number: int, places: Mapping[
 
 def _topic(path: Path, name: str, messages: list[tuple], clock: int, places: Mapping[str, _Place]) -> _Topic:
     time = np.array([message[clock] for message in messages], np.int64)
-    if len(time) < 2:
-        raise ValueError(f"{path}, topic '{name}': got {len(time)} message(s), expected 2 or more")
+    if not len(time):
+        raise ValueError(f"{path}, topic '{name}': got no message, expected some")
     late = np.diff(time) <= 0
     if late.any():
         number = int(np.argmax(late)) + 2

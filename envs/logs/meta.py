@@ -1,6 +1,7 @@
 """`meta.yaml`, checked key by key."""
 
 import difflib
+import reprlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -36,6 +37,12 @@ _META = {
 }  # key: whether it must be there
 
 
+_short = reprlib.Repr()
+"""A few aliases of YAML are billions of values, which nobody can read."""
+_short.maxlevel = 2
+_short.maxstring = _short.maxother = _short.maxlong = 200
+
+
 class _Loader(yaml.SafeLoader):
     """YAML in which no key comes twice; the safe loader keeps the last one in silence."""
 
@@ -43,7 +50,9 @@ class _Loader(yaml.SafeLoader):
         keys = [self.construct_object(key, deep=True) for key, _ in node.value]
         for key in keys:
             if keys.count(key) > 1:
-                raise yaml.constructor.ConstructorError(None, None, f"key '{key}' is there twice", node.start_mark)
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"key {_short.repr(key)} is there twice", node.start_mark
+                )
         return super().construct_mapping(node, deep)
 
 
@@ -189,4 +198,4 @@ class Meta:
         return value
 
     def _refuse(self, where: str, value: Any, wanted: str):
-        raise ValueError(f"{self.path}: {where}: got {value!r}, expected {wanted}")
+        raise ValueError(f"{self.path}: {where}: got {_short.repr(value)}, expected {wanted}")

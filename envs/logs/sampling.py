@@ -2,7 +2,9 @@
 
 import numpy as np
 
-ASKED = ("target", "action", "phase", "enabled", "cmd")
+SAID = ("action", "target", "phase")
+"""What a policy says in a tick."""
+ASKED = (*SAID, "enabled", "cmd")
 """Signals that stay until they change."""
 HELD = (*ASKED, "contact", "quat")
 """These, and what means nothing between two rows: never filtered, never mixed."""

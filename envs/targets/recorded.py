@@ -1,12 +1,12 @@
 """Episodes from measured logs: what a policy saw and did, at its own ticks, as the simulator would have told it.
 
 A run is cut where the robot falls and where its rows have a hole. Motors that are switched off under a walking policy
-are a fall: that is how most robots fall. Of every piece the first tick is left out, because nobody knows what was done
-before it, and so is the last one of a piece that does not end in a fall, because nobody knows what came of it.
+are a fall: that is how most robots fall. So is a trunk that sinks; where nobody measured how high it is, its legs say
+it. Of every piece the first tick is left out, because nobody knows what was done before it, and so is the last one of a
+piece that does not end in a fall, because nobody knows what came of it.
 """
 
 from functools import partial
-from itertools import chain
 
 import chex
 import jax
@@ -38,9 +38,11 @@ class Recorded:
     trajectory: Trajectory
     asked: Asked  # from the run's first step on, a few before the trajectory's
     power: jax.Array  # [episodes, time] W, mechanical, braking not regained
+    run: jax.Array  # [episodes] of the log, from 0; in order, and every run has one episode or more
+    begin: jax.Array  # [episodes] policy steps between the first one of the run and that of the episode
 
 
-def episodes(log: Log, steps: int, most: int | None = None) -> Recorded:
+def episodes(log: Log, steps: int) -> Recorded:
     """Turns a log of a walking BITeno into episodes of `steps` policy steps.
 
     A longer piece of a run becomes several episodes; a shorter one is filled up with steps that are not alive.
@@ -48,56 +50,74 @@ def episodes(log: Log, steps: int, most: int | None = None) -> Recorded:
     Args:
       log: of one or more runs.
       steps: length of an episode.
-      most: episodes taken of a run, the first ones; all where None.
 
     Raises:
-      ValueError: the log is of another robot or policy, lacks a signal, or has no two ticks in a row.
+      ValueError: the log is of another robot or policy, or of one that hangs, or lacks a signal; or a run has no two
+        ticks in a row with the robot on its feet.
     """
     if log.robot != "biteno" or set(log.joints) != set(constants.JOINTS):
         raise ValueError(f"robot: got '{log.robot}' with {', '.join(log.joints)}, expected biteno with all its joints")
+    if log.base != "free":
+        raise ValueError(f"base: got {log.base}, expected free, of a robot that walks")
     rate = (log.policy or {}).get("rate_hz", 1.0 / constants.POLICY_DT_S)
     if abs(rate * constants.POLICY_DT_S - 1.0) > 1e-6:
         raise ValueError(f"policy.rate_hz: got {rate:g}, expected {1.0 / constants.POLICY_DT_S:g}")
     order = [log.joints.index(joint) for joint in constants.JOINTS]
     found, leads = [], []
-    for run in log.runs:
+    for index, run in enumerate(log.runs):
         ticks = _at_ticks(run, order)
-        chunks = [_chunks(_steps(ticks, rows, fell), steps) for rows, fell in _pieces(ticks)]
-        found += list(chain.from_iterable(chunks))[:most]
+        pieces = _pieces(ticks)
+        if not pieces:
+            raise ValueError(f"{run.name}: got no two ticks in a row on its feet, expected a robot that walks")
+        begins = np.round((ticks["time"] - ticks["time"][pieces[0][0][0]]) / constants.POLICY_DT_S).astype(int)
+        for rows, fell in pieces:
+            found += [one | {"run": index} for one in _chunks(_steps(ticks, rows, fell), steps, begins[rows[0]])]
         # A first action that does not change is not heard.
         unheard = 0.5 < (ticks["time"][0] - run.time[0]) / constants.POLICY_DT_S < 1.5
         leads.append(2 if unheard else 1)
-    if not found:
-        raise ValueError(f"runs: got {len(log.runs)} without two ticks in a row, expected a robot that walks")
     return _as_simulated(jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *found), max(leads))
 
 
-def beginning(recorded: Recorded, count: int, steps: int) -> Recorded:
-    """The first `steps` of the first `count` episodes.
-
-    Raises:
-      ValueError: there are fewer.
-    """
-    there = len(recorded.power)
-    if there < count:
-        raise ValueError(f"runs: got {there} episode(s), expected {count} or more")
-    cut = lambda leaf: leaf[:count, :steps]  # noqa: E731
-    trajectory, asked = recorded.trajectory, recorded.asked
+def beginning(recorded: Recorded, steps: int) -> Recorded:
+    """The first `steps` of every run's first episode."""
+    first = np.unique(np.asarray(recorded.run), return_index=True)[1]
+    one = jax.tree.map(lambda leaf: leaf[first], recorded)
+    trajectory, asked = one.trajectory, one.asked
     lead = asked.command.shape[1] - trajectory.alive.shape[1]
     # Who still stands when the cut comes has not fallen before it.
-    fell = (trajectory.fell & ~trajectory.alive[:, steps:].any(axis=1))[:count]
-    return Recorded(
-        trajectory=Trajectory(
-            obs=cut(trajectory.obs),
-            action=cut(trajectory.action),
-            alive=cut(trajectory.alive),
-            score=cut(trajectory.score),
-            fell=fell,
-            not_finite=trajectory.not_finite[:count],
-        ),
-        asked=Asked(command=asked.command[:count, : lead + steps], phase=asked.phase[:count]),
-        power=cut(recorded.power),
+    fell = trajectory.fell & ~trajectory.alive[:, steps:].any(axis=1)
+    cut = {name: trajectory[name][:, :steps] for name in ("obs", "action", "alive", "score")}
+    return one.replace(
+        trajectory=trajectory.replace(fell=fell, **cut),
+        asked=asked.replace(command=asked.command[:, : lead + steps]),
+        power=one.power[:, :steps],
     )
+
+
+def whole(recorded: Recorded, steps: int) -> tuple[Trajectory, np.ndarray]:
+    """The first `steps` of every run as one episode, and its power: for what came of a walk, not for windows.
+
+    Not alive is it where nothing is known, also in between, and from its first fall on.
+
+    Returns:
+      Of shapes [runs, steps, ...] and [runs, steps] W.
+    """
+    run, begin, trajectory = np.asarray(recorded.run), np.asarray(recorded.begin), recorded.trajectory
+    alive = np.asarray(trajectory.alive)
+    falls = np.full(run[-1] + 1, np.iinfo(np.int32).max)
+    np.minimum.at(falls, run, np.where(trajectory.fell, begin + alive.sum(axis=1), falls[run]))
+    place = begin[:, None] + np.arange(alive.shape[1])
+    known = alive & (place < np.minimum(falls, steps)[run, None])
+    rows = np.broadcast_to(run[:, None], place.shape)[known], place[known]
+
+    def spread(leaf: jax.Array) -> np.ndarray:
+        values = np.zeros((len(falls), steps, *leaf.shape[2:]), leaf.dtype)
+        values[rows] = np.asarray(leaf)[known]
+        return values
+
+    spreads = {name: spread(trajectory[name]) for name in ("obs", "action", "alive", "score")}
+    fell = falls <= steps
+    return Trajectory(**spreads, fell=fell, not_finite=np.zeros_like(fell)), spread(recorded.power)
 
 
 def _at_ticks(run: Run, order: list[int]) -> dict[str, np.ndarray]:
@@ -111,7 +131,8 @@ def _at_ticks(run: Run, order: list[int]) -> dict[str, np.ndarray]:
     for name in JOINT_SIGNALS:
         if name in signals:
             signals[name] = signals[name][:, order]
-    height = signals["pos"][:, 2] if "pos" in signals else np.full(len(run.time), np.inf)
+    by_legs = lambda: np.asarray(jax.vmap(gait.height)(signals["gravity"], signals["q"]))  # noqa: E731
+    height = signals["pos"][:, 2] if "pos" in signals else by_legs()
     down = np.asarray(env.fallen(signals["gravity"], height)) | (signals.get("enabled", np.ones(len(height))) == 0)
     rows, aligned = _ticks(run.name, run.time, signals["action"])
     # Who has fallen may be asked for no more actions.
@@ -132,15 +153,17 @@ def _at_ticks(run: Run, order: list[int]) -> dict[str, np.ndarray]:
 def _ticks(name: str, time: np.ndarray, action: np.ndarray) -> tuple[np.ndarray, bool]:
     """Rows in which the policy spoke, and whether they are when it looked."""
     period, width = constants.POLICY_DT_S, float(np.median(np.diff(time)))
+    changes = 1 + np.flatnonzero((np.diff(action, axis=0) != 0).any(axis=1))
     if abs(width / period - 1.0) < _SAME_RATE:
-        return np.arange(len(time)), True
+        starts = np.append(0, changes)
+        long = np.diff(np.append(starts, len(time)))
+        return np.union1d(starts, np.flatnonzero(np.repeat(long < _SILENCE, long))), True
     if width * _FASTER > period:
         raise ValueError(
             f"{name}: got {1 / width:.6g} rows a second, expected the policy's {1 / period:g}, or {_FASTER / period:g} "
             "or more"
         )
-    rows = 1 + np.flatnonzero((np.diff(action, axis=0) != 0).any(axis=1))
-    apart = np.diff(time[rows])
+    rows, apart = changes, np.diff(time[changes])
     if len(rows) < 2 or abs(np.median(apart) / period - 1.0) > 0.25:
         every = f"every {np.median(apart):.3g} s" if len(rows) > 1 else f"{len(rows)} time(s)"
         raise ValueError(f"{name}: 'action' changes {every}, expected every {period:g} s")
@@ -192,15 +215,14 @@ def _steps(ticks: dict[str, np.ndarray], rows: np.ndarray, fell: bool) -> dict:
     return moments | {"alive": np.ones(len(ends), bool), "fell": ends}
 
 
-def _chunks(steps: dict, length: int) -> list[dict]:
-    """Episodes of a length."""
+def _chunks(steps: dict, length: int, begin: int) -> list[dict]:
+    """Episodes of a length, of a piece that begins so many steps after its run."""
     count = len(steps["alive"])
 
     def cut(start: int) -> dict:
         fill = max(0, start + length - count)
-        return jax.tree.map(
-            lambda leaf: np.pad(leaf[start : start + length], [(0, fill)] + [(0, 0)] * (leaf.ndim - 1)), steps
-        )
+        filled = lambda leaf: np.pad(leaf[start : start + length], [(0, fill)] + [(0, 0)] * (leaf.ndim - 1))  # noqa: E731
+        return jax.tree.map(filled, steps) | {"begin": begin + start}
 
     return [cut(start) for start in range(0, count, length)]
 
@@ -243,4 +265,6 @@ def _as_simulated(steps: dict, lead: int) -> Recorded:
             phase=gait.advance(now["phase"][:, 0], -lead),
         ),
         power=jnp.where(alive, gait.power(now["tau"], now["dq"]), 0.0),
+        run=steps["run"],
+        begin=steps["begin"],
     )

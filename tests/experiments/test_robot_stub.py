@@ -115,3 +115,23 @@ def test_a_log_without_targets_cannot_be_played(place, tmp_path):
     logs.write(replace(measured, runs=tuple(runs)), tmp_path / "log")
     with pytest.raises(ValueError, match=r"target\.left_abad"):
         logs.read(tmp_path / "log", measured=False)
+
+
+@pytest.mark.parametrize(
+    ("request_text", "policy", "named"),
+    [
+        ("[]", b"", "episodes: got None, expected a positive integer"),
+        ('{"episodes": 2.0, "seconds": 1, "seed": 0}', b"", "episodes: got 2.0"),
+        ('{"episodes": 2, "seconds": NaN, "seed": 0}', b"", "seconds: got nan, expected a positive number"),
+        ('{"episodes": 2, "seconds": 1, "seed": -1}', b"", "seed: got -1"),
+        ("{", b"", "Expecting property name"),
+        ('{"episodes": 2, "seconds": 1, "seed": 0}', b"PK\x03\x04 cut off", "policy.npz"),
+    ],
+)
+def test_what_it_cannot_walk_with_it_refuses(tmp_path, request_text, policy, named):
+    place = tmp_path / "round_000"
+    (place / "policy").mkdir(parents=True)
+    (place / "policy" / "policy.npz").write_bytes(policy)
+    (place / "request.json").write_text(request_text)
+    robot_stub.main(robot_stub.Args(folder=tmp_path, idle_s=1.0))
+    assert named in (place / "refused.txt").read_text()

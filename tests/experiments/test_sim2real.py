@@ -1,12 +1,17 @@
 """A robot that answers through logs: what is asked of it, what is refused, and a run that is stopped at any point."""
 
 import json
-from dataclasses import replace
+import shutil
+import sys
+from dataclasses import dataclass, replace
+from itertools import count
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from rich.console import Console
 
 from envs.diagnosis import Finding
 from experiments import (
@@ -19,6 +24,7 @@ from experiments import (
     sim2real,
     sim2real_bench,
     sim2real_report,
+    train,
 )
 from experiments.robot_body import Body, Robot
 from experiments.rounds import Run, Terms
@@ -85,10 +91,26 @@ def test_a_log_counts_when_it_is_whole(tmp_path, monkeypatch):
 
     monkeypatch.setattr(robot_folder.time, "sleep", sleep)
     # A log that is there is waited for, however little time there is, and counts more than a refusal.
-    monkeypatch.setattr(robot_folder.time, "monotonic", iter([0.0, 1.0, 2.0, 3.0]).__next__)
+    monkeypatch.setattr(robot_folder.time, "monotonic", count().__next__)
     robot_folder.wait(tmp_path, 3.5)
     # Last changed in the fourth pause; the fifth look has seen it so, and three more.
     assert len(looks) == 7
+
+
+def test_a_log_that_never_rests_is_told(tmp_path, monkeypatch):
+    log, looks = tmp_path / "log", []
+
+    def sleep(seconds):
+        looks.append(seconds)
+        log.mkdir(exist_ok=True)
+        (log / "meta.yaml").write_text("robot: biteno\n")
+        (log / "run_000.csv").write_text("t\n" * len(looks))
+
+    monkeypatch.setattr(robot_folder.time, "sleep", sleep)
+    monkeypatch.setattr(robot_folder.time, "monotonic", lambda: float(len(looks)))
+    with pytest.raises(ValueError, match="log: still changes 60 s after the time that it had"):
+        robot_folder.wait(tmp_path, 5.0)
+    assert len(looks) == 66
 
 
 def line(verdicts, measured, predicted, explained=0.5, cut_short=0):
@@ -124,7 +146,7 @@ def falls(*args, **kwargs):
 
 
 def test_what_simulation_does_not_cover_is_expected_again():
-    assert falls(["widen", "accept"], 0.8, 0.1) == 0.1
+    assert falls(["widen", "accept"], 0.6, 0.1) == 0.1
     for verdict in ("unexplained", "radius_exhausted", "not_finite"):
         assert falls(["widen", verdict], 0.8, 0.1) == 0.8
         # Where simulation is worse than what was measured, it is believed.
@@ -142,8 +164,11 @@ def test_falls_that_the_tuned_simulator_does_not_know_are_expected_again():
     # Four of five fall, and of 100 simulated walks of the same policy ten: 5 * 0.108^4 * 0.892 + 0.108^5.
     assert expected.surprise(line(["accept"], 0.8, 0.0, explained=0.1)) == pytest.approx(6.2e-4, rel=0.02)
     assert falls(["accept"], 0.8, 0.0, explained=0.1) == 0.8
-    # One of five is no surprise where one of a hundred falls: 1 - (1 - 2 / 102)^5 = 0.09.
-    assert falls(["accept"], 0.2, 0.0, explained=0.01) == 0.0
+    # Three of five where a fifth falls: few walks would allow it, and that is no reason to walk on.
+    assert expected.surprise(line(["accept"], 0.6, 0.0, explained=0.2)) == pytest.approx(0.063, rel=0.02)
+    assert falls(["accept"], 0.6, 0.0, explained=0.2) == 0.6
+    # One of five is none where five of a hundred fall: 1 - (1 - 6 / 102)^5 = 0.26.
+    assert falls(["accept"], 0.2, 0.0, explained=0.05) == 0.0
     # What ends before its time may have been a fall.
     assert falls(["accept"], 0.2, 0.0, explained=0.01, cut_short=2) == pytest.approx(0.6)
     assert falls(["accept"], 0.0, 0.0, explained=0.9) == 0.0
@@ -262,6 +287,53 @@ def test_who_would_fall_is_not_asked_to_walk(first, answered, tmp_path, monkeypa
     # Who has walked already may be learnt from.
     (place / "tuning.json").unlink()
     assert first(careful).round(0, [])["tuning"]["verdicts"]
+
+
+def test_every_walk_that_was_asked_for_is_counted(first, answered, tmp_path):
+    """A run that nobody asked for, or that is not there, would change what the robot is said to have done."""
+    run, place = first(TERMS), tmp_path / "round_000"
+    run._ask(0, run._start(0, lambda: run._first))
+    request = place / "request.json"
+    asked = request.read_text()
+    request.write_text(json.dumps(json.loads(asked) | {"episodes": 3}))
+    robot_stub.answer(place, Robot(Body()), 0)
+    with pytest.raises(ValueError, match=r"log: got 3 run\(s\), expected the 2 walks that .*request\.json asks for"):
+        run.round(0, [])
+    request.write_text(asked)
+    shutil.rmtree(place / "log")
+    assert run.round(0, [])["measured"]["episodes"] == 2
+
+
+def test_a_run_goes_on_in_the_model_that_it_began_with(learner, answered, tmp_path):
+    model = tmp_path / "model"
+    shutil.copytree(Path(rounds.__file__).parent / "results" / "stand_in" / "found" / "model", model)
+    args = replace(ARGS, out=tmp_path / "run", rounds=1, model=model)
+    assert sim2real.play(args, learner) == sim2real.play(args, learner)
+    text = (model / "model.xml").read_text()
+    (model / "model.xml").write_text(text.replace("<mujoco", "<mujoco ", 1))
+    with pytest.raises(ValueError, match="model_sha256"):
+        sim2real.play(args, learner)
+
+
+def test_a_suspicion_is_told_once_a_run():
+    hole = lambda row: Finding("missing rows", "t", (), 0.02, f"rows are missing behind row {row}")  # noqa: E731
+    found = {"run_000": [hole(3), hole(9), hole(12)], "run_001": [], "run_002": [hole(5)]}
+    assert doctor.summary(found) == [(hole(3), ["run_000 (3 times)", "run_002"])]
+
+
+def test_errors_are_printed_as_they_are(monkeypatch, capsys):
+    @dataclass
+    class NoArgs:
+        """A command without options."""
+
+    def main(args):
+        raise ValueError("got position[knee], expected `pip install 'jaxtune[onnx]'` [/x]")
+
+    monkeypatch.setattr(sys, "argv", ["program"])
+    monkeypatch.setattr(train, "console", Console(width=200))
+    with pytest.raises(SystemExit):
+        train.run(main, NoArgs)
+    assert "error: got position[knee], expected `pip install 'jaxtune[onnx]'` [/x]" in capsys.readouterr().out
 
 
 def test_a_log_that_means_something_else_is_not_learnt_from(first, answered, tmp_path, monkeypatch):

@@ -124,6 +124,46 @@ def test_a_hole_of_a_measured_topic_is_a_hole_in_time(tmp_path):
     assert len(run.time) == 44 - 5
 
 
+def test_what_comes_after_the_last_action_is_heard(tmp_path):
+    """A policy that falls silent before its robot falls; and a command that was given once."""
+    messages = [m for m in recording() if m[0] != "/policy" or m[3] < 0.295]
+    messages.append(("/cmd", "std_msgs/msg/Float64MultiArray", (0.3, 0.1, -0.2), 0.01))
+    messages.sort(key=lambda message: message[3])
+    folder = write(tmp_path / "log", "mcap", messages)
+    commands = {f"cmd.{name}": f"/cmd.data[{index}]" for index, name in enumerate(("x", "y", "yaw"))}
+    (folder / "meta.yaml").write_text(yaml.safe_dump(META | {"columns": COLUMNS | commands}))
+    (run,) = logs.read(folder).runs
+    ticks = np.arange(5, 49)
+    np.testing.assert_allclose(run.time, 0.01 * (ticks - 5), atol=1e-9)
+    np.testing.assert_array_equal(run.signals["action"][:, 0], np.minimum(ticks, 29))
+    np.testing.assert_allclose(run.signals["q"][:, 0], 0.01 * ticks, atol=1e-9)
+    np.testing.assert_array_equal(run.signals["cmd"], np.tile([0.3, 0.1, -0.2], (len(ticks), 1)))
+
+
+@pytest.mark.parametrize("late_s", [-0.002, 0.00005, 0.004])
+def test_what_a_policy_says_on_two_topics_is_of_one_tick(tmp_path, late_s):
+    messages = recording()
+    kind = "std_msgs/msg/Float64MultiArray"
+    messages += [("/target", kind, m[2][2:], m[3] + late_s) for m in messages if m[0] == "/policy"]
+    messages.sort(key=lambda message: message[3])
+    folder = write(tmp_path / "log", "mcap", messages)
+    moved = {f"target.{joint}": f"/target.data[{index}]" for index, joint in enumerate(JOINTS)}
+    (folder / "meta.yaml").write_text(yaml.safe_dump(META | {"columns": COLUMNS | moved}))
+    (run,) = logs.read(folder).runs
+    assert len(run.time) >= 43
+    np.testing.assert_array_equal(run.signals["target"][:, 0], 10 + run.signals["action"][:, 0])
+
+
+def test_targets_without_actions_are_heard_when_they_come(tmp_path):
+    """Rows are those of the positions, and no later target is anticipated."""
+    folder = write(tmp_path / "log", "mcap", [m for m in recording() if m[0] != "/imu"])
+    columns = {ours: theirs for ours, theirs in COLUMNS.items() if not ours.startswith(("action", "gyro"))}
+    (folder / "meta.yaml").write_text(yaml.safe_dump(META | {"columns": columns, "rate_hz": 1000}))
+    (run,) = logs.read(folder).runs
+    rows = np.round(1000 * run.time).astype(int) + 50
+    np.testing.assert_array_equal(run.signals["target"][:, 0], 10 + rows // 10)
+
+
 @pytest.mark.parametrize(
     ("columns", "named"),
     [

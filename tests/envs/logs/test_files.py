@@ -282,6 +282,16 @@ def test_a_damaged_npz_is_named(tmp_path):
         logs.read(tmp_path / "log")
 
 
+def test_a_short_file_of_billions_of_values_is_refused_in_a_line(tmp_path):
+    lines = ["robot:", "  - &a0 [x, x, x, x, x, x, x, x, x, x]"]
+    lines += [f"  - &a{level} [{', '.join([f'*a{level - 1}'] * 10)}]" for level in range(1, 10)]
+    path = put(tmp_path / "log", meta={"robot": None}) / "meta.yaml"
+    path.write_text("\n".join([*lines, path.read_text()]))
+    with pytest.raises(ValueError, match=r"robot: got .*expected a text") as error:
+        logs.read(path.parent)
+    assert len(str(error.value)) < 1000
+
+
 def test_what_is_no_log_is_named(tmp_path):
     with pytest.raises(ValueError, match=r"meta\.yaml: there is no such file"):
         logs.read(tmp_path)

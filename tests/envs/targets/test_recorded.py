@@ -188,13 +188,14 @@ def test_a_fall_is_seen_after_the_policy_has_stopped(simulated):
     np.testing.assert_array_equal(found.fell, [True])
 
 
-def test_a_policy_that_stops_is_not_made_up(simulated):
+@pytest.mark.parametrize("rows_per_tick", [1, 5])
+def test_a_policy_that_stops_is_not_made_up(simulated, rows_per_tick):
     _, log = simulated
-    run = faster(log.runs[0], 5)
+    run = faster(log.runs[0], rows_per_tick)
     action = run.signals["action"].copy()
-    action[300:700] = action[300]
+    action[60 * rows_per_tick : 140 * rows_per_tick] = action[60 * rows_per_tick]
     paused = replace(run, signals=run.signals | {"action": action})
-    found = recorded.episodes(replace(log, rate_hz=500.0, runs=(paused,)), STEPS).trajectory
+    found = recorded.episodes(replace(log, rate_hz=100.0 * rows_per_tick, runs=(paused,)), STEPS).trajectory
     # 60 ticks before and the rest of 199 after 140, the first, the last and what borders on the pause left out.
     assert found.alive.shape[0] == 2
     np.testing.assert_allclose(found.alive.sum(axis=1), [58, 57], atol=2)
@@ -215,28 +216,83 @@ def test_a_long_run_is_several_episodes(simulated):
         np.testing.assert_allclose(one.reshape(240, -1)[: STEPS - 3], other[0, : STEPS - 3], atol=1e-6)
 
 
-def test_of_every_run_the_first_episode_may_be_enough(simulated):
-    _, log = simulated
-    whole = recorded.episodes(log, STEPS)
-    first = recorded.episodes(log, 80, most=1)
-    np.testing.assert_array_equal(first.trajectory.obs, whole.trajectory.obs[:, :80])
-    # Of the runs that fall, those that fall within it.
-    short = np.asarray(whole.trajectory.alive.sum(axis=1)) <= 80
-    np.testing.assert_array_equal(first.trajectory.fell, whole.trajectory.fell & short)
-
-
-def test_beginnings_are_those_of_longer_episodes(simulated):
+def test_beginnings_are_of_every_run_the_first_steps_of_its_first_episode(simulated):
     _, log = simulated
     whole = recorded.episodes(log, STEPS)
     steps = int(whole.trajectory.alive[3].sum())
     for length in (steps - 1, steps, steps + 1):
-        cut = recorded.beginning(whole, 4, length)
-        same_length = recorded.episodes(log, length, most=1)
-        jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-6, atol=1e-6), cut, same_length)
-        assert cut.trajectory.fell[3] == (length >= steps)
-    assert recorded.beginning(whole, 2, 50).power.shape == (2, 50)
-    with pytest.raises(ValueError, match=r"runs: got 4 episode\(s\), expected 5 or more"):
-        recorded.beginning(whole, 5, 50)
+        pieces = recorded.episodes(log, length)
+        first = np.unique(np.asarray(pieces.run), return_index=True)[1]
+        jax.tree.map(
+            partial(np.testing.assert_allclose, rtol=1e-6, atol=1e-6),
+            recorded.beginning(whole, length),
+            jax.tree.map(lambda leaf, first=first: leaf[first], pieces),
+        )
+        assert recorded.beginning(whole, length).trajectory.fell[3] == (length >= steps)
+    # Longer than what was cut, which is shorter than the walks.
+    assert recorded.beginning(recorded.episodes(log, 50), 60).power.shape == (4, 50)
+
+
+def test_a_walk_is_the_same_in_one_piece_and_in_several(simulated):
+    _, log = simulated
+    one, power = recorded.whole(recorded.episodes(log, STEPS), 150)
+    other, same_power = recorded.whole(recorded.episodes(log, 40), 150)
+    jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-6, atol=1e-6), (one, power), (other, same_power))
+    ends = recorded.episodes(log, STEPS).trajectory.alive.sum(axis=1)
+    np.testing.assert_array_equal(one.fell, [False, False, *(ends[2:] <= 150)])
+    np.testing.assert_array_equal(one.alive.sum(axis=1), np.minimum(ends, 150))
+    assert one.fell.any()
+    # A fall in the last step is one, in the step after it is none.
+    last = int(ends[3])
+    assert [bool(recorded.whole(recorded.episodes(log, STEPS), last + more)[0].fell[3]) for more in (-1, 0)] == [0, 1]
+
+
+def test_a_lost_row_is_no_end_of_a_walk(simulated):
+    """Of one walk a row is lost, of one that falls as well: what comes after the gap counts."""
+    _, log = simulated
+    entire, _ = recorded.whole(recorded.episodes(log, STEPS), STEPS)
+    fall = int(entire.alive[2].sum())
+    runs = []
+    for run, row in ((log.runs[0], 100), (log.runs[2], fall - 10)):
+        keep = np.delete(np.arange(len(run.time)), row)
+        runs.append(replace(run, time=run.time[keep], signals={n: v[keep] for n, v in run.signals.items()}))
+    walked, _ = recorded.whole(recorded.episodes(replace(log, runs=tuple(runs)), STEPS), STEPS - 3)
+    np.testing.assert_array_equal(walked.fell, [False, True])
+    for found, expected, row in zip(walked.alive, entire.alive[np.array([0, 2]), :-3], (100, fall - 10), strict=True):
+        # A step is a row with the ones before and after it; the first step is that of the second row.
+        gap = np.arange(row - 2, row + 1)
+        np.testing.assert_array_equal(np.flatnonzero(found != expected), gap)
+
+
+def test_a_walk_ends_with_its_first_fall(simulated):
+    _, log = simulated
+    gravity = log.runs[0].signals["gravity"].copy()
+    gravity[60:62] = [1.0, 0.0, 0.0]
+    tripped = replace(log, runs=(replace(log.runs[0], signals=log.runs[0].signals | {"gravity": gravity}), log.runs[1]))
+    pieces = recorded.episodes(tripped, STEPS)
+    np.testing.assert_array_equal(pieces.run, [0, 0, 1])
+    np.testing.assert_array_equal(pieces.begin, [0, 62, 0])
+    walked, power = recorded.whole(pieces, STEPS)
+    np.testing.assert_array_equal(walked.fell, [True, False])
+    np.testing.assert_array_equal(walked.alive.sum(axis=1), [59, STEPS - 3])
+    assert (power[0, 59:] == 0).all()
+
+
+def test_a_trunk_that_sinks_has_fallen_whoever_measured_it(simulated):
+    """Its knees give way, its trunk stays upright, its motors stay on."""
+    _, log = simulated
+    run = log.runs[0]
+    folded = run.signals["q"].copy()
+    folded[120:] = [0.0, 1.2, -2.4, 0.0, 1.2, -2.4]  # feet under the hips, 0.22 m below them
+    signals = run.signals | {"q": folded}
+    del signals["pos"]
+    found = recorded.episodes(replace(log, runs=(replace(run, signals=signals),)), STEPS).trajectory
+    np.testing.assert_array_equal(found.fell, [True])
+    np.testing.assert_array_equal(found.alive.sum(axis=1), [119])
+    # Of a walk the legs say what was measured, and as long as it is up on its feet they never say that it sinks.
+    upright = without(log, "pos")
+    same_fell = recorded.episodes(upright, STEPS).trajectory
+    np.testing.assert_array_equal(same_fell.alive, recorded.episodes(without(log), STEPS).trajectory.alive)
 
 
 def test_who_repeats_an_episode_is_asked_for_the_same_until_its_end_and_on(simulated):
@@ -296,7 +352,11 @@ def without(log, *names):
             "run_000: got 50 rows a second, expected the policy's 100",
         ),
         (lambda log: replace(log, runs=(faster(log.runs[0], 1.2),)), "run_000: got 120 rows a second, expected"),
-        (lambda log: replace(log, runs=(lying(log.runs[0]),)), "got 1 without two ticks in a row"),
+        (
+            lambda log: replace(log, runs=(*log.runs, lying(log.runs[1]))),
+            "run_001: got no two ticks in a row on its feet",
+        ),
+        (lambda log: replace(log, base="fixed"), "base: got fixed, expected free"),
     ],
 )
 def test_what_is_no_walk_is_named(simulated, damage, named):
