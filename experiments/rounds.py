@@ -183,6 +183,8 @@ class Run:
 
     def _permit(self, index: int, predicted: Mapping, history: Sequence[Mapping]) -> None:
         rate, most = expected_falls(predicted, history), self._terms.max_fall_rate
+        if not history:
+            console.print(f"nothing was measured in this run yet; simulation alone expects {rate:.0%} of walks to fall")
         if rate > most and not self._terms.force:
             # An earlier call may have asked on other terms.
             (self._place(index) / "request.json").unlink(missing_ok=True)

@@ -197,7 +197,8 @@ def _pieces(ticks: dict[str, np.ndarray]) -> list[tuple[np.ndarray, bool]]:
         stands = up[rows[0]] and len(rows) >= (round(_UP_S / constants.POLICY_DT_S) if down else 3)
         if stands:
             after = rows[-1] + 1
-            found.append((rows, bool(after < len(up) and not hole[after])))
+            # Where nobody saw it fall it is enough to see it lie.
+            found.append((rows, bool(after < len(up) and not up[after])))
         down = not up[rows[0]] or (down and not stands)
     return found
 

@@ -278,6 +278,21 @@ def test_a_walk_ends_with_its_first_fall(simulated):
     assert (power[0, 59:] == 0).all()
 
 
+def test_a_fall_that_nobody_saw_is_one(simulated):
+    """It stands, nothing is known for a while, it lies, and it is put on its feet again."""
+    _, log = simulated
+    run = log.runs[0]
+    gravity = run.signals["gravity"].copy()
+    gravity[100:110] = [1.0, 0.0, 0.0]
+    keep = np.r_[0:80, 105 : len(run.time)]
+    signals = {name: values[keep] for name, values in (run.signals | {"gravity": gravity}).items()}
+    pieces = recorded.episodes(replace(log, runs=(replace(run, time=run.time[keep], signals=signals),)), STEPS)
+    np.testing.assert_array_equal(pieces.trajectory.fell, [True, False])
+    walked, _ = recorded.whole(pieces, STEPS)
+    np.testing.assert_array_equal(walked.fell, [True])
+    np.testing.assert_array_equal(walked.alive.sum(axis=1), [79])
+
+
 def test_a_trunk_that_sinks_has_fallen_whoever_measured_it(simulated):
     """Its knees give way, its trunk stays upright, its motors stay on."""
     _, log = simulated
