@@ -29,13 +29,17 @@ def verdict(line: Mapping) -> str | None:
     return tuning["verdicts"][-1] if tuning["verdicts"] and tuning["p_value"][-1] is not None else None
 
 
+def _ended(walks: Mapping) -> int:
+    """Walks that ended too early."""
+    return round(walks["fall_rate"] * walks["episodes"]) + walks["cut_short"]
+
+
 def surprise(line: Mapping) -> float:
     """Chance of as many falls as were measured, if the tuned simulator were right."""
     walks, simulated = line["measured"], line["tuning"]["explained"]
-    falls = round(walks["fall_rate"] * walks["episodes"]) + walks["cut_short"]
     # Of few simulated walks one may have been lucky.
     rate = (simulated["fall_rate"] * simulated["episodes"] + 1) / (simulated["episodes"] + 2)
-    return float(binom.sf(falls - 1, walks["episodes"], rate))
+    return float(binom.sf(_ended(walks) - 1, walks["episodes"], rate))
 
 
 def expected_falls(predicted: Mapping, history: Sequence[Mapping]) -> float:
@@ -49,4 +53,4 @@ def expected_falls(predicted: Mapping, history: Sequence[Mapping]) -> float:
     if verdict(line) == "accept" and surprise(line) >= _SURPRISE:
         return predicted["fall_rate"]
     walks = line["measured"]
-    return max(predicted["fall_rate"], walks["fall_rate"] + walks["cut_short"] / walks["episodes"])
+    return max(predicted["fall_rate"], _ended(walks) / walks["episodes"])

@@ -78,8 +78,8 @@ def foot_motion(qpos: jax.Array, qvel: jax.Array) -> tuple[jax.Array, jax.Array]
     return qpos[:3] + offset, velocity
 
 
-def height(gravity: jax.Array, joint: jax.Array) -> jax.Array:
-    """Of the trunk over flat ground that its lower foot stands on, m; in the air, less than it is.
+def trunk_height(gravity: jax.Array, joint: jax.Array) -> jax.Array:
+    """Over flat ground that the lower foot stands on, m; in the air, less than it is.
 
     Args:
       gravity: [3] projected gravity.

@@ -131,7 +131,7 @@ def _at_ticks(run: Run, order: list[int]) -> dict[str, np.ndarray]:
     for name in JOINT_SIGNALS:
         if name in signals:
             signals[name] = signals[name][:, order]
-    by_legs = lambda: np.asarray(jax.vmap(gait.height)(signals["gravity"], signals["q"]))  # noqa: E731
+    by_legs = lambda: np.asarray(jax.vmap(gait.trunk_height)(signals["gravity"], signals["q"]))  # noqa: E731
     height = signals["pos"][:, 2] if "pos" in signals else by_legs()
     down = np.asarray(env.fallen(signals["gravity"], height)) | (signals.get("enabled", np.ones(len(height))) == 0)
     rows, aligned = _ticks(run.name, run.time, signals["action"])

@@ -169,6 +169,8 @@ def test_falls_that_the_tuned_simulator_does_not_know_are_expected_again():
     assert falls(["accept"], 0.6, 0.0, explained=0.2) == 0.6
     # One of five is none where five of a hundred fall: 1 - (1 - 6 / 102)^5 = 0.26.
     assert falls(["accept"], 0.2, 0.0, explained=0.05) == 0.0
+    # And where it is one, a fifth is a fifth, which is allowed.
+    assert falls(["accept"], float(np.float32(0.2)), 0.0, explained=0.01) == TERMS.max_fall_rate
     # What ends before its time may have been a fall.
     assert falls(["accept"], 0.2, 0.0, explained=0.01, cut_short=2) == pytest.approx(0.6)
     assert falls(["accept"], 0.0, 0.0, explained=0.9) == 0.0
