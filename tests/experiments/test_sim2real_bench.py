@@ -59,5 +59,5 @@ def test_a_policy_trained_in_the_model_that_was_found_walks_better(tmp_path):
     print(f"without: {without}\nwith: {with_it}")
     falls, fewer = (round(args.evaluation * one["fall_rate"]) for one in (without, with_it))
     assert fewer <= 0.1 * args.evaluation
-    assert falls >= fewer + 0.25 * args.evaluation
-    assert with_it["return"] > 1.2 * without["return"]
+    assert falls >= fewer + 0.5 * args.evaluation
+    assert with_it["return"] > 2 * without["return"]
