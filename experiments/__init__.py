@@ -1,1 +1,13 @@
-"""Command lines: train, tune, sweep, measure."""
+"""The commands of jaxtune, one module each: `python -m experiments` lists them.
+
+What commands share is in four packages: `common` (command line, configs, checkpoints, pages and pictures), `walking`
+(policies of BITeno and the simulators that they walk in), `discovery` (logs in, names of missing effects out) and
+`robot` (rounds with a robot that answers through files). A command imports packages and never another command.
+"""
+
+import contextlib
+import io
+
+# MJX prints two lines about an optional engine (warp) on its first import; they would head every command's output.
+with contextlib.redirect_stdout(io.StringIO()):
+    import mujoco.mjx  # noqa: F401

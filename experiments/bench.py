@@ -17,17 +17,18 @@ import numpy as np
 import tyro
 from rich.table import Table
 
-from envs import domain
 from envs.biteno import constants
 from envs.logs import Controller, Log, Run, read, write
 from envs.logs.tables import WRITERS
-from experiments import checkpoint
-from experiments.config import chosen, preset
-from experiments.loop import Loop
-from experiments.targets import TARGETS
-from experiments.train import console, run, starting_policy
+from experiments.common import checkpoint
+from experiments.common.cli import console, run
+from experiments.common.config import chosen, preset
+from experiments.walking.learner import Learner
+from experiments.walking.policies import starting_policy
+from experiments.walking.targets import TARGETS
 from jaxtune import dist as dists
 from jaxtune import tuner
+from jaxtune.mjx import parameters
 
 FIELDS = ("novelty", "threshold", "p_value")
 
@@ -57,10 +58,12 @@ def speed(args: Args) -> dict:
     for physics in ("exact", "fast"):
         sizes = preset(args.preset)
         sizes = dataclasses.replace(sizes, task=dataclasses.replace(sizes.task, physics=physics))
-        loop = Loop(sizes, chosen("legs6"))
-        dist = loop.dist(domain.nominal(loop.entries), sizes.policy_radius)
-        train = jax.jit(lambda key, policy, loop=loop, dist=dist: loop.train(key, policy, dist, loop.preset.chunk))
-        policy, key = loop.init(jax.random.PRNGKey(0)), jax.random.PRNGKey(1)
+        learner = Learner(sizes, chosen("legs6"))
+        dist = learner.dist(parameters.nominal(learner.entries), sizes.policy_radius)
+        train = jax.jit(
+            lambda key, policy, learner=learner, dist=dist: learner.train(key, policy, dist, learner.preset.chunk)
+        )
+        policy, key = learner.init(jax.random.PRNGKey(0)), jax.random.PRNGKey(1)
         seconds = []
         for _ in range(4):
             begin = time.monotonic()
@@ -75,12 +78,12 @@ def targets(args: Args) -> dict:
     """Steps a second of the shipped policy's episodes in every engine, at sub-steps of 1 ms, compilation apart."""
     sizes = preset(args.preset)
     sizes = dataclasses.replace(sizes, task=dataclasses.replace(sizes.task, physics="exact"))
-    loop = Loop(sizes, chosen("foot_friction"))
-    policy = starting_policy(args.policy, loop)
+    learner = Learner(sizes, chosen("foot_friction"))
+    policy = starting_policy(args.policy, learner)
     rows = {}
     for name, make in TARGETS.items():
         try:
-            play = loop.play(make(loop.robot, domain.nominal(loop.entries)))
+            play = learner.play(make(learner.robot, parameters.nominal(learner.entries)))
         except ValueError as error:
             console.print(f"left out: {error}", markup=False)
             continue
@@ -90,7 +93,7 @@ def targets(args: Args) -> dict:
             jax.block_until_ready(play(jax.random.PRNGKey(0), policy, sizes.ppo.num_envs, sizes.episode_steps))
             seconds.append(time.monotonic() - begin)
         speed = sizes.ppo.num_envs * sizes.episode_steps / seconds[1]
-        physics = speed * loop.robot.substeps
+        physics = speed * learner.robot.substeps
         rows[name] = {"first_call_s": seconds[0], "steps_per_second": speed, "physics_steps_per_second": physics}
     return rows
 
@@ -124,14 +127,14 @@ def logs(args: Args) -> dict:
 def alarm(args: Args) -> dict:
     """First gate calls with the target outside the radius, at its centre and drawn within it."""
     sizes = preset(args.preset)
-    loop = Loop(sizes, chosen("legs6"))
-    policy = starting_policy(args.policy, loop)
-    dist = loop.dist(domain.nominal(loop.entries), args.radius)
-    machine = loop.tuner(None)
+    learner = Learner(sizes, chosen("legs6"))
+    policy = starting_policy(args.policy, learner)
+    dist = learner.dist(parameters.nominal(learner.entries), args.radius)
+    machine = learner.tuner(None)
 
     def masses(multiplier: float) -> dict:
-        truth = {name: multiplier if name.endswith("_mass") else 1.0 for name in loop.entries}
-        return domain.to_coordinates(loop.entries, truth)
+        truth = {name: multiplier if name.endswith("_mass") else 1.0 for name in learner.entries}
+        return parameters.to_coords(learner.entries, truth)
 
     fixed = {"masses, start 0.5X": 2.0, "masses, start 1.5X": 2.0 / 3.0, "centre of the radius": 1.0}
     names = [*fixed, "drawn within the radius"]
@@ -142,7 +145,7 @@ def alarm(args: Args) -> dict:
         drawn = jax.tree.map(lambda x: x[0], dists.sample(key_draw, dist, 1))
         targets = jax.tree.map(lambda *x: jnp.stack(x), *map(masses, fixed.values()), drawn)
         each = sizes.tuner.set_episodes
-        measured = loop.simulate(key_measure, policy, jax.tree.map(lambda x: jnp.repeat(x, each), targets))
+        measured = learner.simulate(key_measure, policy, jax.tree.map(lambda x: jnp.repeat(x, each), targets))
         sets = jax.tree.map(lambda x: x.reshape(-1, each, *x.shape[1:]), measured)
         collected = machine.collect(key_collect, policy, dist)
         # The model is trained once: only its score depends on the set.

@@ -1,18 +1,15 @@
 """Says what is wrong with a log before anything is learnt from it: `python -m experiments.doctor --log LOG`."""
 
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from rich.markup import escape
 from rich.table import Table
 
-from envs import models
-from envs.diagnosis import Finding, diagnose
-from envs.logs import Log, read
-from envs.rig import hung
-from experiments import checkpoint, plots
-from experiments.train import console, run
+from envs.diagnosis import diagnose_log, shared_findings
+from envs.logs import read
+from experiments.common import checkpoint, plots
+from experiments.common.cli import console, run
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,30 +22,12 @@ class Args:
     """Folder of doctor.json and doctor.png; the log's own name in runs/doctor where not given."""
 
 
-def examine(log: Log) -> dict[str, list[Finding]]:
-    """What is suspected, by run; a run in which nothing is has an empty list."""
-    spec = models.spec(log.robot)
-    model = hung(spec) if log.base == "fixed" else spec.compile()
-    return {one.name: diagnose(one, log.joints, model, log.base) for one in log.runs}
-
-
-def summary(found: dict[str, Sequence[Finding]]) -> list[tuple[Finding, list[str]]]:
-    """Every suspicion once, in the words of its first finding, and the runs that share it, the most common first."""
-    shared: dict[tuple, tuple[Finding, dict[str, int]]] = {}
-    for name, findings in found.items():
-        for finding in findings:
-            times = shared.setdefault((finding.kind, finding.signal, finding.joints), (finding, {}))[1]
-            times[name] = times.get(name, 0) + 1
-    names = lambda times: [name if count == 1 else f"{name} ({count} times)" for name, count in times.items()]  # noqa: E731
-    return [(one, names(times)) for one, times in sorted(shared.values(), key=lambda one: -len(one[1]))]
-
-
 def main(args: Args) -> None:
     """Reads, examines, prints and draws."""
     log = read(args.log)
     out = args.out or Path("runs/doctor") / args.log.resolve().name
-    found = examine(log)
-    said = summary(found)
+    found = diagnose_log(log)
+    said = shared_findings(found)
     out.mkdir(parents=True, exist_ok=True)
     checkpoint.write_json(
         out / "doctor.json",

@@ -13,16 +13,17 @@ import jax
 import numpy as np
 from rich.table import Table
 
-from envs import domain
-from envs.biteno import constants, gait
-from envs.targets.protocol import Asked, Recording, Target
-from experiments import checkpoint, film, plots
-from experiments.checkpoint import write_json
-from experiments.config import PRESETS, chosen, named_values, preset
-from experiments.loop import Loop
-from experiments.targets import TARGETS
-from experiments.train import console, run, starting_policy
-from jaxtune.types import Trajectory
+from envs.biteno import constants
+from envs.targets.protocol import Commands
+from experiments.common import checkpoint, film, plots
+from experiments.common.checkpoint import write_json
+from experiments.common.cli import console, run
+from experiments.common.config import PRESETS, chosen, named_values, preset
+from experiments.walking.learner import Learner
+from experiments.walking.policies import starting_policy
+from experiments.walking.quality import quality, record_walks
+from experiments.walking.targets import TARGETS
+from jaxtune.mjx import parameters
 
 GRID = tuple(itertools.product((-0.4, 0.0, 0.4, 0.8), (-0.3, 0.0, 0.3), (-0.8, 0.0, 0.8)))
 """Commands forward in m/s, sideways in m/s, turning in rad/s."""
@@ -57,7 +58,7 @@ class Args:
 
 
 def check(args: Args) -> dict[str, float]:
-    """Reads the arguments; returns the target's parameters.
+    """Checks the arguments, and reads the physical values of the target that `--set` gives, by name.
 
     Raises:
       ValueError: names the field, the value and what is allowed.
@@ -72,18 +73,6 @@ def check(args: Args) -> dict[str, float]:
     return named_values("set", args.set, constants.ENTRIES)
 
 
-def measure(target: Target, key: jax.Array, act, count: int, steps: int, asked=None) -> tuple[Trajectory, Recording]:
-    """Episodes on the host, and the motion behind them."""
-    return jax.tree.map(np.asarray, target.record(key, act, count, steps, asked))
-
-
-def judge(trajectory: Trajectory, recording: Recording) -> dict[str, float]:
-    """Gait quality, and the return under the weights of Table I."""
-    values = gait.quality(**recording, alive=trajectory.alive, fell=trajectory.fell)
-    values["return"] = trajectory.score.sum(axis=1).mean()
-    return {name: float(value) for name, value in values.items()}
-
-
 def main(args: Args) -> None:
     """Measures, prints and draws."""
     checkpoint.set_up_compiler(preset(args.preset).xla_flags)
@@ -92,21 +81,21 @@ def main(args: Args) -> None:
     entries = chosen(",".join(dict.fromkeys(("foot_friction", *params))))
     task = dataclasses.replace(sizes.task, physics=args.physics)
     pushed = dataclasses.replace(task, push_mps=args.push)
-    loops = {
-        name: Loop(dataclasses.replace(sizes, task=task), entries)
+    learners = {
+        name: Learner(dataclasses.replace(sizes, task=task), entries)
         for name, task in (("none", task), ("pushes", pushed))
     }
-    policy = starting_policy(args.policy, loops["none"])
-    act = loops["none"].act(policy)
-    values = domain.nominal(entries) | params
-    targets = {name: TARGETS[args.target](loop.robot, values) for name, loop in loops.items()}
+    policy = starting_policy(args.policy, learners["none"])
+    act = learners["none"].act(policy)
+    values = parameters.nominal(entries) | params
+    targets = {name: TARGETS[args.target](learner.robot, values) for name, learner in learners.items()}
     key = jax.random.PRNGKey(args.seed)
     short, long = (round(seconds / constants.POLICY_DT_S) for seconds in (_GRID_S, task.episode_s))
     command = np.repeat(np.array(GRID, np.float32)[:, None], short, axis=1)
-    grid = measure(targets["none"], key, act, len(GRID), short, Asked(command=command))
-    rows = {"grid": judge(*grid)}
+    grid = record_walks(targets["none"], key, act, len(GRID), short, Commands(command=command))
+    rows = {"grid": quality(*grid)}
     for name, target in targets.items():
-        rows[name] = judge(*measure(target, jax.random.fold_in(key, len(rows)), act, args.episodes, long))
+        rows[name] = quality(*record_walks(target, jax.random.fold_in(key, len(rows)), act, args.episodes, long))
 
     table = Table(title=f"{args.policy} in {args.target} {' '.join(args.set)}")
     table.add_column("")
@@ -119,7 +108,7 @@ def main(args: Args) -> None:
     console.print(table)
     args.out.mkdir(parents=True, exist_ok=True)
     by_command = [
-        {"command": one, **judge(*jax.tree.map(lambda leaf, row=row: leaf[row : row + 1], grid))}
+        {"command": one, **quality(*jax.tree.map(lambda leaf, row=row: leaf[row : row + 1], grid))}
         for row, one in enumerate(GRID)
     ]
     write_json(
@@ -129,9 +118,9 @@ def main(args: Args) -> None:
     _, recording = jax.tree.map(lambda leaf: leaf[GRID.index((0.4, 0.0, 0.0))], grid)
     plots.gait(args.out / "gait.png", recording.foot_force[..., 2], recording.phase)
     try:
-        film.strip(args.out / "film.png", loops["none"].robot.mj_model, recording.qpos)
+        film.strip(args.out / "film.png", learners["none"].robot.mj_model, recording.qpos)
         if args.video:
-            film.gif(args.out / "walk.gif", loops["none"].robot.mj_model, recording.qpos)
+            film.gif(args.out / "walk.gif", learners["none"].robot.mj_model, recording.qpos)
     except film.NoPicture as error:
         console.print(f"no film: {error}", markup=False)
 

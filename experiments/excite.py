@@ -7,7 +7,6 @@ on the robot, and put what was measured beside them.
 """
 
 import shutil
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,11 +15,7 @@ import numpy as np
 
 from envs import models
 from envs.logs import Controller, Log, Run, write
-from envs.rig import hung
-from experiments.train import console, run
-
-_CHIRP_HZ = (0.5, 10.0)
-_SHARES = {"triangle": 0.35, "chirp": 0.3, "steps": 0.2, "swing": 0.15}
+from experiments.common.cli import console, run
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,100 +42,6 @@ class Args:
     """Rate of the joint controllers."""
     seed: int = 0
     """Seed of postures and steps."""
-
-
-@dataclass(frozen=True)
-class Motion:
-    """What one run asks of the robot."""
-
-    name: str
-    condition: str
-    gain: float
-    """Share of the controller's gains."""
-    split: str
-    time: np.ndarray
-    """[rows] s"""
-    target: np.ndarray
-    """[rows, joints] rad"""
-    enabled: np.ndarray
-    """[rows] 0 where the motors are off."""
-
-
-def excitation(
-    spec: mujoco.MjSpec, joints: Sequence[str], runs: int, seconds: float, rate_hz: float, seed: int = 0
-) -> list[Motion]:
-    """Motions for `runs` runs of `seconds` each.
-
-    Raises:
-      ValueError: fewer runs than can be split.
-    """
-    if runs < 4:
-        raise ValueError(f"runs: got {runs}, expected 4 or more: two to train on, one to select by and one to seal")
-    rng = np.random.default_rng(seed)
-    low, high, home = _ranges(hung(spec), joints)
-    splits = ("train", "select", "train", "sealed")
-    motions = []
-    for number in range(runs):
-        posture = home + 0.25 * (high - low) * rng.uniform(-1, 1, len(joints))
-        room = np.minimum(np.minimum(high - posture, posture - low), 0.6)
-        target, enabled = _medley(posture, np.maximum(room, 0.05), seconds, rate_hz, rng)
-        split = splits[number % len(splits)]
-        # Every split gets both gains, the one run of four to select by the lower.
-        earlier = sum(motion.split == split for motion in motions)
-        gain = (1.0, 0.5)[(earlier + (split == "select")) % 2]
-        motions.append(
-            Motion(
-                f"run_{number:03d}",
-                f"posture{number}_gain{gain:g}",
-                gain,
-                split,
-                np.arange(len(target)) / rate_hz,
-                target,
-                enabled,
-            )
-        )
-    return motions
-
-
-def _ranges(model: mujoco.MjModel, joints: Sequence[str]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Least, largest and middle position; a joint without limits may turn by a right angle each way."""
-    found = [model.joint(name) for name in joints]
-    limited = np.array([bool(model.jnt_limited[joint.id]) for joint in found])
-    span = np.array([joint.range for joint in found])
-    low, high = np.where(limited[:, None], span, [-np.pi / 2, np.pi / 2]).T
-    middle = np.where(limited, 0.5 * (low + high), np.array([joint.qpos0[0] for joint in found]))
-    return low, high, middle
-
-
-def _medley(posture, room, seconds, rate_hz, rng) -> tuple[np.ndarray, np.ndarray]:
-    rows = {name: round(share * seconds * rate_hz) for name, share in _SHARES.items()}
-    count = len(posture)
-    pieces = []
-    # Joints move at different paces, so that what one does to another shows.
-    time = np.arange(rows["triangle"]) / rate_hz
-    pace = rng.uniform(0.8, 1.6, count) / (rows["triangle"] / rate_hz) * 1.5
-    phase = (time[:, None] * pace + rng.uniform(0, 1, count)) % 1.0
-    pieces.append(posture + 0.7 * room * (4 * np.abs(phase - 0.5) - 1))
-    time = np.arange(rows["chirp"]) / rate_hz
-    length = rows["chirp"] / rate_hz
-    ratio = _CHIRP_HZ[1] / _CHIRP_HZ[0]
-    cycles = _CHIRP_HZ[0] * length / np.log(ratio) * (ratio ** (time / length) - 1)
-    fade = 0.4 / (1 + 3 * time / length)
-    pieces.append(posture + (fade[:, None] * room) * np.sin(2 * np.pi * (cycles[:, None] + rng.uniform(0, 1, count))))
-    every = max(1, round(0.15 * rate_hz))
-    levels = rng.uniform(-1, 1, (-(-rows["steps"] // every), count))
-    pieces.append(posture + 0.8 * room * np.repeat(levels, every, axis=0)[: rows["steps"]])
-    pieces.append(np.repeat(posture[None], rows["swing"], axis=0))
-    target = np.concatenate(pieces)
-    enabled = np.ones(len(target))
-    enabled[-rows["swing"] :] = 0.0
-    return target, enabled
-
-
-def scaled(controller: Controller, gain: float) -> Controller:
-    """A controller with a share of its gains."""
-    gains = {name: values * (gain if name in ("kp", "kd") else 1.0) for name, values in controller.gains.items()}
-    return Controller(kind=controller.kind, rate_hz=controller.rate_hz, gains=gains)
 
 
 def main(args: Args) -> None:

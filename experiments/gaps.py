@@ -11,14 +11,15 @@ import jax
 import numpy as np
 from rich.table import Table
 
-from envs import domain
 from envs.biteno import constants
 from envs.targets.mjx import MjxTarget
-from experiments import checkpoint, plots
-from experiments.config import preset
-from experiments.evaluate import judge
-from experiments.loop import Loop
-from experiments.train import bars, console, run, starting_policy
+from experiments.common import checkpoint, plots
+from experiments.common.cli import bars, console, run
+from experiments.common.config import preset
+from experiments.walking.learner import Learner
+from experiments.walking.policies import starting_policy
+from experiments.walking.quality import quality
+from jaxtune.mjx import parameters
 
 SWEEPS = {
     "friction": (("foot_friction",), (0.1, 0.15, 0.2, 0.3, 0.4, 0.6, 0.9, 1.2)),
@@ -67,23 +68,23 @@ def main(args: Args) -> None:
     if args.episodes < 1:
         raise ValueError(f"episodes: got {args.episodes}, expected 1 or more")
     sizes = preset(args.preset)
-    entries = domain.select(constants.ENTRIES, [name for names, _ in SWEEPS.values() for name in names])
-    loop = Loop(sizes, entries)
-    policy = starting_policy(args.policy, loop)
-    nominal = domain.nominal(entries)
-    friction = float(loop.robot.mj_model.geom(constants.FEET[0]).friction[0])
+    entries = parameters.select(constants.ENTRIES, [name for names, _ in SWEEPS.values() for name in names])
+    learner = Learner(sizes, entries)
+    policy = starting_policy(args.policy, learner)
+    nominal = parameters.nominal(entries)
+    friction = float(learner.robot.mj_model.geom(constants.FEET[0]).friction[0])
     rows = points(friction)
     key, steps = jax.random.PRNGKey(args.seed), round(sizes.task.episode_s / constants.POLICY_DT_S)
 
     @jax.jit
     def walk(policy, params):
-        return MjxTarget(robot=loop.robot, params=params).record(key, loop.act(policy), args.episodes, steps)
+        return MjxTarget(robot=learner.robot, params=params).record(key, learner.act(policy), args.episodes, steps)
 
     results = []
     with bars() as progress:
         for sweep, value, params in progress.track(rows, description="walking"):
             params = {name: np.float32(number) for name, number in (nominal | params).items()}
-            results.append({"sweep": sweep, "value": value, **judge(*jax.device_get(walk(policy, params)))})
+            results.append({"sweep": sweep, "value": value, **quality(*jax.device_get(walk(policy, params)))})
 
     table = Table(title=f"{args.policy}, untuned")
     for column in ("", "value", *SHOWN):

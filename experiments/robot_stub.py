@@ -20,9 +20,9 @@ import numpy as np
 
 from envs.biteno import constants
 from envs.logs import Log, read, write
-from experiments.player import Player
-from experiments.robot_body import ROW_S, Body, Robot
-from experiments.train import console, run
+from experiments.common.cli import console, run
+from experiments.robot.player import Player
+from experiments.robot.surrogate import ROW_S, Body, Robot
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,17 +17,22 @@ import jax
 import numpy as np
 from rich.table import Table
 
-from envs import correction, logs
+from envs import corrected, logs
 from envs.biteno import constants
 from envs.targets import recorded
-from experiments import checkpoint, export, plots, sim2real
-from experiments.checkpoint import write_json
-from experiments.config import preset
-from experiments.loop import walked
-from experiments.robot_body import Body
-from experiments.robot_folder import request, wait
-from experiments.rounds import Simulator, Terms
-from experiments.train import console, policy_config, run, starting_policy
+from experiments.common import checkpoint, plots
+from experiments.common.checkpoint import as_json, from_json, write_json
+from experiments.common.cli import console, run
+from experiments.common.config import preset
+from experiments.robot import policy_files
+from experiments.robot import transfer as transfers
+from experiments.robot.exchange import request, wait
+from experiments.robot.records import Round, WalkMeans
+from experiments.robot.rounds import Programs, Terms
+from experiments.robot.surrogate import Body
+from experiments.robot.transfer import Transfer
+from experiments.walking.learner import summarise_walks
+from experiments.walking.policies import policy_config, starting_policy
 from jaxtune.tuner import knobs
 
 METHODS = ("ours", "spm", "dr", "oracle")
@@ -66,8 +71,20 @@ class Args:
     """Noise of simulated sensors, in units of `sensing.NOISE`."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """What became of one method with one seed."""
+
+    seed: int
+    rounds: list[Round]
+    start: WalkMeans
+    """Of the policy that every method begins with."""
+    end: WalkMeans
+    """Of the policy after the last round."""
+
+
 def check(args: Args) -> None:
-    """Reads the arguments.
+    """Checks the arguments, those of every run among them.
 
     Raises:
       ValueError: names the field, the value and what is allowed.
@@ -75,7 +92,7 @@ def check(args: Args) -> None:
     for name in args.methods:
         if name not in METHODS:
             raise ValueError(f"methods: got '{name}', expected some of {', '.join(METHODS)}")
-        sim2real.check(asked(args, name, 0))
+        transfers.check(transfer_of(args, name, 0))
     if not args.methods or not args.seeds:
         raise ValueError("methods, seeds: got none, expected one or more of each")
     for option in ("rounds", "evaluation"):
@@ -83,12 +100,17 @@ def check(args: Args) -> None:
             raise ValueError(f"{option}: got {getattr(args, option)}, expected 1 or more")
 
 
-def asked(args: Args, method: str, seed: int) -> sim2real.Args:
-    """The command that plays a method's rounds."""
+def transfer_of(args: Args, method: str, seed: int) -> Transfer:
+    """Returns the run of one method with one seed, as `experiments.sim2real` would play it.
+
+    Args:
+      args: of the benchmark.
+      method: one of `METHODS`; `oracle` is `dr` around what the stand-in has, as far as the simulator can have it.
+      seed: of everything random.
+    """
     body = Body()
     truth = {"trunk_mass": body.trunk_mass, **dict.fromkeys(_LEGS, body.leg_mass)}
     start = {name: args.mass * value for name, value in truth.items()}
-    # Who knows the robot trains with what it has, as far as the simulator can have it.
     known = truth | {"foot_friction": body.foot_friction}
     how = {
         "ours": {"method": "ours", "start": start},
@@ -96,47 +118,50 @@ def asked(args: Args, method: str, seed: int) -> sim2real.Args:
         "dr": {"method": "dr", "start": start, "radius": _DR_RADIUS},
         "oracle": {"method": "dr", "start": known, "radius": preset(args.preset).policy_radius},
     }[method]
-    return sim2real.Args(
+    return Transfer(
         out=args.out / f"{method}_{seed}",
         rounds=args.rounds,
         policy=str(args.out / f"start_{seed}" / "learner"),
         model=args.model,
         noise=args.noise,
         preset=args.preset,
-        # A stand-in may fall: what that costs is what is measured.
+        # Falls cost the stand-in nothing, and how many there are is what is measured.
         terms=Terms(walk_s=args.walk_s, force=True, timeout_s=_ANSWER_S, seed=seed),
         **how | {"start": tuple(f"{name}={value:g}" for name, value in how["start"].items())},
     )
 
 
-def prepare(args: Args, learner: Simulator, seed: int) -> None:
-    """Trains the policy that every method of a seed starts with: the one that ships, at masses that are wrong."""
+def prepare(args: Args, programs: Programs, seed: int) -> None:
+    """Trains the policy that every method of a seed starts with: the one that ships, trained on at wrong masses.
+
+    Args:
+      args: of the benchmark.
+      programs: of the nominal model.
+      seed: of the training.
+    """
     place = args.out / f"start_{seed}" / "learner"
     if (place / "config.json").exists():
         return
-    loop = learner.loop
-    start = sim2real.check(asked(args, "ours", seed))[2]
-    dist = loop.dist(start, loop.preset.policy_radius)
-    state = learner.machines["ours"].init(starting_policy("walk", loop), dist, knobs())
-    state, _ = learner.train(jax.random.PRNGKey(_EVALUATION_SEED + seed), state)
-    checkpoint.save(place, state.policy.learner, policy_config(loop))
+    learner = programs.learner
+    start = transfers.check(transfer_of(args, "ours", seed))[2]
+    dist = learner.dist(start, learner.preset.policy_radius)
+    state = programs.machines["ours"].init(starting_policy("walk", learner), dist, knobs())
+    state, _ = programs.train(jax.random.PRNGKey(_EVALUATION_SEED + seed), state)
+    checkpoint.save(place, state.policy.learner, policy_config(learner))
 
 
 @contextmanager
-def robot(folder: Path):
-    """The stand-in, as a process of its own, while it is needed."""
+def stand_in(folder: Path):
+    """Runs the stand-in robot as a process of its own for the length of a `with` block.
+
+    Args:
+      folder: where it looks for requests; what it prints goes into `robot_NAME.log` beside the folder.
+    """
     folder.mkdir(parents=True, exist_ok=True)
-    command = [
-        sys.executable,
-        "-m",
-        "experiments.robot_stub",
-        "--folder",
-        str(folder.resolve()),
-        "--idle-s",
-        str(_DAY_S),
-    ]
-    with (folder.parent / f"robot_{folder.name}.log").open("a") as said:
-        process = subprocess.Popen(command, stdout=said, stderr=said, cwd=Path(__file__).parent.parent)
+    options = ["--folder", str(folder.resolve()), "--idle-s", str(_DAY_S)]
+    command = [sys.executable, "-m", "experiments.robot_stub", *options]
+    with (folder.parent / f"robot_{folder.name}.log").open("a") as output:
+        process = subprocess.Popen(command, stdout=output, stderr=output, cwd=Path(__file__).parent.parent)
         try:
             yield process
         finally:
@@ -144,47 +169,55 @@ def robot(folder: Path):
             process.wait()
 
 
-def evaluate(args: Args, learner: Simulator, policy: Path) -> dict:
-    """Return, falls and power of a policy over walks that nobody learns from."""
+def evaluate(args: Args, programs: Programs, policy: Path) -> WalkMeans:
+    """Has the stand-in walk with a policy, in walks that nothing is learnt from, and summarises them.
+
+    Args:
+      args: of the benchmark; `evaluation` walks of `walk_s` are asked for.
+      programs: whose learner loads the policy.
+      policy: its folder; the walks are kept in `round_evaluation` beside it.
+    """
     place = policy.parent / "round_evaluation"
     found = place / "evaluation.json"
     if not found.exists():
-        export.export(place / "policy", starting_policy(str(policy), learner.loop).learner, learner.loop.preset)
+        ppo = starting_policy(str(policy), programs.learner).learner
+        policy_files.export(place / "policy", ppo, programs.learner.preset)
         request(place, args.evaluation, args.walk_s, _EVALUATION_SEED)
-        with robot(policy.parent):
+        with stand_in(policy.parent):
             wait(place, _ANSWER_S)
         steps = round(args.walk_s / constants.POLICY_DT_S)
-        write_json(found, walked(*recorded.whole(recorded.episodes(logs.read(place / "log"), steps), steps)))
-    return json.loads(found.read_text())
+        write_json(found, summarise_walks(*recorded.whole(recorded.episodes(logs.read(place / "log"), steps), steps)))
+    return from_json(WalkMeans, json.loads(found.read_text()))
 
 
 def main(args: Args) -> None:
     """Plays what has not been played, evaluates, prints and draws."""
     check(args)
     checkpoint.set_up_compiler(preset(args.preset).xla_flags)
-    identity = asdict(args) | {"model_sha256": args.model and correction.read(args.model).digest}
+    identity = asdict(args) | {"model_sha256": args.model and corrected.read(args.model).digest}
     for option in ("out", "methods", "seeds"):
         del identity[option]
     checkpoint.open_run(args.out, identity)
-    learner = sim2real.simulator(asked(args, "ours", 0))
-    nominal = learner if args.model is None else sim2real.simulator(replace(asked(args, "ours", 0), model=None))
-    results: dict[str, list[dict]] = {name: [] for name in args.methods}
+    first = transfer_of(args, "ours", 0)
+    programs = transfers.compile_programs(first)
+    nominal = programs if args.model is None else transfers.compile_programs(replace(first, model=None))
+    results: dict[str, list[Outcome]] = {name: [] for name in args.methods}
     for seed in args.seeds:
         prepare(args, nominal, seed)
-        before = evaluate(args, learner, args.out / f"start_{seed}" / "learner")
+        before = evaluate(args, programs, args.out / f"start_{seed}" / "learner")
         for name in args.methods:
-            command = asked(args, name, seed)
-            with robot(command.out):
-                rounds = sim2real.play(command, learner)
-            after = evaluate(args, learner, command.out / f"round_{args.rounds:03d}" / "learner")
-            results[name].append({"seed": seed, "rounds": rounds, "start": before, "end": after})
+            transfer = transfer_of(args, name, seed)
+            with stand_in(transfer.out):
+                rounds = transfers.play(transfer, programs)
+            after = evaluate(args, programs, transfer.out / f"round_{args.rounds:03d}" / "learner")
+            results[name].append(Outcome(seed=seed, rounds=rounds, start=before, end=after))
     write_json(args.out / "summary.json", {"methods": results, "versions": checkpoint.versions()})
-    plots.transfer(args.out / "fig6.png", results)
+    plots.transfer(args.out / "fig6.png", as_json(results))
     show(args, results)
 
 
-def show(args: Args, results: dict[str, list[dict]]) -> None:
-    """Prints a row for every method: means over seeds."""
+def show(args: Args, results: dict[str, list[Outcome]]) -> None:
+    """Prints a row for every method, means over seeds."""
     model = f"in {args.model}, " if args.model else ""
     title = f"{model}masses at {args.mass:g}X, mean over {len(args.seeds)} seed(s), {args.evaluation} walks each"
     table = Table(title=title)
@@ -192,14 +225,15 @@ def show(args: Args, results: dict[str, list[dict]]) -> None:
         table.add_column(column, justify="left" if column == "method" else "right")
     for name, runs in results.items():
         change = [
-            f"{np.mean([one['start'][key] for one in runs]):.2f} -> {np.mean([one['end'][key] for one in runs]):.2f}"
-            for key in ("return", "fall_rate", "power_w")
+            f"{np.mean([getattr(one.start, key) for one in runs]):.2f} -> "
+            f"{np.mean([getattr(one.end, key) for one in runs]):.2f}"
+            for key in ("mean_return", "fall_rate", "power_w")
         ]
-        moved = [one["rounds"][-1]["tuning"]["moved"] for one in runs]
-        masses = np.mean([[ends["after"] for key, ends in one.items() if key.endswith("_mass")] for one in moved])
-        measured = [line["measured"] for one in runs for line in one["rounds"]]
-        walks = sum(one["episodes"] for one in measured) / len(runs)
-        falls = sum(one["episodes"] * one["fall_rate"] for one in measured) / len(runs)
+        moved = [one.rounds[-1].tuning.moved for one in runs]
+        masses = np.mean([[ends.after for key, ends in one.items() if key.endswith("_mass")] for one in moved])
+        measured = [line.measured for one in runs for line in one.rounds]
+        walks = sum(one.episodes for one in measured) / len(runs)
+        falls = sum(one.episodes * one.fall_rate for one in measured) / len(runs)
         table.add_row(name, *change, f"{masses:.2f}", f"{walks:.0f}", f"{falls:.1f}")
     console.print(table)
 

@@ -8,7 +8,7 @@ the paper's rule, which is the one that has a step size.
 import dataclasses
 import itertools
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,18 +17,17 @@ import jax.numpy as jnp
 import numpy as np
 from rich.table import Table
 
-from envs import domain
 from envs.targets.mjx import MjxTarget
-from experiments import checkpoint, plots
-from experiments.config import chosen, preset
-from experiments.loop import Loop, Policy
-from experiments.sim2sim import Args as TuningArgs
-from experiments.sim2sim import check as check_tuning
-from experiments.sim2sim import engine, off, true_params
-from experiments.train import console, run, starting_policy
+from experiments.common import checkpoint, plots
+from experiments.common.cli import console, run
+from experiments.common.config import Preset, chosen, preset
+from experiments.walking.cases import CASES, check_case, check_positive
+from experiments.walking.learner import Learner, Policy
+from experiments.walking.policies import starting_policy
 from jaxtune import dist as dists
 from jaxtune import tuner
-from jaxtune.types import Verdict
+from jaxtune.mjx import Entry, parameters
+from jaxtune.types import Coords, Verdict
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,75 +58,93 @@ class Args:
     """Parameters that are tuned: legs6, whole_body, or names joined by commas."""
 
 
-def check(args: Args) -> TuningArgs:
-    """Checks every combination as `experiments.sim2sim` would check it alone.
+def check(args: Args) -> tuple[Preset, dict[str, Entry]]:
+    """Checks the arguments, every combination of knobs included, before anything is compiled.
+
+    Returns:
+      Sizes, with those of a sweep in the place of a single tuning's, and the table of parameters that are tuned.
 
     Raises:
       ValueError: names the field, the value and what is allowed.
     """
-    shared = {
-        field: getattr(args, field) for field in ("out", "case", "start", "seeds", "preset", "policy", "parameters")
-    }
-    for step_size, widen_factor, radius, level in itertools.product(
-        args.step_sizes, args.widen_factors, args.radii, args.levels
-    ):
-        one = TuningArgs(**shared, step_size=step_size, widen_factor=widen_factor, radius=radius, level=level)
-        check_tuning(one)
-    if engine(one) != "mjx":
-        raise ValueError(f"case: got '{one.case}', but a sweep is one program and needs a target in mjx")
-    return one
+    sizes, entries = preset(args.preset), chosen(args.parameters)
+    check_case(args.case, args.start, entries, args.parameters)
+    combinations = itertools.product(args.step_sizes, args.widen_factors, args.radii, args.levels)
+    for step_size, widen_factor, radius, level in combinations:
+        check_positive(radius=radius, seeds=args.seeds)
+        tuner.knobs(step_size=step_size, widen_factor=widen_factor, level=level)
+    if CASES[args.case].target != "mjx":
+        raise ValueError(f"case: got '{args.case}', but a sweep is one program and needs a target in mjx")
+    return dataclasses.replace(sizes, tuner=sizes.sweep, episode_steps=sizes.sweep_steps), entries
 
 
 def lanes(args: Args) -> np.ndarray:
-    """All combinations, [step sizes, widening factors, radii, levels, seeds, 5]."""
+    """Lists all combinations of knobs and seed as a grid, one lane of the vmapped program each.
+
+    Returns:
+      [step sizes, widening factors, radii, levels, seeds, 5], the last axis in that order.
+    """
     axes = (args.step_sizes, args.widen_factors, args.radii, args.levels, range(args.seeds))
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
 
 
-def program(args: Args, loop: Loop, policy: Policy):
-    """The sweep as one function of its lanes [lanes, 5]; returns state and info, [lanes, ...]."""
-    target = MjxTarget(robot=loop.robot, params=true_params(args, loop.entries))
-    fixed = dataclasses.replace(
-        loop.tuner(target),
-        train_policy=lambda key, policy, dist: (policy, {}),
-        update=tuner.vote_update,
-    )
-    dist = loop.dist(domain.nominal(loop.entries), 1.0)
+def program(args: Args, learner: Learner, policy: Policy) -> Callable:
+    """Compiles the sweep as one function of its lanes, [lanes, 5] -> (distribution, info), both [lanes, ...].
+
+    The policy never trains, so that a lane costs simulation and the tuner's own models alone.
+    """
+    target = MjxTarget(robot=learner.robot, params=CASES[args.case].true_params(learner.entries, args.start))
+    fixed = dataclasses.replace(learner.tuner(target), train_policy=_keep, update=tuner.vote_update)
+    dist = learner.dist(parameters.nominal(learner.entries), 1.0)
 
     def one(step_size, widen_factor, radius, level, seed):
         knobs = tuner.knobs().replace(step_size=step_size, widen_factor=widen_factor, level=level)
         begin = dist.replace(radius=dict.fromkeys(dist.radius, radius))
         state = fixed.init(policy, begin, knobs)
-        state, info = fixed.run(jax.random.PRNGKey(seed.astype(int)), state, loop.preset.sweep_tunings)
-        # Policy and episodes are the same or of no use in every lane.
+        state, info = fixed.run(jax.random.PRNGKey(seed.astype(int)), state, learner.preset.sweep_tunings)
+        # The policy is the same in every lane, and returning it would copy it as often.
         return state.dist, info
 
     return jax.jit(lambda columns: jax.vmap(one)(*columns.T))
 
 
-def errors(loop: Loop, truth: dict, centre: dict, off: Sequence[str]) -> np.ndarray:
-    """Mean of |estimate / truth - 1| over the parameters that were off, [lanes]."""
-    estimate = domain.from_coordinates(loop.entries, centre)
+def _keep(key, policy, dist):
+    """Returns the policy as it is: the tuner's `train_policy` where nothing is trained."""
+    return policy, {}
+
+
+def mean_error(learner: Learner, truth: Mapping[str, float], centre: Coords, off: Sequence[str]) -> np.ndarray:
+    """Averages |estimate / truth - 1| over the parameters whose true value is not nominal.
+
+    Args:
+      learner: holds the table that turns coordinates into physical values.
+      truth: physical values by name.
+      centre: estimates in coordinates, [lanes] by name.
+      off: names that are averaged over.
+
+    Returns:
+      [lanes]
+    """
+    estimate = parameters.from_coords(learner.entries, centre)
     return np.mean([np.abs(np.asarray(estimate[name]) / truth[name] - 1) for name in off], axis=0)
 
 
 def main(args: Args) -> None:
-    """Runs the sweep; prints a table; writes summary.json and heat_map.png."""
+    """Runs the sweep, prints a table, and writes summary.json and heat_map.png."""
     checkpoint.set_up_compiler(preset(args.preset).xla_flags)
-    one = check(args)
-    sizes, entries = preset(args.preset), chosen(args.parameters)
-    sizes = dataclasses.replace(sizes, tuner=sizes.sweep, episode_steps=sizes.sweep_steps)
-    loop = Loop(sizes, entries)
+    sizes, entries = check(args)
+    learner = Learner(sizes, entries)
     checkpoint.open_run(args.out, {**dataclasses.asdict(args), "out": None, "sizes": sizes})
-    policy = starting_policy(one.policy, loop, args.out)
+    policy = starting_policy(args.policy, learner, args.out)
     grid = lanes(args)
-    sweep = program(args, loop, policy)
+    sweep = program(args, learner, policy)
     begin = time.monotonic()
     dist, info = jax.block_until_ready(sweep(jnp.asarray(grid.reshape(-1, grid.shape[-1]))))
     seconds = time.monotonic() - begin
 
-    astray = off(args, entries)
-    final = errors(loop, true_params(args, loop.entries), dist.centre, astray).reshape(grid.shape[:-1])
+    case = CASES[args.case]
+    off = case.off(entries)
+    final = mean_error(learner, case.true_params(entries, args.start), dist.centre, off).reshape(grid.shape[:-1])
     calls = np.asarray(info.calls).sum(axis=-1).reshape(grid.shape[:-1])
     names = ("step_size", "widen_factor", "radius", "level")
     rows = [
@@ -144,7 +161,7 @@ def main(args: Args) -> None:
             "case": args.case,
             "start": args.start,
             "preset": args.preset,
-            "off": astray,
+            "off": off,
             "lanes": grid[..., 0].size,
             "rows": rows,
             "params": dists.names(dist),

@@ -28,7 +28,7 @@ def pytest_configure(config):
     config.addinivalue_line("filterwarnings", "ignore:JAXopt is no longer maintained:DeprecationWarning")
     # What tests compile they run briefly. Flags are read when JAX makes its first array.
     with warnings.catch_warnings(action="ignore"):
-        from experiments.config import QUICK_COMPILATION
+        from experiments.common.config import QUICK_COMPILATION
     os.environ.setdefault("XLA_FLAGS", QUICK_COMPILATION)
 
 

@@ -10,11 +10,11 @@ import pytest
 from envs.logs import Controller, read, splits, write
 from envs.segments import noise
 from experiments import discover, discovery_bench
+from experiments.discovery.blind_robots import OUTSIDE, Truth, record
+from experiments.discovery.scores import score, tally, wilson
+from experiments.discovery.setup import ask, gate, hypotheses, measure_scales, place_sets
 from experiments.discovery_bench import ARM, SIZES
-from experiments.discovery_scores import score, tally, wilson
 from experiments.excite import excitation
-from experiments.hidden import OUTSIDE, Truth, record
-from experiments.question import ask, gate, hypotheses, measure_scales, place_sets
 
 JOINTS = ("shoulder", "elbow")
 GAINS = {"kp": np.array([40.0, 20.0]), "kd": np.array([2.0, 0.8]), "torque_limit_nm": np.array([15.0, 15.0])}

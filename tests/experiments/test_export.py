@@ -16,50 +16,50 @@ from envs import logs, sensing
 from envs.biteno import constants, env, gait
 from envs.targets import recorded
 from experiments import export, robot_stub
-from experiments.config import preset
-from experiments.loop import Loop
-from experiments.player import Player
-from experiments.robot_body import Body, Robot
-from experiments.train import starting_policy
+from experiments.common.config import preset
+from experiments.robot.player import Player
+from experiments.robot.surrogate import Body, Robot
+from experiments.walking.learner import Learner
+from experiments.walking.policies import starting_policy
 
 
 @pytest.fixture(scope="module")
 def walk():
-    """The loop and its policy."""
-    loop = Loop(preset("cpu"), {})
-    return loop, starting_policy("walk", loop)
+    """The learner and its policy."""
+    learner = Learner(preset("cpu"), {})
+    return learner, starting_policy("walk", learner)
 
 
 @pytest.fixture(scope="module")
 def folder(walk, tmp_path_factory):
-    loop, policy = walk
+    learner, policy = walk
     out = tmp_path_factory.mktemp("export") / "policy"
-    export.export(out, policy.learner, loop.preset)
+    export.export(out, policy.learner, learner.preset)
     return out
 
 
 @pytest.fixture(scope="module")
 def played(walk):
     """States of ten steps of eight robots, and what was done in them."""
-    loop, policy = walk
-    act = loop.act(policy)
+    learner, policy = walk
+    act = learner.act(policy)
 
     def step(state, key):
         action, _ = act(state.obs, key)
-        drive = loop.robot.drive({}, state, action)
-        return loop.robot.settle(state, drive, loop.robot.simulate({}, state, drive)), (state, drive)
+        drive = learner.robot.drive({}, state, action)
+        return learner.robot.settle(state, drive, learner.robot.simulate({}, state, drive)), (state, drive)
 
-    start = jax.vmap(lambda key: loop.robot.reset({}, key))(jax.random.split(jax.random.PRNGKey(0), 8))
+    start = jax.vmap(lambda key: learner.robot.reset({}, key))(jax.random.split(jax.random.PRNGKey(0), 8))
     run = jax.jit(jax.vmap(lambda state: jax.lax.scan(step, state, jax.random.split(jax.random.PRNGKey(1), 10))[1]))
     return jax.device_get(run(start))
 
 
 def test_onnxruntime_does_what_flax_does(walk, folder, played):
-    loop, policy = walk
+    learner, policy = walk
     session = onnxruntime.InferenceSession(folder / "policy.onnx", providers=["CPUExecutionProvider"])
     obs = np.concatenate([played[0].obs.reshape(-1, 40), np.random.default_rng(0).normal(0, 1, (500, 40))])
     obs = obs.astype(np.float32)
-    expected = loop.act(policy)(jnp.asarray(obs), jax.random.PRNGKey(0))[0]
+    expected = learner.act(policy)(jnp.asarray(obs), jax.random.PRNGKey(0))[0]
     (found,) = session.run(None, {"obs": obs})
     assert np.abs(expected).max() > 1.0
     np.testing.assert_allclose(found, expected, atol=1e-5, rtol=1e-5)

@@ -8,28 +8,30 @@ import numpy as np
 import pytest
 
 from envs import domain
-from experiments import checkpoint
-from experiments.config import PRESETS, WALK, chosen
-from experiments.loop import Loop
-from experiments.train import policy_config
+from experiments.common import checkpoint
+from experiments.common.config import PRESETS, WALK, chosen
+from experiments.walking.learner import Learner
+from experiments.walking.policies import policy_config
 
 
 @pytest.fixture(scope="module")
-def loop():
-    return Loop(PRESETS["smoke"], chosen("foot_friction"), chosen("torque_scale"))
+def learner():
+    return Learner(PRESETS["smoke"], chosen("foot_friction"), chosen("torque_scale"))
 
 
 @pytest.fixture(scope="module")
-def train(loop):
-    dist = loop.dist(domain.nominal(loop.entries), 0.3)
-    return jax.jit(lambda key, policy: loop.train(key, policy, dist, 1))
+def train(learner):
+    dist = learner.dist(domain.nominal(learner.entries), 0.3)
+    return jax.jit(lambda key, policy: learner.train(key, policy, dist, 1))
 
 
-def test_saved_policy_takes_the_same_next_step(loop, train, tmp_path):
-    policy = loop.init(jax.random.PRNGKey(0))
-    checkpoint.save(tmp_path, policy.learner, policy_config(loop))
-    other = loop.init(jax.random.PRNGKey(7))
-    loaded = other.replace(learner=checkpoint.load(tmp_path, other.learner, policy_config(loop)), robots=policy.robots)
+def test_saved_policy_takes_the_same_next_step(learner, train, tmp_path):
+    policy = learner.init(jax.random.PRNGKey(0))
+    checkpoint.save(tmp_path, policy.learner, policy_config(learner))
+    other = learner.init(jax.random.PRNGKey(7))
+    loaded = other.replace(
+        learner=checkpoint.load(tmp_path, other.learner, policy_config(learner)), robots=policy.robots
+    )
     expected, _ = train(jax.random.PRNGKey(1), policy)
     found, metrics = train(jax.random.PRNGKey(1), loaded)
     jax.tree.map(np.testing.assert_array_equal, found, expected)
@@ -39,36 +41,36 @@ def test_saved_policy_takes_the_same_next_step(loop, train, tmp_path):
     assert train._cache_size() == 1
 
 
-def test_robots_train_within_the_policy_radius_and_with_hidden_parameters(loop, train):
-    policy = loop.init(jax.random.PRNGKey(0))
+def test_robots_train_within_the_policy_radius_and_with_hidden_parameters(learner, train):
+    policy = learner.init(jax.random.PRNGKey(0))
     other = policy.replace(radius=jnp.float32(0.2), hidden={"torque_scale": jnp.float32(0.75)})
     drawn, wider = (train(jax.random.PRNGKey(1), one)[0].robots.info["params"] for one in (policy, other))
     np.testing.assert_array_equal(drawn["torque_scale"], 1.0)
     np.testing.assert_array_equal(wider["torque_scale"], 0.75)
     # The distribution's radius is 0.3.
-    for params, radius in ((drawn, loop.preset.policy_radius), (wider, 0.2)):
+    for params, radius in ((drawn, learner.preset.policy_radius), (wider, 0.2)):
         spread = np.abs(np.log(params["foot_friction"]))
         assert 0.5 * radius < spread.max() <= radius + 1e-6
     assert train._cache_size() == 1
 
 
-def test_policy_of_another_config_is_refused(loop, tmp_path):
-    learner = loop.init(jax.random.PRNGKey(0)).learner
-    checkpoint.save(tmp_path, learner, policy_config(loop))
-    task = dataclasses.replace(loop.preset.task, action_scale=0.5)
-    other = Loop(dataclasses.replace(loop.preset, task=task), loop.entries)
+def test_policy_of_another_config_is_refused(learner, tmp_path):
+    learner = learner.init(jax.random.PRNGKey(0)).learner
+    checkpoint.save(tmp_path, learner, policy_config(learner))
+    task = dataclasses.replace(learner.preset.task, action_scale=0.5)
+    other = Learner(dataclasses.replace(learner.preset, task=task), learner.entries)
     with pytest.raises(ValueError, match=r"config\.action_scale is 0\.25 there, expected 0\.5"):
         checkpoint.load(tmp_path, learner, policy_config(other))
 
 
-def test_missing_policy_is_named(loop, tmp_path):
+def test_missing_policy_is_named(learner, tmp_path):
     with pytest.raises(ValueError, match=r"policy: .*no config\.json"):
-        checkpoint.load(tmp_path, None, policy_config(loop))
+        checkpoint.load(tmp_path, None, policy_config(learner))
 
 
-def test_shipped_policy_loads_and_has_learnt(loop):
-    fresh = loop.init(jax.random.PRNGKey(0)).learner
-    shipped = checkpoint.load(WALK, fresh, policy_config(loop))
+def test_shipped_policy_loads_and_has_learnt(learner):
+    fresh = learner.init(jax.random.PRNGKey(0)).learner
+    shipped = checkpoint.load(WALK, fresh, policy_config(learner))
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(shipped.params))
     # A learner that has seen the task knows that joints do not all move alike.
     assert np.ptp(shipped.normalizer.std) > 0.1

@@ -10,7 +10,7 @@ from envs import logs
 from envs.biteno import constants
 from envs.logs import Controller
 from experiments import excite, robot_stub
-from experiments.robot_body import Body, Robot
+from experiments.robot.surrogate import Body, Robot
 
 EXACT = Body(encoder_rad=1e-9, velocity_noise_rad_s=0.0, transport_s=0.0, motor_lag_s=0.0)
 

@@ -14,21 +14,15 @@ import pytest
 from rich.console import Console
 
 from envs.diagnosis import Finding
-from experiments import (
-    checkpoint,
-    doctor,
-    expected,
-    robot_folder,
-    robot_stub,
-    rounds,
-    sim2real,
-    sim2real_bench,
-    sim2real_report,
-    train,
-)
-from experiments.robot_body import Body, Robot
-from experiments.rounds import Run, Terms
-from experiments.train import starting_policy
+from experiments import doctor, robot_stub, sim2real, sim2real_bench, train
+from experiments.common import checkpoint
+from experiments.robot import exchange as robot_folder
+from experiments.robot import fall_risk as expected
+from experiments.robot import report as sim2real_report
+from experiments.robot import rounds
+from experiments.robot.rounds import Run, Terms
+from experiments.robot.surrogate import Body, Robot
+from experiments.walking.policies import starting_policy
 
 TERMS = Terms(walk_s=0.8, force=True, timeout_s=0.0, seed=0)
 ARGS = sim2real.Args(preset="smoke", terms=TERMS, rounds=2)

@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 import experiments
-from experiments import checkpoint, sim2real, sim2real_bench
+from experiments import sim2real, sim2real_bench
+from experiments.common import checkpoint
 from experiments.sim2real_bench import Args, asked, evaluate, robot
 
 PACKAGE = Path(experiments.__file__).parent

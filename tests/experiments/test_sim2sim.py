@@ -7,8 +7,9 @@ import jax
 import numpy as np
 import pytest
 
-from experiments import checkpoint, plots, report, sim2sim, sweep
-from experiments.config import PRESETS
+from experiments import sim2sim, sweep
+from experiments.common import checkpoint, plots, report
+from experiments.common.config import PRESETS
 
 
 @pytest.mark.parametrize(
@@ -122,7 +123,7 @@ def test_summary_has_the_promised_keys(tmp_path):
 def test_finished_pairs_are_not_run_again(tmp_path, monkeypatch):
     runner = object.__new__(sim2sim.Runner)
     runner._args = sim2sim.Args(out=tmp_path)
-    runner._loop = type("Loop", (), {"preset": PRESETS["smoke"]})
+    runner._loop = type("Learner", (), {"preset": PRESETS["smoke"]})
     runner._methods = {"ours": sim2sim.Method(None, None, None, 1)}
     calls = []
 

@@ -1,4 +1,4 @@
-"""Targets that are not JAX, in the loop and on the command line."""
+"""Targets that are not JAX, in the learner and on the command line."""
 
 import json
 import sys
@@ -11,8 +11,9 @@ import pytest
 import toys
 
 import envs.targets
-from experiments import evaluate, film, sim2sim
-from experiments.loop import Loop
+from experiments import evaluate, sim2sim
+from experiments.common import film
+from experiments.walking.learner import Learner
 from jaxtune import tuner as tuners
 from jaxtune.types import Verdict
 
@@ -45,8 +46,8 @@ def test_a_step_with_a_foreign_target_is_that_of_the_tuner():
         return machine.measure(key, policy)
 
     sizes = sim2sim.preset("smoke")
-    loop = types.SimpleNamespace(preset=sizes, _train=jax.jit(toys.train_policy))
-    step = Loop.step(loop, machine, play)
+    learner = types.SimpleNamespace(preset=sizes, _train=jax.jit(toys.train_policy))
+    step = Learner.step(learner, machine, play)
     got, expected = step(jax.random.key(0), state), jax.jit(machine.step)(jax.random.key(0), state)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), got, expected)
     assert traces == [False]

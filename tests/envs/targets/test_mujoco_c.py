@@ -108,9 +108,9 @@ def test_a_time_step_that_does_not_fit_is_named(robot):
 
 
 def test_the_shipped_policy_walks_20_seconds():
-    from experiments.config import chosen, preset
-    from experiments.loop import Loop
-    from experiments.train import starting_policy
+    from experiments.common.config import chosen, preset
+    from experiments.walking.learner import Loop
+    from experiments.walking.policies import starting_policy
 
     sizes = preset("cpu")
     loop = Loop(dataclasses.replace(sizes, task=dataclasses.replace(sizes.task, physics="exact")), chosen("legs6"))

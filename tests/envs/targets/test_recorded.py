@@ -13,9 +13,9 @@ from envs.biteno import constants
 from envs.logs import Controller, Log, Run
 from envs.logs.sampling import HELD
 from envs.targets import mujoco_c, recorded
-from experiments.config import preset
-from experiments.loop import Loop
-from experiments.train import starting_policy
+from experiments.common.config import preset
+from experiments.walking.learner import Loop
+from experiments.walking.policies import starting_policy
 from jaxtune import windows
 
 STEPS, LENGTH = 200, 50

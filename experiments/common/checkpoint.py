@@ -1,4 +1,7 @@
-"""Saving and loading, and the folder of a run: what was asked, with what, and what came of it."""
+"""Saving and loading: checkpoints, JSON, and the folder of a run with its config and versions.
+
+Every file is written whole or not at all, since a run may be killed at any moment and must go on from what it left.
+"""
 
 import dataclasses
 import importlib.metadata
@@ -6,6 +9,7 @@ import json
 import os
 import platform
 import subprocess
+import typing
 from pathlib import Path
 from typing import Any
 
@@ -15,14 +19,17 @@ import orbax.checkpoint as ocp
 
 _PACKAGES = ("jaxtune", "jax", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "orbax-checkpoint", "numpy")
 
-_DRAFT = ".tmp"  # of a file that is being written, or was when a run was killed
+_DRAFT = ".tmp"  # suffix of a file that is being written, or that a killed run left behind
 
 
 def set_up_compiler(xla_flags: str) -> None:
-    """Adds a preset's flags to XLA_FLAGS, and keeps what is compiled, so that a second run starts quicker.
+    """Sets the compiler's flags, and keeps compiled programs on disk so that a second run starts sooner.
 
-    To be called before JAX makes its first array, which is when it reads the flags. Programs are kept in the user's
-    cache folder, or where `JAX_COMPILATION_CACHE_DIR` says.
+    Call it before JAX makes its first array, because JAX reads the flags then and never again. Programs are kept in the
+    user's cache folder, or where `JAX_COMPILATION_CACHE_DIR` says.
+
+    Args:
+      xla_flags: added to `XLA_FLAGS`.
     """
     if xla_flags:
         os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {xla_flags}".strip()
@@ -34,13 +41,20 @@ def set_up_compiler(xla_flags: str) -> None:
 
 
 def a_device_a_core(most: int = 8) -> str:
-    """The flag that makes every core which this process may use a device of its own, for what shares its work out."""
+    """Returns the XLA flag that makes every core of this process a JAX device, for programs that shard their work.
+
+    Args:
+      most: largest number of devices.
+    """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return f"--xla_force_host_platform_device_count={min(cores, most)}"
 
 
 def versions() -> dict[str, str]:
-    """Versions of what a result depends on, the device, and the git revision where there is one."""
+    """Lists what a result depends on beside its config: versions of packages, the device, and the git revision.
+
+    Every summary and config holds it, so that a number can be traced to the code that produced it.
+    """
     found = {"python": platform.python_version(), "device": jax.devices()[0].device_kind}
     for package in _PACKAGES:
         try:
@@ -60,9 +74,14 @@ def versions() -> dict[str, str]:
 
 
 def as_json(value: Any) -> Any:
-    """Dataclasses, arrays and tuples to what `json` writes; numbers that are not finite become null."""
+    """Converts dataclasses, arrays, paths and tuples to what `json` can write.
+
+    A dataclass becomes an object with its fields' names as keys, or `metadata["key"]` where a field has another name in
+    files. Numbers that are not finite become null: JSON has no form for them, and Python's own (`NaN`) is refused
+    elsewhere.
+    """
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {field.name: as_json(getattr(value, field.name)) for field in dataclasses.fields(value)}
+        return {_key(field): as_json(getattr(value, field.name)) for field in dataclasses.fields(value)}
     if isinstance(value, dict):
         return {str(name): as_json(item) for name, item in value.items()}
     if isinstance(value, (list, tuple)):
@@ -76,18 +95,48 @@ def as_json(value: Any) -> Any:
     return None if isinstance(value, float) else value
 
 
+def from_json(kind: Any, value: Any) -> Any:
+    """Reads what `as_json` made of a dataclass: the inverse, by the types of its fields.
+
+    Args:
+      kind: a dataclass, or a type that one of its fields may have (`tuple[T, ...]`, `dict[str, T]`, numbers, texts).
+      value: what `json` has read.
+
+    Raises:
+      KeyError: a field is missing.
+    """
+    if dataclasses.is_dataclass(kind):
+        types = typing.get_type_hints(kind)
+        return kind(**{f.name: from_json(types[f.name], value[_key(f)]) for f in dataclasses.fields(kind)})
+    if typing.get_origin(kind) is tuple:
+        return tuple(from_json(typing.get_args(kind)[0], item) for item in value)
+    if typing.get_origin(kind) is dict:
+        return {name: from_json(typing.get_args(kind)[1], item) for name, item in value.items()}
+    return value
+
+
+def _key(field: dataclasses.Field) -> str:
+    return field.metadata.get("key", field.name)
+
+
 def write_json(path: Path, value: Any) -> None:
-    """Writes JSON whole or not at all."""
+    """Writes JSON whole or not at all, by renaming a finished draft into place."""
     draft = path.with_suffix(f".{os.getpid()}{_DRAFT}")
     draft.write_text(json.dumps(as_json(value), indent=1) + "\n")
     draft.replace(path)
 
 
 def open_run(out: Path, config: Any) -> None:
-    """Makes a run's folder, or goes on in one of the same config.
+    """Makes the folder of a run and writes its config, or checks that an earlier run there had the same one.
+
+    A command calls it before it computes anything: results of two configs must never mix in one folder.
+
+    Args:
+      out: the folder.
+      config: everything that the results depend on.
 
     Raises:
-      ValueError: the folder holds a run of another config; names the first field that differs.
+      ValueError: the folder holds a run of another config (names the first field that differs), or other files.
     """
     wanted = as_json(config)
     path = out / "config.json"
@@ -101,17 +150,28 @@ def open_run(out: Path, config: Any) -> None:
 
 
 def save(path: Path, state: Any, config: Any) -> None:
-    """Writes a pytree of arrays with the config that it belongs to."""
+    """Writes a pytree of arrays as an orbax checkpoint, with the config that `load` will ask for.
+
+    Args:
+      path: folder of the checkpoint.
+      state: the pytree.
+      config: what a program that loads the state must agree in.
+    """
     with ocp.StandardCheckpointer() as checkpointer:
         checkpointer.save(path.absolute() / "state", state, force=True)
     write_json(path / "config.json", {"config": as_json(config), "versions": versions()})
 
 
 def load(path: Path, like: Any, config: Any) -> Any:
-    """Reads a pytree of the same structure and shapes as `like`.
+    """Reads a pytree that `save` wrote.
+
+    Args:
+      path: folder of the checkpoint.
+      like: a pytree of the same structure, shapes and types.
+      config: what the state must have been saved with.
 
     Raises:
-      ValueError: there is none, or it belongs to another config; names the first field that differs.
+      ValueError: there is no checkpoint, or one of another config; names the first field that differs.
     """
     stored = path / "config.json"
     if not stored.exists():
@@ -119,7 +179,7 @@ def load(path: Path, like: Any, config: Any) -> Any:
     _same(f"policy: {path} was made with another config", json.loads(stored.read_text())["config"], as_json(config))
     with ocp.StandardCheckpointer() as checkpointer:
         state = checkpointer.restore(path.absolute() / "state", jax.tree.map(ocp.utils.to_shape_dtype_struct, like))
-    # Orbax ties arrays to their device; a step whose input is tied and whose output is not would be compiled twice.
+    # Orbax commits arrays to a device, and a step with committed input and uncommitted output would compile twice.
     return jax.tree.map(jnp.asarray, jax.device_get(state))
 
 

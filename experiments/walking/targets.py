@@ -1,4 +1,4 @@
-"""Targets by name."""
+"""The simulators that can play the target, by the name that commands give them."""
 
 from collections.abc import Callable, Mapping
 
@@ -9,7 +9,7 @@ from envs.targets.protocol import Target
 
 
 def _bullet(robot: Biteno, params: Mapping[str, float]) -> Target:
-    # Not everyone has PyBullet.
+    # Imported late, because PyBullet is an optional dependency.
     from envs.targets import bullet
 
     return bullet.target(robot, params)
@@ -20,3 +20,4 @@ TARGETS: dict[str, Callable[[Biteno, Mapping[str, float]], Target]] = {
     "mujoco_c": mujoco_c.target,
     "bullet": _bullet,
 }
+"""`(robot, physical values by name) -> target` by engine: MJX, MuJoCo C, or PyBullet (extra `bullet`)."""

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from envs.effects import LIBRARY
-from experiments.hidden import OUTSIDE
+from experiments.discovery.blind_robots import OUTSIDE
 
 SEVERITIES = (2.0, 5.0, 15.0)
 """Floor units."""

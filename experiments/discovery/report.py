@@ -6,8 +6,8 @@ from rich.console import Console
 from rich.table import Table
 
 from envs.logs import Log
-from experiments import plots, report
-from experiments.question import Question
+from experiments.common import plots, report
+from experiments.discovery.setup import Question
 from jaxtune.discovery.result import Result
 
 VERDICTS = {

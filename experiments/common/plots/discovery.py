@@ -8,7 +8,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from envs.logs import Run
-from experiments.plots.base import save
+from experiments.common.plots.base import save
 
 
 def suspicions(path: Path, run: Run, joints: Sequence[str], titles: Sequence[str]) -> None:

@@ -48,6 +48,36 @@ class _Simulator:
         return {name: read[name] for name in self.signals}
 
 
+def gathered(folders: tuple[Path, ...]) -> Log:
+    """One log of several.
+
+    Raises:
+      ValueError: they are not of one robot, or its base is free.
+    """
+    logs = [
+        read(folder) if (folder / "meta.yaml").exists() or not _xl330(folder) else read_xl330(folder)
+        for folder in folders
+    ]
+    if not logs:
+        raise ValueError("logs: got none, expected one or more")
+    first = logs[0]
+    for folder, log in zip(folders, logs, strict=True):
+        if log.base != "fixed":
+            raise ValueError(f"{folder}: base: got '{log.base}', expected 'fixed': hang or clamp the robot")
+        if log.joints != first.joints:
+            raise ValueError(f"{folder}: joints: got {log.joints}, expected {first.joints}")
+        if models.spec(log.robot).to_xml() != models.spec(first.robot).to_xml():
+            raise ValueError(f"{folder}: robot: got {log.robot}, expected the same model as {first.robot}")
+    if len(logs) == 1:
+        return first
+    runs = tuple(replace(run, name=f"{run.name}_{number}") for number, log in enumerate(logs) for run in log.runs)
+    return replace(first, runs=runs)
+
+
+def _xl330(folder: Path) -> bool:
+    return any(folder.glob("*.json"))
+
+
 def ask(
     log: Log,
     spec: mujoco.MjSpec,

@@ -7,7 +7,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from envs.biteno.constants import DUTY, POLICY_DT_S
-from experiments.plots.base import save
+from experiments.common.plots.base import save
 
 
 def gaps(path: Path, rows: Sequence[dict], shown: dict[str, str], nominal: dict[str, float]) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 from envs.biteno import TaskConfig, constants, env
 from envs.logs import Controller, Run
 from envs.rig import hung
-from experiments.player import Player
+from experiments.robot.player import Player
 
 _STEP_S = 0.0005
 _TICK_S = 0.001  # of the joints' controllers

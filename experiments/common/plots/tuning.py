@@ -7,7 +7,7 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 
-from experiments.plots.base import COLOURS, save, spread
+from experiments.common.plots.base import COLOURS, save, spread
 
 _MARKS = {"accept": "o", "widen": "^", "unexplained": "X", "radius_exhausted": "s", "not_finite": "x"}
 

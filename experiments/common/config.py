@@ -1,46 +1,53 @@
-"""Sizes of the experiments: what a preset buys, each number a field."""
+"""Sizes of the experiments: every number that decides how long a run takes and how good it can get, by preset.
+
+`smoke` runs every command in seconds to minutes and shows that it works, not that it tunes; `cpu` is for two cores, `gpu`
+for one data-centre GPU.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from envs import domain
 from envs.biteno import TaskConfig, constants
 from jaxtune.dvm import DVMConfig
+from jaxtune.mjx import Entry, select
 from jaxtune.ppo import PPOConfig
 from jaxtune.spm import SPMConfig
 from jaxtune.tuner import TunerConfig
 
-WALK = Path(__file__).parent / "policies" / "walk"
+WALK = Path(__file__).parents[1] / "policies" / "walk"
 """The policy that ships with the package."""
 
 QUICK_COMPILATION = "--xla_backend_optimization_level=0 --xla_backend_extra_options=xla_cpu_disable_new_fusion_emitters"
-"""Flags for runs of seconds, which are not worth minutes of optimisation."""
+"""XLA flags of the preset `smoke` and of the tests: programs that run for seconds are not worth minutes of compiling."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Preset:
-    """Everything that decides how long an experiment takes."""
+    """Sizes of one kind of run: task, PPO, tuner, and how much is simulated and evaluated.
+
+    A run writes its preset into `config.json`, and goes on only in a folder whose preset is the same.
+    """
 
     task: TaskConfig = field(default_factory=lambda: TaskConfig(physics="fast", base="raibert"))
     ppo: PPOConfig = field(default_factory=PPOConfig)
     tuner: TunerConfig = field(default_factory=TunerConfig)
     push_mps: float = 0.5
-    """Speed of the pushes that the policy trains with; nothing else has any."""
+    """Speed of the pushes that the policy trains with. Tuning and evaluation have none."""
     policy_radius: float = 0.1
-    """The policy trains within this radius of the centre, however wide the tuner's own is."""
+    """Largest radius, in coordinates, that the policy trains in, however wide the tuner's distribution is."""
     episode_steps: int = 250
     """Steps of a simulated or measured episode."""
     epochs: int = 30
-    """PPO updates in a tuning; each is one rollout and what is learnt of it."""
+    """PPO updates in a tuning; each one is a rollout and the gradient steps on it."""
     tunings: int = 5
     """Tunings in a run."""
     evaluation_episodes: int = 32
-    """Episodes of the full time limit over which a return is the mean."""
+    """Episodes of the full time limit that a return is averaged over."""
     scratch_updates: int = 3000
     """PPO updates of a policy trained from scratch."""
     foreseen_episodes: int = 100
-    """Episodes in which is looked what a policy will do before a robot is asked for it."""
+    """Episodes simulated to predict falls before a robot walks."""
     chunk: int = 10
     """PPO updates between two lines of progress."""
     sweep: TunerConfig = field(
@@ -53,7 +60,7 @@ class Preset:
             dvm=DVMConfig(channels=32, train_steps=300, batch=64, references=512),
         )
     )
-    """Sizes of every tuning in a sweep, where many run side by side."""
+    """Sizes of a tuning in a sweep, where many run side by side in one program."""
     sweep_steps: int = 100
     """Steps of an episode in a sweep."""
     sweep_tunings: int = 3
@@ -78,7 +85,7 @@ _SMOKE = Preset(
     episode_steps=80,
     epochs=2,
     tunings=2,
-    evaluation_episodes=_TINY.set_episodes,  # of equal length too: one program measures and evaluates
+    evaluation_episodes=_TINY.set_episodes,  # of equal length too, so one program measures and evaluates
     foreseen_episodes=4,
     scratch_updates=2,
     chunk=2,
@@ -109,28 +116,39 @@ PRESETS = {"smoke": _SMOKE, "cpu": Preset(), "gpu": _GPU}
 
 
 def preset(name: str) -> Preset:
-    """A preset by name.
+    """Returns the preset that the command line names: `smoke`, `cpu` or `gpu`.
 
     Raises:
-      ValueError: there is none of this name.
+      ValueError: no preset has this name.
     """
     if name not in PRESETS:
         raise ValueError(f"preset: got '{name}', expected one of {', '.join(PRESETS)}")
     return PRESETS[name]
 
 
-def chosen(parameters: str) -> dict[str, domain.Entry]:
-    """Rows of the parameter table: a set's name, or names joined by commas.
+def chosen(parameters: str) -> dict[str, Entry]:
+    """Returns the rows of BITeno's parameter table that `--parameters` names.
+
+    Args:
+      parameters: the name of a set (`legs6`, `whole_body`), or names of parameters joined by commas.
 
     Raises:
-      ValueError: a name is neither.
+      ValueError: a name is neither; lists those that exist.
     """
     names = constants.PARAMETER_SETS.get(parameters) or tuple(name.strip() for name in parameters.split(","))
-    return domain.select(constants.ENTRIES, names)
+    return select(constants.ENTRIES, names)
 
 
-def named_values(option: str, items: Sequence[str], entries: Mapping[str, domain.Entry]) -> dict[str, float]:
-    """Physical values by name, of `name=value`.
+def named_values(option: str, items: Sequence[str], entries: Mapping[str, Entry]) -> dict[str, float]:
+    """Parses physical values that an option gives as `name=value`.
+
+    Args:
+      option: its name, for messages.
+      items: what was given.
+      entries: the parameter table, with the bounds that values must keep.
+
+    Returns:
+      Values by name.
 
     Raises:
       ValueError: an item is not of this form, its name is not in the table, or its value is out of bounds.
@@ -142,7 +160,7 @@ def named_values(option: str, items: Sequence[str], entries: Mapping[str, domain
             found[name] = float(value)
         except ValueError:
             raise ValueError(f"{option}: got '{item}', expected name=value") from None
-        (entry,) = domain.select(entries, [name]).values()
+        (entry,) = select(entries, [name]).values()
         low, high = entry.bounds
         if not low <= found[name] <= high:
             raise ValueError(f"{option}: got '{item}', expected {low:g} to {high:g}")

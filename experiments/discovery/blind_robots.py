@@ -12,8 +12,8 @@ import mujoco
 import numpy as np
 
 from envs.logs import Controller, Log, Run
-from envs.rig import hung
-from experiments.excite import Motion, scaled
+from envs.rig import suspended
+from experiments.discovery.excitation import TargetRun, scaled
 
 _STEP_S = 0.0004
 _BRISTLE = 2000.0  # 1/rad: one over the displacement at which bristles slip
@@ -37,7 +37,7 @@ class Truth:
 def record(
     spec: mujoco.MjSpec,
     joints: Sequence[str],
-    motions: Sequence[Motion],
+    motions: Sequence[TargetRun],
     controller: Controller,
     truth: Truth,
     nominal_error: float,
@@ -76,7 +76,7 @@ class _Robot:
     def __init__(self, spec, joints, truth: Truth, nominal_error: float, rng: np.random.Generator):
         self._truth, self._joints = truth, tuple(joints)
         spec = spec.copy()
-        nominal = hung(spec)
+        nominal = suspended(spec)
 
         def off() -> float:
             return float(np.exp(rng.choice([-1, 1]) * rng.uniform(0.5, 1.5) * nominal_error))
@@ -90,7 +90,7 @@ class _Robot:
         self._springs = {}
         for name in truth.places if truth.effect in ("backlash", "compliance") else ():
             self._springs[name] = self._split(spec, name)
-        model = hung(spec)
+        model = suspended(spec)
         for name in self._springs:
             # What the joint carried stays with the motor; the spare hinge is light.
             model.dof_armature[model.joint(f"{name}_play").dofadr[0]] = 1e-4
@@ -134,7 +134,7 @@ class _Robot:
                 for geom in body.geoms:
                     geom.mass *= truth.size
             else:
-                model = hung(spec)
+                model = suspended(spec)
                 body.add_geom(
                     type=mujoco.mjtGeom.mjGEOM_SPHERE,
                     size=[0.015, 0, 0],
@@ -157,7 +157,9 @@ class _Robot:
             spare.stiffness = [self._truth.size, 0.0, 0.0]
         return spare
 
-    def play(self, motion: Motion, controller: Controller, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    def play(
+        self, motion: TargetRun, controller: Controller, rng: np.random.Generator
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Positions and speeds [rows, joints] as the encoders have them."""
         truth, model, at = self._truth, self._model, self._at
         effect, size = truth.effect, truth.size

@@ -1,0 +1,1 @@
+"""What all commands share: command line, sizes, checkpoints, pages and pictures."""

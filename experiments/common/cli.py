@@ -1,0 +1,68 @@
+"""What every command shares: reading its arguments, printing, showing progress, and ending with one line on an error."""
+
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import tyro
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+console = Console()
+"""Where commands print their results."""
+
+_errors = Console(stderr=True)
+_LINE_S = 60.0  # between two lines of progress where there is no terminal to draw bars on
+
+
+def run(main: Callable[[Any], None], args_type: type) -> None:
+    """Runs a command: parses the command line into its `Args` and calls its `main` with them.
+
+    Bad input is the user's to mend, so a `ValueError` ends the process with exit code 2 and one line on stderr, which
+    names the field, what was found and what was expected. Any other exception is a defect and keeps its traceback.
+
+    Raises:
+      SystemExit: with code 2, where `main` raised a `ValueError` or the command line cannot be parsed.
+    """
+    args = tyro.cli(args_type, description=args_type.__doc__)
+    try:
+        main(args)
+    except ValueError as error:
+        _errors.print(f"[red]error:[/red] {escape(str(error))}", highlight=False, soft_wrap=True)
+        raise SystemExit(2) from error
+
+
+def bars() -> Progress:
+    """Makes the progress display of a command, a context manager with a bar for every task.
+
+    On a terminal the bars are drawn in place. Elsewhere (a file, a pipe, a job's log) every unfinished task prints a
+    plain line once a minute, so that a long run can be followed without thousands of redrawn bars.
+    """
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()
+    kind = Progress if console.is_terminal else _Lines
+    return kind(*columns, TimeElapsedColumn(), TimeRemainingColumn(), console=console)
+
+
+class _Lines(Progress):
+    """Progress as a line a minute for every task that is not finished."""
+
+    def start(self) -> None:
+        super().start()
+        self._ended = threading.Event()
+        self._begin = time.monotonic()
+        # A thread, because one step of a task may take many minutes.
+        threading.Thread(target=self._print_lines, daemon=True).start()
+
+    def stop(self) -> None:
+        self._ended.set()
+        super().stop()
+
+    def _print_lines(self) -> None:
+        while not self._ended.wait(_LINE_S):
+            minutes = (time.monotonic() - self._begin) / 60.0
+            for task in self.tasks:
+                if not task.finished:
+                    total = "" if task.total is None else f" {task.completed:g}/{task.total:g}"
+                    self.console.print(f"{minutes:.0f} min: {task.description}{total}", highlight=False, markup=False)

@@ -1,0 +1,85 @@
+"""Pages from templates, and what a tuning did in the form that JSON and pages want."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import jax.numpy as jnp
+import jinja2
+import numpy as np
+
+from jaxtune import dist as dists
+from jaxtune.mjx import Entry, parameters
+from jaxtune.tuner import Info
+from jaxtune.types import ParamDist, Verdict
+
+
+def render(template: Path, **values) -> str:
+    """Renders a page from a template, whose folder and this one it may include from.
+
+    All values are escaped, because names and texts come from logs of unknown origin. A value that the template names
+    and the call does not give is an error, never an empty place on the page.
+
+    Args:
+      template: path of the template.
+      **values: what the template names.
+    """
+    folders = jinja2.FileSystemLoader([template.parent, Path(__file__).parent])
+    pages = jinja2.Environment(loader=folders, autoescape=True, undefined=jinja2.StrictUndefined)
+    return pages.get_template(template.name).render(**values)
+
+
+def tuning(info: Info) -> dict:
+    """Lists what happened in a tuning, for JSON.
+
+    Args:
+      info: of `Tuner.tune` or `Tuner.step`.
+
+    Returns:
+      `verdicts`, `radius` and the gate's numbers as lists over its calls; the update's `step` and `interval` by
+      parameter in radii, and whether it was `identifiable`; falls, broken episodes and training metrics.
+    """
+    calls = int(info.calls)
+    order = dists.names(info.dist)
+    gate = {name: np.asarray(value)[:calls] for name, value in info.gate.items()}
+    update = {
+        name: dict(zip(order, np.asarray(info.update[name]).tolist(), strict=True))
+        for name in ("step", "interval", "identifiable")
+    }
+    return {
+        "verdicts": [Verdict(int(verdict)).name.lower() for verdict in info.verdicts[:calls]],
+        "radius": np.asarray(info.radius)[:calls],
+        **gate,
+        **update,
+        "spm_loss": float(info.update.loss),
+        "measured_falls": int(info.measured_falls),
+        "not_finite": int(info.not_finite),
+        "training": {name: float(np.mean(value)) for name, value in info.train.items()},
+    }
+
+
+def moved(entries: Mapping[str, Entry], before: ParamDist, after: ParamDist, info: Info) -> dict[str, dict]:
+    """Compares every parameter before and after a tuning, in physical values.
+
+    Args:
+      entries: the parameter table.
+      before: distribution that the tuning began with.
+      after: distribution that it left.
+      info: what happened in between; its intervals are those that held-out simulated sets have calibrated.
+
+    Returns:
+      `before`, `after`, `low` and `high` by parameter. The ends of the interval are nan where no set was accepted, and
+      where the interval reaches past the simulated box, because held-out sets say nothing about what lies there.
+    """
+    update = info.update
+    low, high = dists.normalised_box(info.dist)
+    inside = (update.step - update.interval >= low) & (update.step + update.interval <= high)
+    half = dists.ravel(info.dist.radius) * jnp.where(inside, update.interval, jnp.nan)
+    half = dists.unravel(dists.names(after), half)
+    ends = {
+        "before": before.centre,
+        "after": after.centre,
+        "low": {name: centre - half[name] for name, centre in after.centre.items()},
+        "high": {name: centre + half[name] for name, centre in after.centre.items()},
+    }
+    found = {end: parameters.from_coords(entries, values) for end, values in ends.items()}
+    return {name: {end: float(values[name]) for end, values in found.items()} for name in after.centre}

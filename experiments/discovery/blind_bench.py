@@ -1,0 +1,207 @@
+"""The blind benchmark: writes the log of a robot that hides something, has discovery answer, and scores the answer.
+
+The truth goes into a folder of its own, `sealed`, which `Bench.scored` alone opens. Every case is a file, so a benchmark
+that is stopped goes on where it was, and several processes may share its cases.
+"""
+
+import json
+import os
+import shutil
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from envs import models
+from envs.effects import LIBRARY
+from envs.logs import Controller, Log, read, write
+from envs.rig import Rig
+from experiments.common import checkpoint, plots
+from experiments.common.checkpoint import write_json
+from experiments.discovery.blind_cases import SIZE_BOUNDS, SIZES, Case
+from experiments.discovery.blind_robots import Truth, record
+from experiments.discovery.excitation import TargetRun, excitation
+from experiments.discovery.scores import page, score, tally
+from experiments.discovery.setup import HORIZONS_S, Question, ask
+from experiments.discovery.summary import summarise
+from jaxtune.discovery.measure import refitted, slopes
+from jaxtune.discovery.problem import Residuals
+from jaxtune.discovery.result import Calibration
+from jaxtune.discovery.workflow import Discovery
+
+_HALVINGS = 6
+
+
+class Bench:
+    """The cases of one size: their logs, truths, answers and scores, each in a file.
+
+    Args:
+      out: folder of the benchmark.
+      size: one of `blind_cases.SIZES`.
+      seed: of everything random; a seed whose cases were looked at measures nothing any more.
+      nominal_error: by how much nominal parameters are wrong.
+    """
+
+    def __init__(self, out: Path, size: str, seed: int, nominal_error: float):
+        self._out, self._seed, self._nominal_error = out, seed, nominal_error
+        self.size = SIZES[size]
+        self.spec = models.spec(self.size.model)
+        names = ("kp", "kd", "torque_limit_nm")
+        gains = {name: np.array(values) for name, values in zip(names, self.size.gains, strict=True)}
+        self.controller = Controller(kind="pd", rate_hz=1000.0, gains=gains)
+        self.rig = Rig(self.spec, self.size.joints, self.controller.rate_hz)
+        self.motions: list[TargetRun] = excitation(
+            self.spec, self.size.joints, self.size.runs, self.size.seconds, 500.0, seed
+        )
+
+    @property
+    def cases(self) -> list[Case]:
+        """All of them, the harmless ones mixed in."""
+        listed = [*self.size.hidden, *self.size.outside, *[(None, 0.0)] * self.size.empty]
+        order = np.random.default_rng(self._seed).permutation(len(listed))
+        return [Case(number, *listed[index]) for number, index in enumerate(order)]
+
+    def record(self, truth: Truth, seed: int, noise: bool = True) -> Log:
+        """Plays the motions on a robot with something in it."""
+        log = record(
+            self.spec, self.size.joints, self.motions, self.controller, truth, self._nominal_error, seed, noise
+        )
+        return replace(log, robot=self.size.model)
+
+    def ask(self, log: Log, horizons: Sequence[float] = HORIZONS_S, healthy_logs: int = 0) -> Question:
+        """The question to discovery, about the nominal model."""
+        return ask(log, self.spec, horizons, healthy_logs, plain=self.rig)
+
+    @cached_property
+    def calibration(self) -> Calibration:
+        """What healthy logs of this robot and motion say: found once, and kept."""
+        path = self._out / "calibration.npz"
+        if not path.exists():
+            question = self.ask(self.record(Truth(None), 10_000), healthy_logs=self.size.healthy)
+            discovery = Discovery(question.problem, push=question.push)
+            discovery.prepare()
+            discovery.calibrate()
+            found = discovery.calibration
+            arrays = {
+                f"floor {horizon} {split}": floor
+                for horizon, (floors, _) in found.floors.items()
+                for split, floor in floors.items()
+            }
+            arrays |= {f"weight {horizon}": weight for horizon, (_, weight) in found.floors.items()}
+            partial = path.with_suffix(f".{os.getpid()}.npz")
+            np.savez(partial, gain=found.gain, penalty=found.penalty, **arrays)
+            partial.replace(path)
+        with np.load(path) as saved:
+            floors = {}
+            for name in saved.files:
+                kind, *place = name.split()
+                if kind == "floor":
+                    horizon, split = place
+                    of_splits, _ = floors.setdefault(float(horizon), ({}, float(saved[f"weight {horizon}"])))
+                    of_splits[split] = saved[name]
+            return Calibration(floors, float(saved["gain"]), float(saved["penalty"]))
+
+    def truth(self, case: Case) -> tuple[Truth, float]:
+        """Where it hides and how large it is, and its severity in floor units."""
+        if case.effect is None:
+            return Truth(None), 0.0
+        rng = np.random.default_rng((self._seed, case.number))
+        on = LIBRARY[case.effect].on if case.effect in LIBRARY else "joint"
+        bodies = [self.spec.joint(name).parent.name for name in self.size.joints]
+        places = tuple(bodies if on == "body" else self.size.joints)
+        place = str(rng.choice(places))
+        if case.effect == "loose_foot":
+            place = str(rng.choice([name for name in self.size.joints if "knee" in name or "elbow" in name]))
+        pair = place.replace("left", "right")
+        chosen = (place, pair) if pair != place and rng.uniform() < 0.2 else (place,)
+        severity = self.severity_of(case, chosen)
+        low, high = np.log(SIZE_BOUNDS[case.effect])
+        for _ in range(_HALVINGS):
+            middle = 0.5 * (low + high)
+            low, high = (low, middle) if severity(float(np.exp(middle))) > case.severity else (middle, high)
+        size = float(np.exp(0.5 * (low + high)))
+        return Truth(case.effect, chosen, size), severity(size)
+
+    def severity_of(self, case: Case, places: tuple[str, ...]) -> Callable[[float], float]:
+        """How far an effect of a size moves the worst joint's positions, in floor units, noise apart.
+
+        What nominal parameters can make up for within their priors does not count: nobody could see it.
+        """
+        main = sorted(self.calibration.floors)[len(self.calibration.floors) // 2]
+        (floors, weight), seed = self.calibration.floors[main], self.seed(case)
+        floor = floors["train"]
+        problem = self.ask(self.record(Truth(None), seed, noise=False), (main,)).problem
+        measure, zero = Residuals(problem), np.zeros(problem.axes)
+        slope = slopes(problem, measure, main) / floor[..., None]
+        plain = measure(zero, problem.data["train"][main])[0]
+        positions = slice(-len(self.size.joints), None)
+
+        def severity(size: float) -> float:
+            log = self.record(Truth(case.effect, places, size), seed, noise=False)
+            segments = self.ask(log, (main,)).problem.data["train"][main]
+            moved = (measure(zero, segments)[0] - plain) / floor
+            if not np.isfinite(moved).all():
+                return np.inf
+            left = refitted(moved, slope, weight)
+            return float(np.sqrt((left[..., positions] ** 2).mean(axis=(0, 1))).max())
+
+        return severity
+
+    def seed(self, case: Case) -> int:
+        """Of the robot."""
+        return 1000 * (self._seed + 1) + case.number
+
+    def write(self, case: Case) -> Path:
+        """Writes a case's log, and its truth where only the scorer looks."""
+        folder, sealed = self._out / "logs" / f"case_{case.number:03d}", self._sealed(case)
+        if not sealed.exists():
+            truth, severity = self.truth(case)
+            log = self.record(truth, self.seed(case))
+            shutil.rmtree(folder, ignore_errors=True)
+            folder.mkdir(parents=True)
+            name = log.robot if log.robot in models.BUILT_IN else Path(log.robot).name
+            write(replace(log, robot=name), folder / "log", ".npz")
+            if log.robot not in models.BUILT_IN:
+                shutil.copy(log.robot, folder / "log" / name)
+            sealed.parent.mkdir(parents=True, exist_ok=True)
+            write_json(sealed, {"effect": case.effect, "asked": case.severity, "severity": severity, "truth": truth})
+        return folder / "log"
+
+    def _sealed(self, case: Case) -> Path:
+        return self._out / "sealed" / f"case_{case.number:03d}.json"
+
+    def answer(self, case: Case) -> dict:
+        """What discovery says of a case's log; it sees the log, the nominal model and the calibration."""
+        path = self._out / "answers" / f"case_{case.number:03d}.json"
+        if not path.exists():
+            folder = self.write(case)
+            began = time.monotonic()
+            log = read(folder)
+            question = self.ask(log)
+            result = Discovery(question.problem, push=question.push, calibration=self.calibration).run()
+            path.parent.mkdir(parents=True, exist_ok=True)
+            answer = summarise(question, result) | {"seconds": time.monotonic() - began, "rejected": result.rejected}
+            write_json(path, checkpoint.as_json(answer))
+        return json.loads(path.read_text())
+
+    def scored(self) -> list[dict]:
+        """Truth and answer of every case that is done; the one place that opens the truth."""
+        rows = []
+        for case in self.cases:
+            path = self._out / "answers" / f"case_{case.number:03d}.json"
+            if path.exists():
+                truth = json.loads(self._sealed(case).read_text())
+                rows.append(score(truth, json.loads(path.read_text())) | {"case": case.number})
+        return rows
+
+    def report(self, identity: Mapping[str, object]) -> list[dict]:
+        """Writes down how the cases that are done were answered; the table of rates."""
+        rows, out = self.scored(), self._out
+        lines = tally(rows)
+        write_json(out / "scores.json", {"cases": rows, "table": lines, "versions": checkpoint.versions()})
+        plots.confusion(out / "confusion.png", rows)
+        (out / "README.md").write_text(page(identity, len(rows), len(self.cases), lines))
+        return lines

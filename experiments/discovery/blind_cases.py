@@ -1,0 +1,98 @@
+"""What the blind benchmark hides: robots, effects, severities and how many of each, by size."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from envs.biteno import constants
+from envs.effects import LIBRARY
+from experiments.discovery.blind_robots import OUTSIDE
+from experiments.discovery.scores import SEVERITIES
+
+ARM = Path(__file__).parents[1] / "arm.xml"
+
+SIZE_BOUNDS = {
+    "coulomb": (0.01, 10.0),
+    "viscous": (0.01, 20.0),
+    "stribeck": (0.01, 20.0),
+    "load_friction": (0.01, 0.8),
+    "command_delay": (0.001, 0.04),
+    "target_slew": (20.0, 0.3),
+    "gain_error": (0.98, 0.3),
+    "deadband": (0.001, 0.15),
+    "torque_speed": (0.1, 20.0),
+    "torque_limit": (60.0, 0.5),
+    "torque_lag": (0.001, 0.06),
+    "torque_scale": (0.98, 0.3),
+    "backlash": (0.001, 0.15),
+    "compliance": (5000.0, 10.0),
+    "armature": (0.001, 0.5),
+    "link_mass": (1.02, 3.0),
+    "com_offset": (0.001, 0.12),
+    "payload": (0.01, 4.0),
+    "encoder_bias": (0.0005, 0.2),
+    "sensor_delay": (0.001, 0.04),
+    "sensor_lag": (0.001, 0.06),
+    "drag": (0.1, 100.0),
+    "constant_push": (0.01, 15.0),
+    "cogging": (0.02, 15.0),
+    "temperature_fade": (0.02, 0.9),
+    "cable_stiffness": (0.1, 500.0),
+    "loose_foot": (0.01, 1.5),
+}
+"""Sizes between which a severity is looked for, the harmless one first."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """One robot."""
+
+    number: int
+    effect: str | None
+    severity: float
+    """In floor units, of what is hidden alone."""
+
+
+@dataclass(frozen=True)
+class Size:
+    """How much is tried, on which robot."""
+
+    model: str
+    """Name or path."""
+    joints: tuple[str, ...]
+    gains: tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]
+    """kp, kd and torque limit, one for every joint."""
+    runs: int
+    seconds: float
+    hidden: tuple[tuple[str, float], ...]
+    """Effects and severities."""
+    empty: int
+    outside: tuple[tuple[str, float], ...]
+    healthy: int
+
+
+def _spread(names: Sequence[str], count: int) -> tuple[tuple[str, float], ...]:
+    """Effects in turn, severities in turn."""
+    return tuple((names[i % len(names)], SEVERITIES[i % len(SEVERITIES)]) for i in range(count))
+
+
+_HIDDEN = tuple(name for name, row in LIBRARY.items() if not row.needs)
+_ARM = (str(ARM), ("shoulder", "elbow"), ((40.0, 20.0), (2.0, 0.8), (15.0, 15.0)))
+_BITENO = ("biteno", constants.JOINTS, ((60.0,) * 6, (2.0,) * 6, (60.0,) * 6))
+SIZES = {
+    "smoke": Size(
+        *_ARM, 6, 2.0, (("coulomb", 15.0), ("command_delay", 15.0), ("payload", 15.0), ("torque_scale", 15.0)), 2, (), 6
+    ),
+    "arm": Size(*_ARM, 6, 3.0, _spread(_HIDDEN, 46), 20, _spread(OUTSIDE[:3], 9), 20),
+    "standard": Size(*_BITENO, 6, 3.0, _spread(_HIDDEN, 48), 40, _spread(OUTSIDE, 10), 20),
+    "full": Size(
+        *_BITENO,
+        12,
+        5.0,
+        tuple((name, severity) for name in _HIDDEN for severity in SEVERITIES for _ in range(5)),
+        100,
+        _spread(OUTSIDE, 24),
+        40,
+    ),
+}
+"""`smoke` for CI, `arm` for an hour, `standard` for a night on a CPU, `full` for a GPU or a few nights."""

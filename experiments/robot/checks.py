@@ -1,0 +1,77 @@
+"""Checks of a robot's log before anything is learnt from it: what it means, and whose walks it holds."""
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from envs.biteno import TaskConfig
+from envs.diagnosis import Finding
+from envs.logs import Log
+from jaxtune.types import Trajectory
+
+_STRANGE = 0.25
+"""Largest difference between recorded actions and the policy's, rms over rms, that sensor noise and late targets cause."""
+
+
+def check_runs(place: Path, log: Log, episodes: int) -> None:
+    """Checks that a log holds one run for every walk that was asked for.
+
+    A run that nobody asked for, or that is missing, would change how often the robot is said to have fallen.
+
+    Raises:
+      ValueError: names the log, the number of runs and the request.
+    """
+    if len(log.runs) != episodes:
+        raise ValueError(
+            f"{place / 'log'}: got {len(log.runs)} run(s), expected the {episodes} walks that "
+            f"{place / 'request.json'} asks for, in a run each"
+        )
+
+
+def check_meaning(
+    place: Path,
+    log: Log,
+    walks: Trajectory,
+    task: TaskConfig,
+    act: Callable[[jax.Array], jax.Array],
+    suspicions: Sequence[tuple[Finding, list[str]]],
+) -> None:
+    """Checks that a log's numbers mean what they say, and that the round's policy has walked.
+
+    Args:
+      place: folder of the log, for messages.
+      log: as it was read.
+      walks: its episodes, [episodes, time].
+      task: of the policy that was exported.
+      act: what that policy does for observations [steps, obs], without noise.
+      suspicions: what the log doctor says, with the runs that share it.
+
+    Raises:
+      ValueError: most runs have a finding after which numbers mean something else, the log is of a policy with another
+        reference or scale, or its actions are not the policy's. Names everything that is wrong.
+    """
+    wrong = [finding.sentence for finding, runs in suspicions if finding.wrong and 2 * len(runs) > len(log.runs)]
+    wrong += _other_policy(log.policy or {}, {"action_scale": task.action_scale, "base": task.base})
+    strange = _difference(walks, act)
+    if strange > _STRANGE:
+        wrong.append(f"actions differ from what this round's policy does by {strange:.0%} of their size")
+    if wrong:
+        raise ValueError(f"{place}: {'; '.join(wrong)} (trust_log learns from it all the same)")
+
+
+def _other_policy(found: Mapping, expected: Mapping) -> list[str]:
+    return [
+        f"policy.{name}: got {found[name]}, expected {value}"
+        for name, value in expected.items()
+        if found.get(name, value) != value
+    ]
+
+
+def _difference(walks: Trajectory, act: Callable[[jax.Array], jax.Array]) -> float:
+    """Rms difference between recorded actions and the policy's for the recorded observations, over the actions' rms."""
+    alive = np.asarray(walks.alive)
+    recorded = np.asarray(walks.action)[alive]
+    expected = np.asarray(act(walks.obs.reshape(-1, walks.obs.shape[-1])))[alive.ravel()]
+    return float(np.sqrt(((recorded - expected) ** 2).mean() / np.maximum((recorded**2).mean(), 1e-12)))

@@ -1,0 +1,85 @@
+"""Tells a person about a round: a page with its picture in it, and two tables on the console."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from experiments.common import plots, report
+from experiments.common.checkpoint import as_json
+from experiments.robot.fall_risk import surprise
+from experiments.robot.records import Round
+from experiments.robot.rounds import Terms
+
+VERDICTS = {
+    "accept": "The simulator covers what was measured.",
+    "unexplained": "The simulator does not cover what was measured, and a wider distribution brings it no closer: "
+    "physics is missing in the model.",
+    "radius_exhausted": "The simulator does not cover what was measured, and its distribution cannot grow any wider.",
+    "not_finite": "Nothing could be compared: no walk lasted as long as a window, or a number is not finite.",
+    None: "This method does not ask whether the simulator covers what was measured.",
+}
+"""What each verdict of the gate means."""
+
+ADVICE = {
+    "accept": "Go on: tune and walk again, as far as the expected falls allow it.",
+    "unexplained": "Suspend the robot, record the log that experiments.excite writes targets for, and ask "
+    "experiments.discover what is missing.",
+    "radius_exhausted": "Check the bounds of the parameters and the log; if both are right, ask experiments.discover.",
+    "not_finite": "Start from a policy that stands longer: one that was trained in a wider distribution (--method dr), "
+    "or with the robot held by a rope.",
+    None: "Use method ours if you want to know.",
+}
+"""What to do next, by verdict."""
+
+_TEMPLATE = Path(__file__).with_suffix(".html")
+_QUANTITIES = {"return": "return", "fall_rate": "share of walks that end in a fall", "power_w": "mechanical power, W"}
+
+
+def write(path: Path, history: Sequence[Round], terms: Terms) -> None:
+    """Writes the page of the last round; text that comes from the log is escaped.
+
+    Args:
+      path: of the HTML file, which holds its pictures.
+      history: all rounds so far.
+      terms: what the robot was asked for.
+    """
+    last = history[-1]
+    page = report.render(
+        _TEMPLATE,
+        line=as_json(last),
+        verdict=last.tuning.verdict,
+        meaning=VERDICTS[last.tuning.verdict],
+        advice=ADVICE[last.tuning.verdict],
+        quantities=_QUANTITIES,
+        unidentified=last.tuning.unidentified,
+        surprise=surprise(last.measured, last.tuning.explained),
+        safe=last.expected_falls <= terms.max_fall_rate,
+        terms=terms,
+        episodes=sum(one.measured.episodes for one in history),
+        falls=sum(round(one.measured.episodes * one.measured.fall_rate) for one in history),
+        picture=plots.embedded(plots.rounds(as_json(list(history)))),
+    )
+    path.write_text(page)
+
+
+def show(console: Console, last: Round) -> None:
+    """Prints a round: the verdict and what to do, what was measured, what moved, and what the next walks risk."""
+    verdict = last.tuning.verdict
+    console.print(f"[bold]round {last.index}: {verdict or 'not asked'}[/bold]: {VERDICTS[verdict]}")
+    console.print(ADVICE[verdict])
+    table = Table("", "predicted", "measured", "same policy, tuned simulator", "predicted of the next")
+    columns = [as_json(one) for one in (last.predicted, last.measured, last.tuning.explained, last.next_predicted)]
+    for name, label in _QUANTITIES.items():
+        table.add_row(label, *(f"{column[name]:.2f}" for column in columns))
+    console.print(table)
+    table = Table("parameter", "before", "after", "90 % interval")
+    for name, ends in last.tuning.moved.items():
+        interval = "-" if ends.low is None else f"{ends.low:.3f} to {ends.high:.3f}"
+        note = " (not identifiable from this log)" if name in last.tuning.unidentified else ""
+        table.add_row(name + note, f"{ends.before:.3f}", f"{ends.after:.3f}", interval)
+    console.print(table)
+    for one in last.measured.suspected:
+        console.print(f"doctor: {one.sentence} ({', '.join(one.runs)})", highlight=False, markup=False)
+    console.print(f"{last.expected_falls:.0%} of the next walks are expected to end in a fall")

@@ -1,0 +1,124 @@
+"""A whole run of rounds with a robot: its options, their checks, and the loop over the rounds."""
+
+import sys
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from envs import corrected
+from envs.biteno import constants
+from experiments.common import checkpoint
+from experiments.common.cli import console
+from experiments.common.config import Preset, chosen, named_values, preset
+from experiments.robot import policy_files, report
+from experiments.robot.records import Round
+from experiments.robot.rounds import STRATEGIES, Programs, Rounds, Terms
+from experiments.walking.learner import Learner
+from experiments.walking.policies import starting_policy
+from jaxtune.mjx import Entry, nominal
+
+
+@dataclass(frozen=True, kw_only=True)
+class Transfer:
+    """Tunes a simulator to a robot that answers through log files, round by round."""
+
+    out: Path = Path("runs/sim2real")
+    """Folder of the run; the same command with the same folder goes on where it was."""
+    rounds: int = 5
+    """Rounds in all; a later call may ask for more."""
+    method: str = "ours"
+    """ours, spm (the paper's rule without the gate) or dr (a wide distribution that stays)."""
+    policy: str = "walk"
+    """First policy: walk (ships with the package), scratch (trained first), or a folder of experiments.train."""
+    parameters: str = "whole_body"
+    """Parameters that are tuned: legs6, whole_body, or names joined by commas."""
+    start: tuple[str, ...] = ()
+    """Where the distribution starts, as name=value; nominal where not given."""
+    radius: float = 0.2
+    """First radius in log space; dr trains on all of it."""
+    model: Path | None = None
+    """Folder of a corrected model that discovery wrote (`OUT/model`), to tune instead of the nominal one."""
+    noise: float = 0.2
+    """Noise of simulated sensors, in units of `sensing.NOISE`."""
+    preset: str = "cpu"
+    """Sizes: smoke, cpu or gpu."""
+    epochs: int | None = None
+    """PPO updates in a round; twice the preset's where not given, after the paper's Fig. 6."""
+    terms: Annotated[Terms, tyro.conf.arg(name="")] = field(default_factory=Terms)
+    """What the robot is asked for."""
+
+
+def check(transfer: Transfer) -> tuple[Preset, dict[str, Entry], dict[str, float]]:
+    """Checks the options before anything is compiled.
+
+    Returns:
+      Sizes of the run, the table of parameters that are tuned, and where they start (physical values by name).
+
+    Raises:
+      ValueError: names the field, the value and what is allowed.
+    """
+    sizes, entries = preset(transfer.preset), chosen(transfer.parameters)
+    if transfer.method not in STRATEGIES:
+        raise ValueError(f"method: got '{transfer.method}', expected one of {', '.join(STRATEGIES)}")
+    epochs = 2 * sizes.epochs if transfer.epochs is None else transfer.epochs
+    least = {"rounds": 1, "epochs": 1, "radius": 1e-6, "noise": 0, "timeout_s": 0, "max_fall_rate": 0}
+    # A walk is compared with simulated episodes, so it lasts at least as long as one.
+    least["walk_s"] = sizes.episode_steps * constants.POLICY_DT_S
+    for option, value in {**asdict(transfer), **asdict(transfer.terms), "epochs": epochs}.items():
+        most = 1 if option == "max_fall_rate" else sys.float_info.max
+        if option in least and not least[option] <= value <= most:
+            raise ValueError(f"{option}: got {value}, expected {least[option]:g} to {most:g}")
+    start = nominal(entries) | named_values("start", transfer.start, entries)
+    task = replace(sizes.task, noise=transfer.noise)
+    return replace(sizes, task=task, epochs=epochs), entries, start
+
+
+def compile_programs(transfer: Transfer) -> Programs:
+    """Makes the learner of a run and its programs, which runs with the same sizes, parameters and model may share."""
+    sizes, entries, _ = check(transfer)
+    return Programs(Learner(sizes, entries, correction=transfer.model and corrected.read(transfer.model)))
+
+
+def play(transfer: Transfer, programs: Programs) -> list[Round]:
+    """Plays all rounds that have not been played, and reports on each.
+
+    Args:
+      transfer: options of the run.
+      programs: of `compile_programs`.
+
+    Returns:
+      All rounds of the run; `summary.json` holds them too.
+
+    Raises:
+      ValueError: an option is wrong, the folder holds another run, or a round cannot be played.
+    """
+    start = check(transfer)[2]
+    policy_files.require_onnx()
+    learner = programs.learner
+    # A policy that cannot be loaded is an error before there is a folder; one from scratch is kept in the folder.
+    policy = None if transfer.policy == "scratch" else starting_policy(transfer.policy, learner)
+    checkpoint.open_run(transfer.out, _identity(transfer, learner.preset))
+    policy = policy or starting_policy(transfer.policy, learner, transfer.out)
+    rounds = Rounds(transfer.out, transfer.terms, programs, transfer.method, policy, start, transfer.radius)
+    history: list[Round] = []
+    for index in range(transfer.rounds):
+        history.append(rounds.play(index, history[-1] if history else None))
+        page = transfer.out / f"round_{index:03d}" / "report.html"
+        report.write(page, history, transfer.terms)
+        report.show(console, history[-1])
+        console.print(f"report in {page}")
+    checkpoint.write_json(transfer.out / "summary.json", {"rounds": history, "versions": checkpoint.versions()})
+    return history
+
+
+def _identity(transfer: Transfer, sizes: Preset) -> dict:
+    """What must stay as it was when a run goes on."""
+    terms = {"walk_s": transfer.terms.walk_s, "seed": transfer.terms.seed}
+    identity = {**asdict(transfer), "sizes": sizes, "terms": terms}
+    # The folder of a model may hold another one by the time a run goes on.
+    identity["model_sha256"] = transfer.model and corrected.read(transfer.model).digest
+    for option in ("out", "rounds"):
+        del identity[option]
+    return identity

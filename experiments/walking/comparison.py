@@ -1,0 +1,151 @@
+"""Compares the tuning methods of the paper's section IV-B: what each one is, their summary and their tables."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import jax.numpy as jnp
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from envs.targets.protocol import Target
+from experiments.walking.learner import Learner, Policy
+from jaxtune import baselines, tuner
+from jaxtune.baselines import Untuned
+from jaxtune.mjx import parameters
+from jaxtune.tuner import Tuner
+from jaxtune.types import ParamDist
+
+METHODS = ("ours", "spm", "dr", "oracle")
+"""`ours`; `spm`, the paper's rule without the gate; `dr`, wide domain randomisation; `oracle`, trained at the truth."""
+
+UPDATES = {"posterior": tuner.posterior_update, "vote": tuner.vote_update}
+"""How `ours` moves the distribution, by the name that the command line gives it."""
+
+
+@dataclass(frozen=True)
+class Contender:
+    """A method, ready to be tuned: the same tuner with other functions, or another policy or distribution."""
+
+    tuner: Tuner | Untuned
+    policy: Policy
+    dist: ParamDist
+    sets: int
+    """Measured sets that it asks for in a tuning."""
+
+
+def contenders(
+    learner: Learner, target: Target, policy: Policy, *, radius: float, dr_radius: float, update: str
+) -> dict[str, Contender]:
+    """Makes the four methods over one learner and one target.
+
+    Args:
+      learner: BITeno's side of the tuner.
+      target: what is tuned to; only `oracle` is told its parameters.
+      policy: what every method starts with.
+      radius: first radius of `ours` and `spm`, in coordinates.
+      dr_radius: radius of domain randomisation, in coordinates.
+      update: one of `UPDATES`, for `ours`.
+
+    Returns:
+      Contenders by the names in `METHODS`.
+    """
+    nominal = parameters.nominal(learner.entries)
+    machine = learner.tuner(target)
+    untuned = Untuned(tuner=machine)
+    start = learner.dist(nominal, radius)
+    truth = {name: target.params[name] for name in nominal}
+    wide = policy.replace(radius=jnp.full_like(policy.radius, dr_radius))
+    knowing = policy.replace(
+        hidden={name: jnp.full_like(value, target.params[name]) for name, value in policy.hidden.items()}
+    )
+    return {
+        "ours": Contender(replace(machine, update=UPDATES[update]), policy, start, 1),
+        "spm": Contender(baselines.spm(machine), policy, start, 1),
+        "dr": Contender(untuned, wide, learner.dist(nominal, dr_radius), 0),
+        "oracle": Contender(untuned, knowing, learner.dist(truth, learner.preset.policy_radius), 0),
+    }
+
+
+def summarise(settings: Mapping[str, object], results: dict[str, list[dict]], off: Sequence[str]) -> dict:
+    """Summarises a run for `summary.json`.
+
+    `falls_in_target` counts falls in the closing evaluation, `measured_falls` those in the episodes that tuning paid
+    with.
+
+    Args:
+      settings: `case`, `start`, `preset` and `seeds` of the run.
+      results: what `experiments.sim2sim.Runner` returned, by method and seed.
+      off: names of the tuned parameters whose true value is not nominal.
+
+    Returns:
+      Lists over seeds by method, `seconds` by method, and the settings.
+    """
+    methods, seconds = {}, {}
+    for name, runs in results.items():
+        first, last = ([run["lines"][end] for run in runs] for end in (0, -1))
+        names = list(first[0]["param_error"])
+        calls = [[line for line in run["lines"] if "verdicts" in line] for run in runs]
+        methods[name] = {
+            "return_start": [line["return"] for line in first],
+            "return_end": [line["return"] for line in last],
+            "param_names": names,
+            "param_error_start": [[line["param_error"][p] for p in names] for line in first],
+            "param_error_end": [[line["param_error"][p] for p in names] for line in last],
+            **{
+                field: [[value for line in lines for value in line[field]] for lines in calls]
+                for field in ("radius", "novelty", "threshold", "p_value", "verdicts")
+            },
+            "real_episodes": [run["measured_episodes"] for run in runs],
+            "falls_in_target": [line["falls"] for line in last],
+            "measured_falls": [sum(line["measured_falls"] for line in lines) for lines in calls],
+            "not_finite": [sum(line["not_finite"] for line in lines) for lines in calls],
+        }
+        seconds[name] = [line["seconds"] for line in last]
+    return {**settings, "off": list(off), "methods": methods, "seconds": seconds}
+
+
+def show(console: Console, summary: dict, results: dict[str, list[dict]]) -> None:
+    """Prints two tables: the methods side by side, and the error of every parameter at the end."""
+    console.print(_methods_table(summary))
+    console.print(_parameters_table(summary, results))
+
+
+def _methods_table(summary: dict) -> Table:
+    start = f", start {summary['start']:g}X" if summary["off"] else ""
+    table = Table(title=f"case {summary['case']}{start}, mean over {summary['seeds']} seed(s)")
+    columns = "method", "return in target", "falls", "parameter error", "gate calls", "target episodes", "s"
+    for column in columns:
+        table.add_column(column, justify="left" if column == "method" else "right")
+    for name, method in summary["methods"].items():
+        columns = [method["param_names"].index(p) for p in summary["off"] or method["param_names"]]
+        error = [np.array(method[f"param_error_{end}"])[:, columns].mean() for end in ("start", "end")]
+        verdicts = [verdict for seed in method["verdicts"] for verdict in seed]
+        table.add_row(
+            name,
+            f"{np.mean(method['return_start']):.1f} -> {np.mean(method['return_end']):.1f}",
+            f"{np.mean(method['falls_in_target']):.1f}",
+            f"{error[0]:.3f} -> {error[1]:.3f}",
+            ", ".join(f"{verdicts.count(verdict)} {verdict}" for verdict in dict.fromkeys(verdicts)) or "-",
+            f"{np.mean(method['real_episodes']):.0f}",
+            f"{np.mean(summary['seconds'][name]):.0f}",
+        )
+    return table
+
+
+def _parameters_table(summary: dict, results: dict[str, list[dict]]) -> Table:
+    table = Table(title="|estimate / truth - 1| at the end (not identifiable in the last tuning: ~)")
+    table.add_column("parameter")
+    for name in summary["methods"]:
+        table.add_column(name, justify="right")
+    first = next(iter(summary["methods"].values()))
+    for column, parameter in enumerate(first["param_names"]):
+        cells = []
+        for name, method in summary["methods"].items():
+            lines = [run["lines"][-1] for run in results[name]]
+            unknown = any(line.get("verdicts") and not line["identifiable"][parameter] for line in lines)
+            mean = np.array(method["param_error_end"])[:, column].mean()
+            cells.append(f"{'~ ' if unknown else ''}{mean:.3f}")
+        table.add_row(f"{parameter}{' *' if parameter in summary['off'] else ''}", *cells)
+    table.caption = "* off at the start" if summary["off"] else "the truth is nominal; the gap is in none of these"
+    return table

@@ -1,0 +1,274 @@
+"""Everything that the tuner is told about BITeno: how its policy learns, how episodes are simulated and scored.
+
+`Learner` binds one robot, one preset and one parameter table together and offers the pure functions that
+`jaxtune.tuner.Tuner` wants (`train`, `simulate`, a target's `measure`), and those that the commands need beside them
+(`evaluate`, `predict`, `play`). It holds no state: what changes is in `Policy`, a pytree.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from types import MappingProxyType
+
+import chex
+import jax
+import jax.numpy as jnp
+from brax.envs.base import State
+
+from envs import corrected
+from envs.biteno import BraxBiteno, constants, gait
+from envs.corrected import Correction
+from envs.targets.mjx import MjxTarget, rollout, simulate
+from envs.targets.protocol import Act, Commands, Target
+from experiments.common.config import Preset
+from jaxtune import dist as dists
+from jaxtune.baselines import Untuned
+from jaxtune.mjx import Entry, parameters
+from jaxtune.ppo import PPO, PPOState
+from jaxtune.tuner import Tuner
+from jaxtune.types import Coords, ParamDist, Trajectory
+
+
+@chex.dataclass(frozen=True)
+class Policy:
+    """A policy while it learns: PPO's state, the robots that it learns on, and what they are drawn from.
+
+    This pytree is the `policy` of a `jaxtune.tuner.TunerState`, so it is also what a run's checkpoints hold.
+    """
+
+    learner: PPOState  # networks, optimiser and observation statistics
+    robots: State  # [envs] robots of the training environments, between two rollouts
+    radius: jax.Array  # largest radius, in coordinates, of the distribution that the training robots are drawn from
+    hidden: dict  # physical values by name of parameters that the robots have and nobody tunes
+    commands: Commands | None = None  # what simulated episodes repeat, in turn, where measured ones are compared
+
+
+class Learner:
+    """Trains, simulates and evaluates policies of one robot, as pure functions.
+
+    Use it where a command needs BITeno: hand `learner.tuner(target)` to the tuning loop, or jit single methods. Programs
+    that are compiled for one learner can be shared by all runs of the same preset and table.
+
+    Args:
+      preset: sizes of everything.
+      entries: the parameter table that is tuned.
+      hidden: parameters that are not tuned but may differ from nominal where a policy trains (the oracle's).
+      correction: a corrected model that discovery wrote; the nominal model where None.
+    """
+
+    def __init__(
+        self,
+        preset: Preset,
+        entries: Mapping[str, Entry],
+        hidden: Mapping[str, Entry] = MappingProxyType({}),
+        correction: Correction | None = None,
+    ):
+        self.preset = preset
+        self.entries = entries
+        self._hidden = hidden
+        self.robot = corrected.make(preset.task, {**entries, **hidden}, correction)
+        pushed = replace(preset.task, push_mps=preset.push_mps)
+        self._env = BraxBiteno(corrected.make(pushed, self.robot.entries, correction))
+        self._ppo = PPO(preset.ppo, self.robot.observation_size, self.robot.action_size)
+        # One compiled program serves all methods, because they differ only in its arguments.
+        self._train = jax.jit(lambda key, policy, dist: self.train(key, policy, dist, preset.epochs))
+
+    def dist(self, centre: Mapping[str, float], radius: float) -> ParamDist:
+        """Makes a uniform distribution around physical values, with the table's bounds.
+
+        Args:
+          centre: physical values by name, multipliers of nominal for logarithmic entries.
+          radius: half width in coordinates (log space for logarithmic entries), the same for every parameter.
+
+        Returns:
+          The distribution in coordinates, which is what the tuner searches.
+        """
+        ends = [{name: entry.bounds[end] for name, entry in self.entries.items()} for end in (0, 1)]
+        middle, lower, upper = (
+            {name: float(value) for name, value in parameters.to_coords(self.entries, side).items()}
+            for side in (centre, *ends)
+        )
+        return dists.make(middle, radius, lower, upper)
+
+    def init(self, key: jax.Array, ppo: PPOState | None = None) -> Policy:
+        """Starts a policy on freshly reset training robots.
+
+        Args:
+          key: random key (`jax.random.PRNGKey`, as Brax's wrappers need it).
+          ppo: a learnt state to go on from; new networks where None.
+        """
+        key_learner, key_robots = jax.random.split(key)
+        ppo = self._ppo.init(key_learner) if ppo is None else ppo
+        count = self.preset.ppo.num_envs
+        robots = self._env.reset(jax.random.split(key_robots, count))
+        return Policy(
+            learner=ppo,
+            robots=jax.tree.map(lambda leaf: jnp.asarray(leaf, leaf.dtype), robots),
+            radius=jnp.asarray(self.preset.policy_radius, jnp.float32),
+            hidden={name: jnp.asarray(value, jnp.float32) for name, value in parameters.nominal(self._hidden).items()},
+        )
+
+    def train(self, key: jax.Array, policy: Policy, dist: ParamDist, updates: int) -> tuple[Policy, dict]:
+        """Runs PPO updates on robots drawn from the distribution.
+
+        The radius is cut to the policy's own: a policy that trained on all of a distribution that the gate has widened
+        would become robust to physics that the robot does not have, at the price of its return.
+
+        Args:
+          key: random key.
+          policy: where training starts.
+          dist: distribution of the parameters, in coordinates.
+          updates: number of PPO updates; static, as it is the length of a scan.
+
+        Returns:
+          The policy, and metrics [updates] by name.
+        """
+        key_params, key_updates = jax.random.split(key)
+        count = self.preset.ppo.num_envs
+        dist = dist.replace(radius=jax.tree.map(lambda r: jnp.minimum(r, policy.radius), dist.radius))
+        params = parameters.from_coords(self.entries, dists.sample(key_params, dist, count))
+        params |= {name: jnp.broadcast_to(value, count) for name, value in policy.hidden.items()}
+        robots = self._env.with_params(policy.robots, params)
+
+        def update(carry, key):
+            ppo, robots, metrics = self._ppo.update(key, carry[0], self._env, carry[1])
+            return (ppo, robots), metrics
+
+        (ppo, robots), metrics = jax.lax.scan(update, (policy.learner, robots), jax.random.split(key_updates, updates))
+        return policy.replace(learner=ppo, robots=robots), metrics
+
+    def simulate(self, key: jax.Array, policy: Policy, coords: Coords) -> Trajectory:
+        """Simulates one episode for every draw: the tuner's `simulate`.
+
+        Where the policy carries `commands`, the episodes repeat them in turn, from the same phase of the gait clock, and
+        only the last `episode_steps` steps are returned: a log shows a robot from a few steps after it began to walk.
+
+        Args:
+          key: random key.
+          policy: acts without exploration noise.
+          coords: [episodes] by name.
+
+        Returns:
+          Episodes, [episodes, time].
+        """
+        count, steps = len(next(iter(coords.values()))), self.preset.episode_steps
+        commands = jax.tree.map(lambda leaf: leaf[jnp.arange(count) % len(leaf)], policy.commands)
+        length = steps if commands is None else commands.command.shape[1]
+        whole = simulate(self.robot, key, self.act(policy), coords, length, commands)
+        return jax.tree.map(lambda leaf: leaf[:, -steps:] if leaf.ndim > 1 else leaf, whole)
+
+    def play(self, target: Target) -> Callable[..., Trajectory]:
+        """Makes the function that plays whole episodes in a target, compiled where the target is in JAX.
+
+        Returns:
+          `(key, policy, count, steps) -> Trajectory [count, steps]`.
+        """
+
+        def play(key, policy, count, steps):
+            return target.episodes(key, self.act(policy), count, steps)
+
+        return jax.jit(play, static_argnums=(2, 3)) if isinstance(target, MjxTarget) else play
+
+    def evaluate(self, key: jax.Array, policy: Policy, play: Callable[..., Trajectory]) -> tuple[float, int]:
+        """Measures what a policy is worth in a target, over the preset's number of full episodes.
+
+        Args:
+          key: random key; the same key gives the same commands and resets.
+          policy: acts without exploration noise.
+          play: what `play` made of the target.
+
+        Returns:
+          Mean return under the weights of Table I, and number of episodes that ended in a fall.
+        """
+        steps = round(self.preset.task.episode_s / constants.POLICY_DT_S)
+        trajectory = play(key, policy, self.preset.evaluation_episodes, steps)
+        return float(trajectory.score.sum(axis=-1).mean()), int(trajectory.fell.sum())
+
+    def predict(self, key: jax.Array, policy: Policy, dist: ParamDist, count: int, steps: int) -> dict[str, jax.Array]:
+        """Predicts how a policy will walk on robots drawn from the distribution.
+
+        Args:
+          key: random key.
+          policy: acts without exploration noise.
+          dist: distribution of the robots' parameters, in coordinates.
+          count: number of simulated walks.
+          steps: policy steps of a walk.
+
+        Returns:
+          By name: mean `return` under the weights of Table I, `fall_rate`, and mean `power_w` while the robot walks.
+        """
+        key_params, key_episodes = jax.random.split(key)
+        params = parameters.from_coords(self.entries, dists.sample(key_params, dist, count))
+        trajectory, power = rollout(
+            self.robot,
+            key_episodes,
+            self.act(policy),
+            params,
+            steps,
+            watch=lambda before, after, motion: gait.power(motion.torque, motion.qvel[6:]),
+        )
+        return summarise_walks(trajectory, power)
+
+    def tuner(self, target: Target | None = None) -> Tuner:
+        """Makes Algorithm 1 over this learner's functions.
+
+        Args:
+          target: what is measured. The tuner is pure where it is in JAX; where None, measured sets come from outside
+            (a log) and are handed to `Tuner.tune`.
+        """
+        count, steps = self.preset.tuner.set_episodes, self.preset.episode_steps
+        return Tuner(
+            config=self.preset.tuner,
+            train_policy=lambda key, policy, dist: self.train(key, policy, dist, self.preset.epochs),
+            simulate=self.simulate,
+            measure=target and (lambda key, policy: target.episodes(key, self.act(policy), count, steps)),
+        )
+
+    def step(self, machine: Tuner | Untuned, play: Callable[..., Trajectory]) -> Callable:
+        """Makes a tuner's step out of parts that are compiled apart, so that several tuners share the large ones.
+
+        Args:
+          machine: a tuner, or a baseline that is never tuned.
+          play: what `play` made of the target.
+
+        Returns:
+          `(key, state) -> (state, info)`, with the random keys split as `Tuner.step` splits them.
+        """
+        if isinstance(machine, Untuned):
+            return replace(machine, tuner=replace(machine.tuner, train_policy=self._train)).step
+        tune = jax.jit(machine.tune)
+        count, steps = self.preset.tuner.set_episodes, self.preset.episode_steps
+
+        def step(key, state):
+            key_measure, key_tune, key_train = jax.random.split(key, 3)
+            state, info = tune(key_tune, state, play(key_measure, state.policy, count, steps))
+            policy, metrics = self._train(key_train, state.policy, state.dist)
+            return state.replace(policy=policy), info.replace(train=metrics)
+
+        return step
+
+    def act(self, policy: Policy) -> Act:
+        """Makes the policy's action function, `(observation [obs], key) -> (action [act], extras)`, without noise."""
+        # A pytree, so that a program which takes it as an argument is not compiled again for the next policy.
+        return jax.tree_util.Partial(self._act, policy.learner)
+
+    def _act(self, ppo: PPOState, obs: jax.Array, key: jax.Array):
+        return self._ppo.act(ppo)(obs, key)
+
+
+def summarise_walks(trajectory: Trajectory, power: jax.Array) -> dict[str, jax.Array]:
+    """Averages what matters of walks, simulated or recorded, so that predictions and measurements compare.
+
+    Args:
+      trajectory: walks, [episodes, time].
+      power: [episodes, time] W, mechanical.
+
+    Returns:
+      Scalars by name: mean `return` of a walk under the weights of Table I, `fall_rate` (share of walks that end in a
+      fall), and mean `power_w` over the steps on which the robot was alive.
+    """
+    alive = trajectory.alive
+    return {
+        "return": trajectory.score.sum(axis=1).mean(),
+        "fall_rate": trajectory.fell.mean(),
+        "power_w": jnp.where(alive, power, 0.0).sum() / jnp.maximum(alive.sum(), 1),
+    }

@@ -1,0 +1,85 @@
+"""Policies that walk: training one from scratch, and loading one by name.
+
+A policy on disk is a folder: PPO's state as an orbax checkpoint, and a `config.json` with what the state depends on
+(`policy_config`). The one that ships is `experiments/policies/walk`.
+"""
+
+import time
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+from rich.progress import Progress
+
+from experiments.common import checkpoint
+from experiments.common.checkpoint import write_json
+from experiments.common.cli import bars
+from experiments.common.config import WALK
+from experiments.walking.learner import Learner, Policy
+from jaxtune.mjx import parameters
+
+
+def policy_config(learner: Learner) -> dict:
+    """Lists what a saved policy and the run that loads it must agree in.
+
+    A policy means nothing to a run with another reference pose, action scale or network, so `starting_policy` refuses
+    a folder whose config differs.
+    """
+    task, ppo = learner.preset.task, learner.preset.ppo
+    return {"base": task.base, "action_scale": task.action_scale, "hidden": list(ppo.hidden)}
+
+
+def walk(
+    key: jax.Array, learner: Learner, updates: int, progress: Progress | None = None
+) -> tuple[Policy, list[dict[str, float]]]:
+    """Trains a walking policy from scratch, on robots around the nominal parameters.
+
+    Args:
+      key: random key of everything.
+      learner: robot and sizes; `preset.policy_radius` is how far its robots are from nominal.
+      updates: PPO updates, rounded up to whole chunks of `preset.chunk`.
+      progress: where steps and reward are shown, if given.
+
+    Returns:
+      The policy, and a line of metrics (means over the chunk) for every chunk of updates.
+    """
+    key_init, key_train = jax.random.split(key)
+    policy = learner.init(key_init)
+    dist = learner.dist(parameters.nominal(learner.entries), learner.preset.policy_radius)
+    chunk = min(learner.preset.chunk, updates)
+    train = jax.jit(lambda key, policy: learner.train(key, policy, dist, chunk))
+    task = progress.add_task("training", total=updates * learner.preset.ppo.steps_per_update) if progress else None
+    curve, start = [], time.monotonic()
+    for index in range(-(-updates // chunk)):
+        policy, metrics = train(jax.random.fold_in(key_train, index), policy)
+        line = {name: float(jnp.mean(value)) for name, value in metrics.items()}
+        steps = (index + 1) * chunk * learner.preset.ppo.steps_per_update
+        curve.append({"steps": steps, "seconds": time.monotonic() - start, **line})
+        if progress:
+            progress.update(task, completed=steps, description=f"reward {100 * line['reward']:.2f} a second")
+    return policy, curve
+
+
+def starting_policy(name: str, learner: Learner, out: Path | None = None) -> Policy:
+    """Loads the policy that a command begins with.
+
+    Args:
+      name: `walk`, which ships with the package; a folder of `experiments.train`; or `scratch`, which is trained first
+        and kept in `out`, where a second call finds it.
+      learner: robot and sizes of the run.
+      out: folder of the run; needed for `scratch` alone.
+
+    Raises:
+      ValueError: the folder holds no policy, or one of another config; names the field that differs.
+    """
+    fresh = learner.init(jax.random.PRNGKey(0))
+    place = WALK if name == "walk" else Path(name)
+    if name == "scratch":
+        place = out / "policy"
+        if not (place / "config.json").exists():
+            with bars() as progress:
+                policy, curve = walk(jax.random.PRNGKey(0), learner, learner.preset.scratch_updates, progress)
+            checkpoint.save(place, policy.learner, policy_config(learner))
+            write_json(place / "curve.json", {"curve": curve})
+    ppo = checkpoint.load(place, fresh.learner, policy_config(learner))
+    return learner.init(jax.random.PRNGKey(0), ppo)
