@@ -1,5 +1,6 @@
-"""What discovery tells a person: a page with its pictures in it, and two tables."""
+"""Tells a person what discovery found: a page with its pictures in it, and tables on the console."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from rich.console import Console
@@ -12,32 +13,55 @@ from jaxtune.discovery.result import Result
 
 VERDICTS = {
     "named": "Something is missing in the model, and it has a name.",
-    "parameter_change": "Nothing is missing, but a parameter is another one.",
-    "no_missing_effect": "The model explains these logs down to the floor.",
+    "parameter_change": "Nothing is missing in the model, but a parameter has another value.",
+    "no_missing_effect": "Nothing is missing: the model explains these logs down to the noise floor.",
     "unnamed": "Something is missing that no effect of the library explains.",
 }
+"""What each verdict means."""
+
+ADVICE = {
+    "named": "Train and tune in the corrected model (--model OUT/model). Where an effect is not distinguishable from "
+    "others, record the experiment in its row first if the difference matters to you.",
+    "parameter_change": "Use the corrected model (--model OUT/model), and check the parameter on the robot.",
+    "no_missing_effect": "Keep the model. If a policy still fails on the robot, look at what these logs cannot show: "
+    "contact, the free base, commands and delays on the way to the controller.",
+    "unnamed": "Look at the joint and regime where the gap is largest. The model that was saved has a torque without a "
+    "name there: it may simulate better, and it explains nothing.",
+}
+"""What to do next, by verdict."""
+
+_TEMPLATE = Path(__file__).with_suffix(".html")
 
 
 def write(path: Path, log: Log, question: Question, result: Result, summary: dict, free: dict) -> None:
-    """Writes the page; whatever came from the log is escaped."""
+    """Writes the page; text that comes from the log is escaped.
+
+    Args:
+      path: of the HTML file, which holds its pictures.
+      log: what was measured.
+      question: what was asked; its rig knows the effects' sentences.
+      result: what was found.
+      summary: of `experiments.discovery.summary.summarise`.
+      free: of `experiments.discovery.summary.free_runs`.
+    """
     pictures = {"where": plots.heat_map(result.where), "traces": plots.traces(free["runs"], log.joints)}
-    if result.rungs:
-        pictures["ladder"] = plots.ladder(result.rungs)
-    effects = [*summary["effects"], *summary["parameter_changes"]]
+    if result.terms:
+        pictures["terms"] = plots.accepted_terms(result.terms)
+    effects = question.rig.effects
     page = report.render(
-        "discovery_report.html",
+        _TEMPLATE,
         robot=log.robot,
         runs=len(log.runs),
         meaning=VERDICTS[summary["verdict"]],
+        advice=ADVICE[summary["verdict"]],
         summary=summary,
-        effects=[effect | {"sentence": question.rig.effects[effect["name"]].sentence} for effect in effects],
+        effects=_presented(summary, question),
         notes=question.notes,
         not_testable=[
-            (name, question.rig.effects[name].excited_by if name in question.rig.effects else "a free base")
-            for name in summary["not_testable"]
+            (name, effects[name].excited_by if name in effects else "a free base") for name in summary["not_testable"]
         ],
         proof=result.proof,
-        rungs=result.rungs,
+        terms=result.terms,
         rejected=result.rejected,
         free=free,
         pictures={name: plots.embedded(figure) for name, figure in pictures.items()},
@@ -45,23 +69,54 @@ def write(path: Path, log: Log, question: Question, result: Result, summary: dic
     path.write_text(page)
 
 
-def show(console: Console, summary: dict, result: Result, free: dict) -> None:
-    """Prints the verdict."""
+def show(console: Console, question: Question, summary: dict, free: dict) -> None:
+    """Prints the verdict, what to do next, every effect with its interval, and the gap before and after.
+
+    Args:
+      console: where it is printed.
+      question: what was asked.
+      summary: of `experiments.discovery.summary.summarise`.
+      free: of `experiments.discovery.summary.free_runs`.
+    """
     console.print(f"[bold]{summary['verdict']}[/bold]: {VERDICTS[summary['verdict']]}")
-    table = Table("effect", "place", "value (95 % interval)", "cannot be told from", "split by")
-    for effect in [*summary["effects"], *summary["parameter_changes"]]:
+    console.print(ADVICE[summary["verdict"]])
+    table = Table("effect", "place", "value (95 % interval)", "not distinguishable from", "experiment")
+    for effect in _presented(summary, question):
         values = ", ".join(
             f"{name} {value['value']:.4g} ({value['low']:.4g} to {value['high']:.4g})"
             for name, value in effect["parameters"].items()
         )
         others = ", ".join(effect["confusable_with"]) or "-"
-        table.add_row(effect["name"], ", ".join(effect["places"]), values, others, effect["split_by"])
+        table.add_row(effect["name"], effect["place"], values, others, effect["experiment"])
     if table.row_count:
         console.print(table)
-    table = Table("sealed runs", "before", "null", "after")
+    table = Table("sealed runs", "nominal", "parameters fitted", "corrected")
     gap, error = summary["gap"], free["error_rad"]["sealed"]
     table.add_row("gap, floor units", *(f"{gap[name]:.2f}" for name in ("before", "null", "after")))
     table.add_row("error of whole runs, rad", *(f"{error[name]:.4f}" for name in ("before", "null", "after")))
     console.print(table)
     if summary["not_testable"]:
         console.print(f"these logs cannot show: {', '.join(summary['not_testable'])}")
+
+
+def _presented(summary: dict, question: Question) -> list[dict]:
+    """Effects and parameter changes with their place in words, the experiment there, and the effect's sentence."""
+    found = []
+    for effect in [*summary["effects"], *summary["parameter_changes"]]:
+        row = question.rig.effects[effect["name"]]
+        place = in_words(effect["places"], question.rig.places[row.on], row.on)
+        added = {"place": place, "experiment": f"{row.excited_by} on {place}", "sentence": row.sentence}
+        found.append(effect | added)
+    return found
+
+
+def in_words(places: Sequence[str], every: Sequence[str], kind: str) -> str:
+    """Names places briefly: `all joints` instead of six names.
+
+    Args:
+      places: where an effect is.
+      every: all places where it could be.
+      kind: what they are (joint, body, foot, robot).
+    """
+    plural = {"body": "bodies", "foot": "feet"}.get(kind, f"{kind}s")
+    return f"all {plural}" if len(places) > 1 and set(places) == set(every) else ", ".join(places)

@@ -1,17 +1,17 @@
-"""Every picture the experiments draw."""
+"""Every picture that the commands draw, as functions from results to a file or a figure."""
 
 from experiments.common.plots.base import embedded
-from experiments.common.plots.discovery import confusion, heat_map, ladder, suspicions, traces
+from experiments.common.plots.discovery import accepted_terms, confusion, heat_map, suspicions, traces
 from experiments.common.plots.tuning import rounds, sim2sim, sweep, training, transfer
 from experiments.common.plots.walking import gait, gaps
 
 __all__ = [
+    "accepted_terms",
     "confusion",
     "embedded",
     "gait",
     "gaps",
     "heat_map",
-    "ladder",
     "rounds",
     "sim2sim",
     "suspicions",

@@ -87,14 +87,18 @@ def traces(runs: Sequence[dict], joints: Sequence[str], most: int = 6) -> plt.Fi
     return figure
 
 
-def ladder(rungs: Sequence) -> plt.Figure:
-    """Gain of every accepted effect beside what healthy logs gain by chance."""
-    figure, axis = plt.subplots(figsize=(8, 1.5 + 0.5 * len(rungs)), layout="constrained")
-    place = np.arange(len(rungs))
-    axis.barh(place, [rung.evidence.gain for rung in rungs], color="tab:blue", height=0.5, label="gain")
-    axis.plot([rung.thresholds.gain for rung in rungs], place, "|", color="black", ms=22, mew=2, label="threshold")
+def accepted_terms(terms: Sequence) -> plt.Figure:
+    """Draws the gain of every accepted effect beside the threshold that simulated null logs set.
+
+    Args:
+      terms: accepted terms (`jaxtune.discovery`), in the order of their acceptance.
+    """
+    figure, axis = plt.subplots(figsize=(8, 1.5 + 0.5 * len(terms)), layout="constrained")
+    place = np.arange(len(terms))
+    axis.barh(place, [term.evidence.gain for term in terms], color="tab:blue", height=0.5, label="gain")
+    axis.plot([term.thresholds.gain for term in terms], place, "|", color="black", ms=22, mew=2, label="threshold")
     axis.set(yticks=place, xscale="log", xlabel="fall of the loss on train")
-    axis.set_yticklabels([rung.hypothesis.key for rung in rungs])
+    axis.set_yticklabels([term.hypothesis.key for term in terms])
     axis.invert_yaxis()
     axis.legend(fontsize=8, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2)
     return figure
