@@ -8,11 +8,11 @@ import mujoco
 import numpy as np
 from mujoco import mjx
 
-from envs import domain
 from envs.biteno import constants
 from envs.biteno.env import Biteno, Drive, Motion, State, TaskConfig
 from envs.chain import MIN_FRICTION_NM, Chain
 from envs.correction import Correction
+from jaxtune.mjx import parameters
 
 
 class CorrectedBiteno(Biteno):
@@ -27,7 +27,7 @@ class CorrectedBiteno(Biteno):
       correction: model and effects.
     """
 
-    def __init__(self, config: TaskConfig, entries: Mapping[str, domain.Entry], correction: Correction):
+    def __init__(self, config: TaskConfig, entries: Mapping[str, parameters.Entry], correction: Correction):
         self._rows = correction.rows
         super().__init__(config, entries, correction.path)
         model = self.mj_model
@@ -49,7 +49,7 @@ class CorrectedBiteno(Biteno):
             model.dof_frictionloss[dof] = np.maximum(model.dof_frictionloss[dof], MIN_FRICTION_NM)
         super()._prepare(model)
 
-    def reset(self, params: domain.Params, key: jax.Array) -> State:
+    def reset(self, params: parameters.Params, key: jax.Array) -> State:
         """Starts an episode of a robot that has been standing."""
         state = super().reset(params, key)
         joint = state.qpos[self.joint_qpos]
@@ -57,7 +57,7 @@ class CorrectedBiteno(Biteno):
         state = state.replace(memory=self._chain.start(self._values, still, self._asked(self._model, joint)))
         return state.replace(obs=self._observe(state, jax.random.fold_in(key, 1)))
 
-    def simulate(self, params: domain.Params, state: State, drive: Drive) -> Motion:
+    def simulate(self, params: parameters.Params, state: State, drive: Drive) -> Motion:
         """Physics in MJX, through the effects."""
         model = self.model(params)
         data = self._data.replace(
@@ -106,6 +106,6 @@ class CorrectedBiteno(Biteno):
         }
 
 
-def make(config: TaskConfig, entries: Mapping[str, domain.Entry], correction: Correction | None = None) -> Biteno:
+def make(config: TaskConfig, entries: Mapping[str, parameters.Entry], correction: Correction | None = None) -> Biteno:
     """The nominal robot, or the one that a correction describes."""
     return Biteno(config, entries) if correction is None else CorrectedBiteno(config, entries, correction)

@@ -11,7 +11,7 @@ import pytest
 from envs import corrected, correction, models
 from envs.biteno import Biteno, BraxBiteno, CorrectedBiteno, TaskConfig, constants
 from envs.correction import Correction
-from envs.domain import select
+from jaxtune.mjx import select
 
 ENTRIES = select(constants.ENTRIES, ("torque_scale",))
 STEPS = 20
