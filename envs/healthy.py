@@ -53,8 +53,7 @@ def replay(run: Run, model: mujoco.MjModel, joints, rng: np.random.Generator) ->
     dof = np.array([model.joint(name).dofadr[0] for name in joints])
     damping = model.dof_damping[dof].copy()
     data.qpos[qpos], data.qvel[dof] = smoothed(run)[0]
-    gains, driven = run.controller.gains, "target" in run.signals
-    on = run.signals.get("enabled", np.ones(len(run.time)))
+    controller, driven = run.impedance(), "target" in run.signals
     steps = int(np.ceil(1.0 / run.controller.rate_hz / _STEP_S - 1e-9))
     model.opt.timestep = 1.0 / run.controller.rate_hz / steps
     count = int(np.ceil((run.time[-1] - run.time[0]) * run.controller.rate_hz)) + 2
@@ -67,16 +66,8 @@ def replay(run: Run, model: mujoco.MjModel, joints, rng: np.random.Generator) ->
         mujoco.mj_step(model, data, int(looks[0]))
     for look, row in enumerate(last):
         q, dq = data.qpos[qpos], data.qvel[dof]
-        if not driven:
-            torque = run.signals["tau"][row]
-        elif run.controller.kind == "servo":
-            stall = on[row] * run.signals["volts"][row] * gains["kt"] / gains["resistance_ohm"]
-            torque = stall * np.clip(gains["gain"] * (run.signals["target"][row] - q), -1, 1)
-            model.dof_damping[dof] = damping + on[row] * gains["kt"] ** 2 / gains["resistance_ohm"]
-        else:
-            limit = gains["torque_limit_nm"]
-            error = run.signals["target"][row] - q
-            torque = on[row] * np.clip(gains["kp"] * error - gains["kd"] * dq, -limit, limit)
+        torque = controller[row].torque(run.signals["target"][row], q, dq) if driven else run.signals["tau"][row]
+        model.dof_damping[dof] = damping + controller.back_emf[row]
         states[look, 0], states[look, 1], torques[look] = q, dq, torque
         data.qfrc_applied[dof] = torque
         if look + 1 < len(looks):

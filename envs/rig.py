@@ -14,11 +14,12 @@ import mujoco
 import numpy as np
 from mujoco import mjx
 
-from envs import domain, sensing
+from envs import sensing
 from envs.chain import MIN_FRICTION_NM, Chain
 from envs.effects import EVERY
 from envs.effects.memory import LONGEST_S
 from envs.segments import Segment
+from jaxtune.mjx import parameters
 from jaxtune.types import Effect, Parameter
 
 Coordinates = Mapping[str, Mapping[str, jax.Array]]
@@ -165,7 +166,7 @@ class Rig:
                 continue
             for parameter in row.parameters:
                 key = f"{name}.{parameter.name}"
-                entries[key] = domain.Entry(
+                entries[key] = parameters.Entry(
                     name=key,
                     kind=row.on,
                     targets=self.places[row.on],
@@ -176,7 +177,7 @@ class Rig:
                 )
                 inner = values[name][parameter.name]
                 params[key] = jnp.exp(inner) if parameter.form == "ratio" else inner
-        return domain.apply(self._model, params, entries)
+        return parameters.apply(self._model, params, entries)
 
     def inner(self, vectors: np.ndarray) -> np.ndarray:
         """What the physics reads of coordinates [n, axes], [n, axes]."""

@@ -129,11 +129,8 @@ class _Disagreement:
         """Torque of the controller, [rows, joints]; None where it has none that is known."""
         if not self._driven:
             return None
-        gains = run.controller.gains
         speed = run.signals["dq"] if "dq" in run.signals else smoothed(run)[:, 1]
-        torque = gains["kp"] * (run.signals["target"] - run.signals["q"]) - gains["kd"] * speed
-        on = run.signals.get("enabled", np.ones(len(run.time)))[:, None]
-        return on * np.clip(torque, -gains["torque_limit_nm"], gains["torque_limit_nm"])
+        return run.impedance().torque(run.signals["target"], run.signals["q"], speed)
 
     def needed(self, run: Run, position: np.ndarray, slope: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Torque that the model needs for the motion [some rows, joints], and which rows."""

@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.biteno import Biteno, CorrectedBiteno, Drive, Motion, State
+from envs.biteno import Biteno, Drive, Motion, State
+from envs.corrected import CorrectedBiteno
 from envs.targets.protocol import Act, Asked, Recording, watch
 from jaxtune.types import Trajectory
 

@@ -7,9 +7,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from envs import domain
 from envs.biteno import Biteno
 from envs.targets.protocol import Act, Asked, Recording, watch
+from jaxtune.mjx import parameters
 from jaxtune.types import Named, Trajectory
 
 _CHUNK = 256  # small batches are fastest on a CPU; larger ones are worked off in turn
@@ -19,7 +19,7 @@ def rollout(
     robot: Biteno,
     key: jax.Array,
     act: Act,
-    params: domain.Params,
+    params: parameters.Params,
     steps: int,
     asked: Asked | None = None,
     watch: Callable[..., Any] = lambda before, after, motion: (),
@@ -105,4 +105,4 @@ def simulate(
     robot: Biteno, key: jax.Array, act: Act, coordinates: Named, steps: int, asked: Asked | None = None
 ) -> Trajectory:
     """Plays one episode for every draw of the tuner's distribution, [episodes] by name in search coordinates."""
-    return rollout(robot, key, act, domain.from_coordinates(robot.entries, coordinates), steps, asked)[0]
+    return rollout(robot, key, act, parameters.from_coords(robot.entries, coordinates), steps, asked)[0]

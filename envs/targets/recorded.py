@@ -182,10 +182,9 @@ def _wanted_torque(run: Run, seen: dict[str, np.ndarray], order: list[int]) -> n
     """What the joints' controller has asked for, [ticks, joints] Nm, where nobody measured what came of it."""
     if run.controller.kind != "pd":
         raise ValueError(f"{run.name}: there is no 'tau', expected it beside a controller of type servo")
-    kp, kd, limit = (run.controller.gains[name][order] for name in ("kp", "kd", "torque_limit_nm"))
     # Until now the target was that of the tick before.
     target = np.concatenate([seen["target"][:1], seen["target"][:-1]])
-    return np.clip(kp * (target - seen["q"]) - kd * seen["dq"], -limit, limit)
+    return run.controller.impedance()[order].torque(target, seen["q"], seen["dq"])
 
 
 def _pieces(ticks: dict[str, np.ndarray]) -> list[tuple[np.ndarray, bool]]:
