@@ -6,10 +6,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Shaped
 
-from jaxtune.types import Named, ParamDist
+from jaxtune.types import Coords, ParamDist
 
 
-def make(centre: Named, radius: float, lower: Named, upper: Named) -> ParamDist:
+def make(centre: Coords, radius: float, lower: Coords, upper: Coords) -> ParamDist:
     """A distribution with one radius for all of its parameters.
 
     Args:
@@ -41,12 +41,12 @@ def names(dist: ParamDist) -> tuple[str, ...]:
     return tuple(sorted(dist.centre))
 
 
-def ravel(params: Named) -> Shaped[Array, "... params"]:
-    """Named values to a vector, at a network's door; sorted by name."""
-    return jnp.stack([params[name] for name in sorted(params)], axis=-1)
+def ravel(coords: Coords) -> Shaped[Array, "... coords"]:
+    """Coords values to a vector, at a network's door; sorted by name."""
+    return jnp.stack([coords[name] for name in sorted(coords)], axis=-1)
 
 
-def unravel(order: Sequence[str], vector: Float[Array, "... params"]) -> dict:
+def unravel(order: Sequence[str], vector: Float[Array, "... coords"]) -> dict:
     """The inverse of `ravel`."""
     return {name: vector[..., column] for column, name in enumerate(order)}
 
@@ -65,12 +65,12 @@ def sample(key: jax.Array, dist: ParamDist, count: int) -> dict:
     return unravel(names(dist), draws)
 
 
-def normalise(dist: ParamDist, params: Named) -> Float[Array, "... params"]:
-    """Named values to a vector in units of the radius around the centre."""
-    return (ravel(params) - ravel(dist.centre)) / ravel(dist.radius)
+def normalise(dist: ParamDist, coords: Coords) -> Float[Array, "... coords"]:
+    """Coords values to a vector in units of the radius around the centre."""
+    return (ravel(coords) - ravel(dist.centre)) / ravel(dist.radius)
 
 
-def normalised_box(dist: ParamDist) -> tuple[Float[Array, " params"], Float[Array, " params"]]:
+def normalised_box(dist: ParamDist) -> tuple[Float[Array, " coords"], Float[Array, " coords"]]:
     """The support in units of the radius around the centre: -1 to 1, less where the bounds cut it."""
     low, high = box(dist)
     return normalise(dist, low), normalise(dist, high)
@@ -99,7 +99,7 @@ def widen(dist: ParamDist, factor: jax.Array) -> ParamDist:
     return dist.replace(radius=radius)
 
 
-def move(dist: ParamDist, step: Float[Array, " params"]) -> ParamDist:
+def move(dist: ParamDist, step: Float[Array, " coords"]) -> ParamDist:
     """Shifts the centre by a step in units of the radius, within the bounds."""
     centre = ravel(dist.centre) + ravel(dist.radius) * step
     centre = jnp.clip(centre, ravel(dist.lower), ravel(dist.upper))

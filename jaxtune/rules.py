@@ -82,9 +82,9 @@ class Collected:
     """Simulated episodes of one distribution."""
 
     trajectory: Trajectory  # D_q, [episodes, time]
-    params: dict  # their parameters, [episodes]
+    coords: dict  # their parameters, [episodes]
     held_out: Trajectory  # [sets, set_episodes, time]
-    held_out_params: dict  # [sets]
+    held_out_coords: dict  # [sets]
 
 
 @chex.dataclass(frozen=True)
@@ -100,7 +100,7 @@ class GateInfo:
 
 @chex.dataclass(frozen=True)
 class UpdateInfo:
-    """One update, [params] each in the order of `dist.names`; of the radius where a step is meant."""
+    """One update, [coords] each in the order of `dist.names`; of the radius where a step is meant."""
 
     step: jax.Array  # taken by the centre
     interval: jax.Array  # half width of the interval around it
@@ -153,7 +153,7 @@ def _conformal_quantile(values: jax.Array, level: jax.Array | float) -> jax.Arra
 
 def vote_update(key, config, collected, measured, dist, knobs) -> tuple[ParamDist, UpdateInfo]:
     """The paper's rule, signed: centre += step_size * radius * vote."""
-    model, loss = spm.train(key, config.spm, collected.trajectory, collected.params, dist)
+    model, loss = spm.train(key, config.spm, collected.trajectory, collected.coords, dist)
     step = knobs.step_size * spm.vote(config.spm, model, measured)
     unknown = jnp.full_like(step, jnp.nan)
     info = UpdateInfo(step=step, interval=unknown, identifiable=jnp.ones_like(step, bool), loss=loss)
@@ -167,9 +167,9 @@ def posterior_update(key, config, collected, measured, dist, knobs) -> tuple[Par
     of their errors. A parameter whose interval is as wide as one that ignores the data is not identifiable and left
     as it was. A parameter whose interval reaches past the box moves but keeps its radius.
     """
-    model, loss = spm.train(key, config.spm, collected.trajectory, collected.params, dist)
+    model, loss = spm.train(key, config.spm, collected.trajectory, collected.coords, dist)
     held_out = jax.lax.map(lambda episodes: spm.estimate(config.spm, model, episodes), collected.held_out)
-    truth = dists.normalise(dist, collected.held_out_params)
+    truth = dists.normalise(dist, collected.held_out_coords)
     low, high = dists.normalised_box(dist)
     interval = _conformal_quantile(jnp.abs(held_out - truth), config.coverage)
     ignorant = _conformal_quantile(jnp.abs((low + high) / 2 - truth), config.coverage)

@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxtune import dist as dists
 from jaxtune import windows
-from jaxtune.types import Named, ParamDist, Trajectory
+from jaxtune.types import Coords, ParamDist, Trajectory
 
 _SCALED = 2048  # windows that the scale of the moments is read from
 _FAR = 10.0  # standard deviations; a moment that hardly varied in training must not drown all others later
@@ -54,23 +54,23 @@ class SPMConfig:
 
 class _Network(nn.Module):
     config: SPMConfig
-    num_params: int
+    num_coords: int
 
     def setup(self):
         self.window_layers = [nn.Dense(width) for width in self.config.hidden]
         self.guess_layers = [nn.Dense(width // 4) for width in self.config.hidden]
-        self.head_hidden = nn.Dense(self.num_params * self.config.head)
-        self.head_out = self.param("head_out", nn.initializers.lecun_normal(), (self.config.head, self.num_params))
+        self.head_hidden = nn.Dense(self.num_coords * self.config.head)
+        self.head_out = self.param("head_out", nn.initializers.lecun_normal(), (self.config.head, self.num_coords))
 
     def __call__(self, features, guesses):
-        """Logits [batch, guesses, params] for moments [batch, moments] and guesses [batch, guesses, params]."""
+        """Logits [batch, guesses, coords] for moments [batch, moments] and guesses [batch, guesses, coords]."""
         for layer in self.window_layers:
             features = nn.elu(layer(features))
         for layer in self.guess_layers:
             guesses = nn.elu(layer(guesses))
         features = jnp.broadcast_to(features[:, None], (*guesses.shape[:2], features.shape[-1]))
         hidden = nn.elu(self.head_hidden(jnp.concatenate([features, guesses], axis=-1)))
-        hidden = hidden.reshape(*hidden.shape[:-1], self.num_params, self.config.head)
+        hidden = hidden.reshape(*hidden.shape[:-1], self.num_coords, self.config.head)
         return jnp.einsum("...ph,hp->...p", hidden, self.head_out)
 
 
@@ -105,7 +105,7 @@ def _moments(window: Float[Array, "batch time channels"]) -> Float[Array, "batch
 
 
 def train(
-    key: jax.Array, config: SPMConfig, trajectory: Trajectory, params: Named, dist: ParamDist
+    key: jax.Array, config: SPMConfig, trajectory: Trajectory, coords: Coords, dist: ParamDist
 ) -> tuple[SPM, jax.Array]:
     """Trains on simulated episodes.
 
@@ -113,7 +113,7 @@ def train(
       key: random key.
       config: sizes.
       trajectory: [episodes, time].
-      params: the true parameters of every episode, [episodes] by name.
+      coords: the true coordinates of every episode, [episodes] by name.
       dist: the distribution they were drawn from; its support is the query box.
 
     Returns:
@@ -121,7 +121,7 @@ def train(
       log 2 at the centre and 1/2, on average over the box, elsewhere.
     """
     key_init, key_moments, key_train = jax.random.split(key, 3)
-    truth = dists.normalise(dist, params)
+    truth = dists.normalise(dist, coords)
     low, high = dists.normalised_box(dist)
     steps = windows.fit_scaler(trajectory)
     window, _ = windows.draw(key_moments, trajectory, _SCALED, config.window)
@@ -154,8 +154,8 @@ def train(
 
 
 def logits(
-    config: SPMConfig, spm: SPM, trajectory: Trajectory, guesses: Float[Array, "guesses params"]
-) -> Float[Array, "guesses params"]:
+    config: SPMConfig, spm: SPM, trajectory: Trajectory, guesses: Float[Array, "guesses coords"]
+) -> Float[Array, "guesses coords"]:
     """Evidence of a set of episodes, for each guess: the mean logit over the set's windows.
 
     Args:
@@ -171,13 +171,13 @@ def logits(
     return _masked_mean(answers, valid)
 
 
-def vote(config: SPMConfig, spm: SPM, trajectory: Trajectory) -> Float[Array, " params"]:
+def vote(config: SPMConfig, spm: SPM, trajectory: Trajectory) -> Float[Array, " coords"]:
     """Which way each parameter must move from the centre, in [-1, 1]; positive raises it."""
     centre = jnp.zeros((1, len(spm.dist.centre)))
     return 2.0 * jax.nn.sigmoid(logits(config, spm, trajectory, centre)[0]) - 1.0
 
 
-def estimate(config: SPMConfig, spm: SPM, trajectory: Trajectory) -> Float[Array, " params"]:
+def estimate(config: SPMConfig, spm: SPM, trajectory: Trajectory) -> Float[Array, " coords"]:
     """Where the sweep's logit crosses zero, for each parameter, in units of the radius around the centre.
 
     Guesses of different parameters are independent in training, so one sweep along the box's diagonal serves them all.

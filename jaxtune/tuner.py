@@ -46,7 +46,7 @@ from jaxtune.rules import (
     posterior_update,
     vote_update,
 )
-from jaxtune.types import Named, ParamDist, Trajectory, Verdict
+from jaxtune.types import Coords, ParamDist, Trajectory, Verdict
 
 __all__ = [
     "Collected",
@@ -65,7 +65,7 @@ __all__ = [
 
 Policy = Any
 TrainPolicy = Callable[[jax.Array, Policy, ParamDist], tuple[Policy, dict]]
-Simulate = Callable[[jax.Array, Policy, Named], Trajectory]
+Simulate = Callable[[jax.Array, Policy, Coords], Trajectory]
 Measure = Callable[[jax.Array, Policy], Trajectory]
 
 
@@ -100,7 +100,7 @@ class Tuner:
     Attributes:
       config: sizes.
       train_policy: `(key, policy, dist) -> (policy, metrics)`.
-      simulate: `(key, policy, params [episodes]) -> Trajectory [episodes, time]`.
+      simulate: `(key, policy, coords [episodes]) -> Trajectory [episodes, time]`.
       measure: `(key, policy) -> Trajectory [set_episodes, time]`, of the same length, policy and commands; None where
         the target is not JAX, and the measured set is handed to `tune`.
       verify: scores a measured set.
@@ -167,7 +167,7 @@ class Tuner:
             gate = self.verify(key_verify, self.config, collected, measured, state.knobs)
             closer = gate.novelty < carry["closest"] - self.config.least_fall
             stalled = jnp.where(closer, 0, carry["stalled"] + 1)
-            verdict = self._judge(gate, dist, calls, stalled)
+            verdict = self._verdict(gate, dist, calls, stalled)
             broken = collected.trajectory.not_finite.sum() + collected.held_out.not_finite.sum()
             wider = dists.widen(dist, state.knobs.widen_factor)
             return {
@@ -203,20 +203,20 @@ class Tuner:
         """Episodes for training and held-out sets, simulated in one batch."""
         key_train, key_held_out, key_simulate = jax.random.split(key, 3)
         sets, each = self.config.held_out_sets, self.config.set_episodes
-        params = dists.sample(key_train, dist, self.config.episodes)
-        held_out_params = dists.sample(key_held_out, dist, sets)
-        every = jax.tree.map(lambda a, b: jnp.concatenate([a, jnp.repeat(b, each)]), params, held_out_params)
+        coords = dists.sample(key_train, dist, self.config.episodes)
+        held_out_coords = dists.sample(key_held_out, dist, sets)
+        every = jax.tree.map(lambda a, b: jnp.concatenate([a, jnp.repeat(b, each)]), coords, held_out_coords)
         trajectory = self.simulate(key_simulate, policy, every)
         return Collected(
             trajectory=jax.tree.map(lambda leaf: leaf[: self.config.episodes], trajectory),
-            params=params,
+            coords=coords,
             held_out=jax.tree.map(
                 lambda leaf: leaf[self.config.episodes :].reshape(sets, each, *leaf.shape[1:]), trajectory
             ),
-            held_out_params=held_out_params,
+            held_out_coords=held_out_coords,
         )
 
-    def _judge(self, gate: GateInfo, dist: ParamDist, calls: jax.Array, stalled: jax.Array) -> jax.Array:
+    def _verdict(self, gate: GateInfo, dist: ParamDist, calls: jax.Array, stalled: jax.Array) -> jax.Array:
         exhausted = dists.at_bounds(dist) | (calls >= self.config.max_widenings)
         return jnp.select(
             [

@@ -10,7 +10,7 @@ import chex
 import jax
 import jax.numpy as jnp
 
-Named = Mapping[str, jax.Array]
+Coords = Mapping[str, jax.Array]
 """Parameters by name, in the coordinates that are searched (the logarithm of a multiplier, say)."""
 
 
