@@ -195,7 +195,7 @@ def calibrated_gate(
     scored = dvm.novelty(config.dvm, model, measured)
     novelty, valid, covered = jax.tree.map(lambda sets, one: jnp.concatenate([sets, one[None]]), held_out, scored)
     novelty = jnp.where(covered, novelty, jnp.inf)
-    # Windows that are not valid sort to the end of the pool. A window without a neighbour counts them too: hence the cap.
+    # Windows that are not valid sort to the end of the pool. One without a neighbour counts them too: hence the cap.
     pool = jnp.sort(jnp.where(valid, novelty, jnp.inf), axis=None)
     rank = jnp.searchsorted(pool, novelty, side="right") / valid.sum()
     rank = jnp.where(jnp.isnan(novelty), jnp.nan, jnp.minimum(rank, 1.0))

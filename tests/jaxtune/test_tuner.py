@@ -1,5 +1,7 @@
 import dataclasses
 import functools
+import re
+import textwrap
 
 import jax
 import jax.numpy as jnp
@@ -214,6 +216,14 @@ def test_collected_episodes_keep_to_their_coordinates():
     everything = np.concatenate([collected.coords["mass"], collected.held_out_coords["mass"]])
     assert len(np.unique(everything)) == 11
     assert np.abs(everything).max() <= 0.2
+
+
+def test_the_example_in_the_documentation_traces():
+    (code,) = re.findall(r"\n(    import jax\n.*?)\n`tuner.run", tuners.__doc__, re.DOTALL)
+    scope = {}
+    exec(textwrap.dedent(code), scope)
+    _, info = jax.eval_shape(scope["tuner"].step, jax.random.key(0), scope["state"])
+    assert info.verdicts.shape == (tuners.TunerConfig().max_widenings + 1,)
 
 
 # Identities of pure functions --------------------------------------------------------------------------------------
