@@ -14,12 +14,14 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 
-from jaxtune.rules import GateInfo, no_gate_log, no_update, vote_update
-from jaxtune.tuner import Info, Tuner, TunerState
-from jaxtune.types import Trajectory
+from jaxtune.rules import Collected, GateInfo, Knobs, TunerConfig, no_gate_log, no_update, vote_update
+from jaxtune.tuner import Info, Policy, Tuner, TunerState
+from jaxtune.types import ParamDist, Trajectory
 
 
-def open_gate(key, config, collected, measured, knobs) -> GateInfo:
+def open_gate(
+    key: jax.Array, config: TunerConfig, collected: Collected, measured: Trajectory, knobs: Knobs
+) -> GateInfo:
     """Accepts every measured set that holds at least one living step, without comparing it with anything.
 
     It takes the place of `rules.calibrated_gate` in the ungated baseline. Its `GateInfo` has novelty 0 at threshold 0,
@@ -33,6 +35,7 @@ def open_gate(key, config, collected, measured, knobs) -> GateInfo:
       knobs: not used.
     """
     nothing = jnp.asarray(jnp.nan)
+    # A set without a step must not move the centre; a novelty of nan ends the tuning as `not_finite`.
     usable = jnp.where(measured.alive.any(), 0.0, jnp.nan)
     return GateInfo(novelty=usable, threshold=jnp.zeros(()), p_value=nothing, uncovered=nothing, elbo=nothing)
 
@@ -57,8 +60,12 @@ class Untuned:
 
     tuner: Tuner
 
-    def init(self, policy, dist, knobs) -> TunerState:
-        """Makes the state before the first step from a policy, a distribution and knobs, as `Tuner.init` does."""
+    def init(self, policy: Policy, dist: ParamDist, knobs: Knobs) -> TunerState:
+        """Makes the state before the first step, as `Tuner.init` does.
+
+        `dist` is the distribution that all training happens in. The knobs are carried along, so that states of all
+        methods have one structure, but not used.
+        """
         return self.tuner.init(policy, dist, knobs)
 
     def step(self, key: jax.Array, state: TunerState) -> tuple[TunerState, Info]:

@@ -80,7 +80,10 @@ class PPOConfig:
 
     @property
     def steps_per_update(self) -> int:
-        """Number of environment steps that one update collects, over all environments; for speeds and budgets."""
+        """Number of environment steps that one update collects, over all environments.
+
+        Divide a training budget in steps by it to get the number of updates.
+        """
         return self.num_envs * self.unroll_steps
 
 
@@ -132,7 +135,8 @@ class PPO:
     def init(self, key: jax.Array) -> PPOState:
         """Makes a learner with random weights, before any update.
 
-        Its policy explores with a standard deviation of `init_std`.
+        Its policy explores with a standard deviation of `init_std`. The observations' running mean and standard
+        deviation begin at 0 and 1.
         """
         key_policy, key_value = jax.random.split(key)
         params = losses.PPONetworkParams(

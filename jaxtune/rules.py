@@ -221,7 +221,9 @@ def _conformal_quantile(values: jax.Array, level: jax.Array | float) -> jax.Arra
     return jnp.sort(values, axis=0)[jnp.minimum(rank, len(values) - 1)]
 
 
-def vote_update(key, config, collected, measured, dist, knobs) -> tuple[ParamDist, UpdateInfo]:
+def vote_update(
+    key: jax.Array, config: TunerConfig, collected: Collected, measured: Trajectory, dist: ParamDist, knobs: Knobs
+) -> tuple[ParamDist, UpdateInfo]:
     """Moves the centre by the vote of a search-parameter model: the paper's update, with a sign.
 
         centre <- centre + step_size * radius * vote,    vote = 2 p(truth > centre) - 1, in [-1, 1]
@@ -245,7 +247,9 @@ def vote_update(key, config, collected, measured, dist, knobs) -> tuple[ParamDis
     return dists.move(dist, step), info
 
 
-def posterior_update(key, config, collected, measured, dist, knobs) -> tuple[ParamDist, UpdateInfo]:
+def posterior_update(
+    key: jax.Array, config: TunerConfig, collected: Collected, measured: Trajectory, dist: ParamDist, knobs: Knobs
+) -> tuple[ParamDist, UpdateInfo]:
     """Moves the centre to the posterior's median and narrows the radius to its interval: the default update.
 
     A sweep of guesses through the search-parameter model gives each coordinate's estimate where the logit of

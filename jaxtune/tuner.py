@@ -287,7 +287,7 @@ class Tuner:
             **no_gate_log(self.config),
         }
 
-    def collect(self, key, policy, dist) -> Collected:
+    def collect(self, key: jax.Array, policy: Policy, dist: ParamDist) -> Collected:
         """Simulates D_q and the held-out sets under one policy, with coordinates drawn from one distribution.
 
         Every episode of D_q is a robot of its own; a held-out set is one robot in `set_episodes` episodes, like a
@@ -298,6 +298,7 @@ class Tuner:
         sets, each = self.config.held_out_sets, self.config.set_episodes
         coords = dists.sample(key_train, dist, self.config.episodes)
         held_out_coords = dists.sample(key_held_out, dist, sets)
+        # One call of the simulator for both, so that it is compiled once and the device is full.
         every = jax.tree.map(lambda a, b: jnp.concatenate([a, jnp.repeat(b, each)]), coords, held_out_coords)
         trajectory = self.simulate(key_simulate, policy, every)
         return Collected(

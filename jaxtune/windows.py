@@ -92,7 +92,7 @@ class Scaler:
     std: jax.Array  # [channels], never zero
 
     def __call__(self, windows: Float[Array, "... channels"]) -> Float[Array, "... channels"]:
-        """Standardises values: `(windows - mean) / std`, channel by channel."""
+        """Standardises values channel by channel: `(windows - mean) / std`, of any leading shape."""
         return (windows - self.mean) / self.std
 
 

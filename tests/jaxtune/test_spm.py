@@ -71,7 +71,7 @@ def test_estimate_of_a_truth_outside_is_the_edge_of_the_box(estimate):
     assert 0.9 < estimate(measured(mass=2.0))[MASS] <= 1.0
 
 
-def test_what_does_not_show_is_answered_with_the_middle_of_the_box(vote, estimate):
+def test_a_coordinate_that_does_not_show_is_estimated_in_the_middle_of_the_box(vote, estimate):
     for colour in (-0.9, 0.9):
         assert abs(vote(measured(colour=colour))[COLOUR]) < 0.35
         assert abs(estimate(measured(colour=colour))[COLOUR]) < 0.35
@@ -122,14 +122,14 @@ def test_what_a_broken_simulation_left_behind_is_no_evidence(estimate):
     np.testing.assert_allclose(estimate(broken), estimate(ended), rtol=1e-3)
 
 
-def test_no_evidence_says_nothing(vote, estimate):
+def test_a_set_without_a_valid_window_gives_no_vote_and_the_middle(vote, estimate):
     nothing = measured()
     nothing = nothing.replace(alive=jnp.zeros_like(nothing.alive))
     np.testing.assert_array_equal(vote(nothing), 0.0)
     np.testing.assert_allclose(estimate(nothing), 0.0, atol=1e-6)
 
 
-def test_ignorance_costs_what_the_calculation_says(simulated, trained):
+def test_loss_of_a_model_that_learns_nothing_is_the_entropy_of_the_labels(simulated, trained):
     trajectory, coords, dist = simulated
     _, loss = trained
     # Labels that the episodes know nothing of. A uniform guess at place u of the box is right with probability u, so

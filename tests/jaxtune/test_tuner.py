@@ -437,7 +437,7 @@ def test_a_set_without_a_window_has_no_score(gate):
     assert np.isfinite(score.novelty[1:]).all()
 
 
-def test_episodes_that_ended_early_lend_their_whole_windows(gate):
+def test_episodes_that_ended_early_are_scored_by_their_whole_windows(gate):
     sets = stacked({})
     fallen = sets.replace(
         alive=sets.alive.at[:, 0, 52:].set(False),
