@@ -10,9 +10,9 @@ from envs import models
 from envs.diagnosis import diagnose
 from envs.logs import Controller
 from envs.rig import hung
+from experiments.discovery.blind_cases import ARM
 from experiments.discovery.blind_robots import Truth, record
-from experiments.discovery_bench import ARM
-from experiments.excite import excitation
+from experiments.discovery.excitation import excitation
 
 JOINTS = ("shoulder", "elbow")
 SPEC = models.spec(str(ARM))

@@ -109,13 +109,15 @@ def test_a_time_step_that_does_not_fit_is_named(robot):
 
 def test_the_shipped_policy_walks_20_seconds():
     from experiments.common.config import chosen, preset
-    from experiments.walking.learner import Loop
+    from experiments.walking.learner import Learner
     from experiments.walking.policies import starting_policy
 
     sizes = preset("cpu")
-    loop = Loop(dataclasses.replace(sizes, task=dataclasses.replace(sizes.task, physics="exact")), chosen("legs6"))
-    assert isinstance(loop.robot, Biteno)
-    act = loop.act(starting_policy("walk", loop))
+    learner = Learner(
+        dataclasses.replace(sizes, task=dataclasses.replace(sizes.task, physics="exact")), chosen("legs6")
+    )
+    assert isinstance(learner.robot, Biteno)
+    act = learner.act(starting_policy("walk", learner))
     steps = round(20.0 / constants.POLICY_DT_S)
-    trajectory = mujoco_c.target(loop.robot, {"foot_friction": 1.0}).episodes(KEY, act, 4, steps)
+    trajectory = mujoco_c.target(learner.robot, {"foot_friction": 1.0}).episodes(KEY, act, 4, steps)
     assert not trajectory.fell.any()

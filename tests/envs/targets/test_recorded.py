@@ -14,7 +14,7 @@ from envs.logs import Controller, Log, Run
 from envs.logs.sampling import HELD
 from envs.targets import mujoco_c, recorded
 from experiments.common.config import preset
-from experiments.walking.learner import Loop
+from experiments.walking.learner import Learner
 from experiments.walking.policies import starting_policy
 from jaxtune import windows
 
@@ -24,10 +24,10 @@ STEPS, LENGTH = 200, 50
 @pytest.fixture(scope="module")
 def simulated():
     """Two episodes of a walk and two of a fall in MuJoCo C, as episodes and as a log of one row a policy step."""
-    loop = Loop(preset("smoke"), {})
-    walk = loop.act(starting_policy("walk", loop))
+    learner = Learner(preset("smoke"), {})
+    walk = learner.act(starting_policy("walk", learner))
     flail = lambda obs, key: (0.5 * jax.random.normal(key, (6,)), {})  # noqa: E731
-    target = mujoco_c.target(loop.robot, {})
+    target = mujoco_c.target(learner.robot, {})
     found = [target.record(jax.random.PRNGKey(3), act, 2, STEPS) for act in (walk, flail)]
     trajectory, recording = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *found)
     np.testing.assert_array_equal(trajectory.fell, [False, False, True, True])
