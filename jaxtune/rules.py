@@ -30,8 +30,8 @@ from jaxtune.dvm import DVMConfig
 from jaxtune.spm import SPMConfig
 from jaxtune.types import ParamDist, Trajectory
 
-# An interval counts as informative below this share of the one that ignores the data. Chosen: two quantiles over a few
-# dozen held-out sets differ by some per cent even when the data say nothing.
+# An interval counts as informative below this share of the one that ignores the data. Chosen below 1, since the two are
+# quantiles over a few dozen sets and differ by chance.
 _IDENTIFIABLE = 0.9
 
 
@@ -39,7 +39,7 @@ _IDENTIFIABLE = 0.9
 class TunerConfig:
     """Sizes of a tuning: whatever fixes array shapes and loop lengths, so a change compiles the tuner anew.
 
-    The defaults are for walking robots on two CPU cores. More `episodes` sharpen both models and cost the most time.
+    The defaults are for walking robots on two CPU cores. More `episodes` sharpen both models and take longer.
     For scalars that may vary within one compiled program, see `Knobs`.
     """
 
