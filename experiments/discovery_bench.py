@@ -1,9 +1,9 @@
 """Measures blind how often discovery is right: `python -m experiments.discovery_bench --size smoke --out DIR`.
 
 It hides an effect in a robot that another engine moves, writes a log as a user would and the truth into a folder that
-only the scorer reads, has discovery work on the log and the nominal model, and scores what it says. Every case is a file
-of its own: the same command goes on where it stopped, and `--piece 0/2` and `--piece 1/2` share the work between two
-processes.
+only the scorer reads, has discovery work on the log and the nominal model, and scores what it says. Every case is a
+file of its own: the same command goes on where it stopped, and `--piece 0/2` and `--piece 1/2` share the work between
+two processes.
 """
 
 from dataclasses import dataclass

@@ -14,7 +14,8 @@ from experiments.common.cli import console, run
 
 @dataclass(frozen=True, kw_only=True)
 class Args:
-    """Looks for swapped joints, flipped signs, degrees for radians, offsets, delays, and a clock that jumps or drifts."""
+    """Looks for swapped joints, flipped signs, degrees for radians, offsets, delays, and a clock that jumps or
+    drifts."""
 
     log: Path
     """Folder of the log."""

@@ -2,8 +2,8 @@
 
 It stands in for a real robot; `experiments.robot.surrogate` says what its body is like. Where it finds
 `RUN/**/round_*/request.json` beside an exported policy it walks with that policy, falls where it falls, and writes
-`round_*/log`. Where it finds targets of `experiments.excite`, `RUN/**/hung/targets`, it plays them while it is suspended
-and writes `hung/log`. Nothing else of it can be seen.
+`round_*/log`. Where it finds targets of `experiments.excite`, `RUN/**/hung/targets`, it plays them while it is
+suspended and writes `hung/log`. Nothing else of it can be seen.
 """
 
 import json

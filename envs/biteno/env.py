@@ -237,7 +237,7 @@ class Biteno:
         return mjx.rne_postconstraint(model, data)._impl.cfrc_ext[self._shanks, 3:]
 
     def settle(self, state: State, drive: Drive, motion: Motion) -> State:
-        """What the robot perceives, earns and is asked for after it moved."""
+        """Observation, rewards, termination and the next command, after the robot moved."""
         finite = jnp.isfinite(motion.qpos).all() & jnp.isfinite(motion.qvel).all()
         zeros = jnp.zeros_like(state.qvel)
         qpos, qvel, warmstart, torque, action, target = jax.tree.map(
@@ -312,9 +312,9 @@ class Biteno:
         )
 
     @staticmethod
-    def ask(state: State, command: jax.Array, phase: jax.Array) -> State:
+    def with_command(state: State, command: jax.Array, phase: jax.Array) -> State:
         """The same robot under another command [3], its gait clock at another phase [2]."""
-        return state.replace(command=command, phase=phase, obs=sensing.with_request(state.obs, command, phase))
+        return state.replace(command=command, phase=phase, obs=sensing.with_command(state.obs, command, phase))
 
     def _push(self, key: jax.Array, qvel: jax.Array, steps: jax.Array) -> jax.Array:
         if not self.config.push_mps:

@@ -6,7 +6,7 @@ log agrees much better with itself and with the model after it. Agreement has up
 between none (0) and all of it (2) of the signal's own size:
 
 - measured velocities are the slopes of measured positions;
-- the controller's torque is what the model needs for the measured motion (robots that are hung or clamped);
+- the controller's torque is what the model needs for the measured motion (robots that are suspended or clamped);
 - the measured torque is the controller's;
 - positions follow their targets, and stay within the joints' ranges.
 
@@ -22,7 +22,7 @@ from envs.diagnosis.finding import Finding
 from envs.diagnosis.physics import physics
 from envs.diagnosis.structure import structure
 from envs.logs import Log, Run
-from envs.rig import hung
+from envs.rig import suspended
 
 __all__ = ["Finding", "diagnose", "diagnose_log", "shared_findings"]
 
@@ -39,7 +39,7 @@ def diagnose_log(log: Log) -> dict[str, list[Finding]]:
       What is suspected, by the name of the run, in the log's order; an empty list where nothing is.
     """
     spec = models.spec(log.robot)
-    model = hung(spec) if log.base == "fixed" else spec.compile()
+    model = suspended(spec) if log.base == "fixed" else spec.compile()
     return {run.name: diagnose(run, log.joints, model, log.base) for run in log.runs}
 
 
@@ -74,7 +74,7 @@ def diagnose(run: Run, joints: tuple[str, ...], model: mujoco.MjModel, base: str
     Args:
       run: as it was read.
       joints: of the log.
-      model: of the robot, hung (`envs.rig.hung`) where the base is fixed.
+      model: of the robot, hung (`envs.rig.suspended`) where the base is fixed.
       base: fixed or free; what a robot on the ground needs of its joints depends on forces that nobody measured.
     """
     found, clean = structure(run)

@@ -15,7 +15,8 @@ _EVERY_STRIP, _EVERY_GIF = 6, 4  # policy steps between two pictures
 
 
 class NoPicture(RuntimeError):
-    """MuJoCo cannot render here: no OpenGL off screen. A command that meets it prints why and goes on without pictures."""
+    """MuJoCo cannot render here: no OpenGL off screen. A command that meets it prints why and goes on without
+    pictures."""
 
 
 def strip(path: Path, model: mujoco.MjModel, qpos: np.ndarray) -> None:

@@ -1,7 +1,7 @@
 """The blind benchmark: writes the log of a robot that hides something, has discovery answer, and scores the answer.
 
-The truth goes into a folder of its own, `sealed`, which `Bench.scored` alone opens. Every case is a file, so a benchmark
-that is stopped goes on where it was, and several processes may share its cases.
+The truth goes into a folder of its own, `sealed`, which `Bench.scored` alone opens. Every case is a file, so a
+benchmark that is stopped goes on where it was, and several processes may share its cases.
 """
 
 import json

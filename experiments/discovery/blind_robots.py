@@ -1,8 +1,9 @@
 """Robots that hide something, for the blind benchmark.
 
-Nothing here uses what discovery fits. MuJoCo C moves the robot with a step, an integrator and friction cones of its own.
-The controller ticks at its rate, late by a jitter, and holds its torque. Friction is a bristle model (LuGre), motors
-saturate smoothly, lags are of second order, play and springs are joints of their own. Readings are noisy and rounded.
+Nothing here uses what discovery fits. MuJoCo C moves the robot with a step, an integrator and friction cones of its
+own. The controller ticks at its rate, late by a jitter, and holds its torque. Friction is a bristle model (LuGre),
+motors saturate smoothly, lags are of second order, play and springs are joints of their own. Readings are noisy and
+rounded.
 """
 
 from collections.abc import Sequence

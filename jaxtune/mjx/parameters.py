@@ -17,7 +17,7 @@ import numpy as np
 from mujoco import mjx
 
 from jaxtune.mjx.derived_fields import set_const
-from jaxtune.types import Named
+from jaxtune.types import Coords
 
 Params = Mapping[str, jax.Array]
 """Physical values by name: a multiplier of the nominal model for a logarithmic entry, an offset for a linear one.
@@ -120,7 +120,7 @@ def to_coords(entries: Mapping[str, Entry], params: Params) -> dict[str, jax.Arr
     return {name: jnp.log(value) if entries[name].log else jnp.asarray(value) for name, value in params.items()}
 
 
-def from_coords(entries: Mapping[str, Entry], coords: Named) -> dict[str, jax.Array]:
+def from_coords(entries: Mapping[str, Entry], coords: Coords) -> dict[str, jax.Array]:
     """Translates coordinates back into physical values, the inverse of `to_coords`.
 
     Call it where a value that the tuner proposes enters a simulation or a report.
