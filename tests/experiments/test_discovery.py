@@ -10,12 +10,13 @@ import pytest
 from envs.logs import Controller, read, splits, write
 from envs.segments import noise
 from experiments import discover
+from experiments.discovery.blind_bench import Bench
 from experiments.discovery.blind_cases import ARM, SIZE_BOUNDS, SIZES
 from experiments.discovery.blind_robots import OUTSIDE, Truth, record
 from experiments.discovery.excitation import excitation
 from experiments.discovery.hypotheses import hypotheses, place_sets
 from experiments.discovery.scores import score, tally, wilson
-from experiments.discovery.setup import build_question, drop_filtered, measure_scales
+from experiments.discovery.setup import build_question, drop_filtered, measure_scales, read_logs
 
 JOINTS = ("shoulder", "elbow")
 GAINS = {"kp": np.array([40.0, 20.0]), "kd": np.array([2.0, 0.8]), "torque_limit_nm": np.array([15.0, 15.0])}
@@ -213,7 +214,7 @@ def test_sizes_hide_what_the_library_has_and_what_it_has_not():
 
 
 def test_the_learner_reads_a_log_that_says_nothing_of_the_truth(tmp_path, spec, motions):
-    bench = discovery_bench.Bench(discovery_bench.Args(out=tmp_path))
+    bench = Bench(tmp_path, "smoke", seed=0, nominal_error=0.1)
     case = next(case for case in bench.cases if case.effect is None)
     folder = bench.write(case)
     assert json.loads((tmp_path / "sealed" / f"case_{case.number:03d}.json").read_text())["effect"] is None
@@ -241,7 +242,7 @@ def test_logs_that_do_not_go_together_are_refused(tmp_path, plain, change, messa
         (folder / "arm.xml").write_text(ARM.read_text())
         folders.append(folder)
     with pytest.raises(ValueError, match=message):
-        discover.gathered(tuple(folders))
+        read_logs(tuple(folders))
 
 
 def test_horizons_that_do_not_rise_are_refused_before_anything_is_computed(tmp_path, plain):

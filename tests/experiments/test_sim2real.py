@@ -364,7 +364,7 @@ def test_progress_is_a_line_a_minute_where_there_is_no_terminal(monkeypatch):
     monkeypatch.setattr(cli, "console", Console(file=output, width=100))
     monkeypatch.setattr(cli, "_LINE_S", 0.05)
     with cli.bars() as progress:
-        progress.add_task("done", total=1, completed=1)
+        progress.update(progress.add_task("done", total=1), completed=1)
         task = progress.add_task("training", total=100)
         progress.update(task, completed=20)
         deadline = time.monotonic() + 10.0
