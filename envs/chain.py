@@ -1,4 +1,7 @@
-"""What effects do to a robot between a target and a reading: one step of it, for the test rig and for the walk."""
+"""Simulates one step of a robot with effects between its targets and its readings, on the test rig and in a walk.
+
+The effects are rows of `envs.effects`; this is the only place that applies them.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,29 +15,29 @@ from mujoco import mjx
 from jaxtune.types import Effect
 
 MIN_FRICTION_NM = 1e-6
-"""With a bound of nothing at all MJX brakes a joint."""
+"""Smallest bound of dry friction. With a bound of exactly zero MJX brakes a joint."""
 
 
 @chex.dataclass(frozen=True)
 class Now:
-    """What an effect may look at."""
+    """What an effect may depend on beside its own values, its signal and its memory."""
 
     dt: float
     position: jax.Array  # [joints] rad
     speed: jax.Array  # [joints] rad/s
-    load: jax.Array  # [joints] Nm on the gears, the larger of those of their two sides
+    load: jax.Array  # [joints] Nm on the gears: the larger of motor torque and of gravity and Coriolis torque
     limit: jax.Array  # [joints] Nm, the controller's
-    stiffness: jax.Array  # [joints] Nm/rad, of the controller; none where the motor was measured
-    damping: jax.Array  # [joints] Nm s/rad, likewise
-    measured: bool  # whether the motor was, and went where it went
-    rotor: jax.Array  # [joints] kg m^2, the motor's part of the joint's inertia; none where it was measured
-    carried: jax.Array  # [joints] Nm that the rotor takes to keep up with the joint
+    stiffness: jax.Array  # [joints] Nm/rad, of the controller; zero where the motor's motion was measured
+    damping: jax.Array  # [joints] Nm s/rad, of controller and back electromotive force; zero likewise
+    measured: bool  # whether the motor's motion was measured, and so is not simulated
+    rotor: jax.Array  # [joints] kg m^2, the rotor's part of the joint's inertia; zero where its motion was measured
+    carried: jax.Array  # [joints] Nm that accelerate the rotor with the joint
     body_velocity: jax.Array  # [bodies, 3] m/s of the centres of mass
 
 
 @chex.dataclass(frozen=True)
 class Wrench:
-    """What acts from outside."""
+    """Forces on the robot from outside; effects of the stage `wrench` add to it."""
 
     torque: jax.Array  # [joints] Nm
     force: jax.Array  # [bodies, 3] N at the centres of mass
@@ -42,27 +45,37 @@ class Wrench:
 
 @dataclass(frozen=True)
 class Chain:
-    """Effects in the order in which they act.
+    """A controller, its motors and its sensors, with effects in the order in which they act.
 
-    What a controller is asked is a dictionary `x` of [joints] arrays: `target` rad, `feed` Nm, `stiffness` Nm/rad,
-    `damping` Nm s/rad, `limit` Nm of both, `emf` Nm s/rad beyond the limit, and `sample`, 1 where it looks anew.
-    `values` are those of every effect by name, [places] by parameter; memories are dictionaries by effect.
+    Three arguments of its methods are always the same. `values` holds [places] by effect and parameter, in the form
+    that effects read (zero: the effect is not there). A memory is a dictionary by effect, and `held`, the controller's
+    last torque. `x` is the controller's input of one step, [joints] each: `target` rad, `feed` Nm (torque sent
+    directly), `stiffness` Nm/rad, `damping` Nm s/rad, `limit` Nm, `emf` Nm s/rad (back electromotive force, not
+    limited), and `sample`, a scalar that is true where the controller reads the joint anew. Its law is
+    `envs.logs.Impedance`'s.
     """
 
     dt: float
     rows: Sequence[Effect]
     qpos: np.ndarray
-    """[joints] of the positions."""
+    """[joints] addresses of the joints' positions."""
     dof: np.ndarray
-    """[joints] of the velocities."""
+    """[joints] addresses of the joints' velocities."""
     bodies: np.ndarray
-    """[bodies] that a wrench may act on."""
+    """[bodies] ids of the bodies that a wrench may act on."""
 
     def step(self, model: mjx.Model, data: mjx.Data, memory: dict, values, x) -> tuple[mjx.Data, dict, dict]:
-        """Moves a robot by one step of its physics.
+        """Simulates one step of the physics, from the controller's inputs to the robot's motion.
+
+        Args:
+          model: of the robot, effects on its fields included.
+          data: the robot before the step.
+          memory: of the effects before the step.
+          values: of the effects.
+          x: the controller's inputs.
 
         Returns:
-          The robot, the memories, and what was read before the step, [joints] by signal.
+          The robot and the memories after the step, and what was read before it: `q`, `dq` and `tau`, [joints] each.
         """
         joint = self.joints(data)
         bias, rotor = data.qfrc_bias[self.dof], model.dof_armature[self.dof]
@@ -81,22 +94,44 @@ class Chain:
         return mjx.step(moved, data), memory, read
 
     def read(self, values, memory: dict, joint: jax.Array, x) -> jax.Array:
-        """What the encoders say of joints [2, joints], [2, joints]; nothing is remembered of it."""
+        """Reads the joints through the effects of transmission and sensors, without advancing a memory.
+
+        Args:
+          values: of the effects.
+          memory: as `step` or `start` left it.
+          joint: true positions and velocities, [2, joints].
+          x: the controller's inputs.
+
+        Returns:
+          Read positions and velocities, [2, joints].
+        """
         far, fast = self.ahead(memory)
         motor = joint.at[0].add(far)
-        # The controller answers to how fast the motor runs ahead within a step; sensors are late for the joint alone.
+        # The rate at which the motor runs ahead reaches the controller within the step; only the joint's motion is
+        # delayed.
         return self.stage("sensor", values, motor, self._now(x, motor), memory)[0].at[1].add(fast)
 
     def joints(self, data: mjx.Data) -> jax.Array:
-        """Positions and velocities of the joints, [2, joints]."""
+        """Takes positions and velocities of the joints from a robot, [2, joints] rad and rad/s."""
         return jnp.stack([data.qpos[self.qpos], data.qvel[self.dof]])
 
     def entering(self, stage: str) -> list[Effect]:
-        """Effects of a stage."""
+        """Lists the effects that enter a stage, in the order in which they act."""
         return [row for row in self.rows if row.enters == stage]
 
     def stage(self, stage, values, signal, now, memory):
-        """Hands a signal from effect to effect."""
+        """Passes a signal through all effects of one stage.
+
+        Args:
+          stage: what the effects enter (`jaxtune.types.Effect.enters`).
+          values: of the effects.
+          signal: as the stage's effects take it.
+          now: `Now`, or None where no effect of the stage looks at it.
+          memory: of the effects; it is copied, not changed.
+
+        Returns:
+          The signal after the last effect, and the memories.
+        """
         memory = dict(memory)
         for row in self.entering(stage):
             signal, kept = row.act(values[row.name], signal, now, memory.get(row.name))
@@ -105,7 +140,14 @@ class Chain:
         return signal, memory
 
     def start(self, values, state, x) -> dict:
-        """Memories of a robot that has been like this for ever."""
+        """Makes the memories of a robot that has been in one state, with one target, for longer than any effect
+        remembers.
+
+        Args:
+          values: of the effects.
+          state: positions and velocities, [2, joints].
+          x: the controller's inputs.
+        """
         torque = self._law(x, x["target"] - state[0], state[1])
         signals = {"command": x["target"], "sensor": state, "torque": torque, "transmission": torque}
         memory = {"held": torque}
@@ -117,15 +159,23 @@ class Chain:
 
     @staticmethod
     def _law(x, error, speed) -> jax.Array:
+        """`envs.logs.Impedance.torque` in JAX, of an error that effects may have changed."""
         torque = x["stiffness"] * error - x["damping"] * speed
         return jnp.clip(torque, -x["limit"], x["limit"]) + x["feed"]
 
     def drive(self, values, memory, motor, x, carried, rotor=None):
-        """From what is true of the motors [2, joints] to the torque on the joints, and what is read.
+        """Computes torques on the joints, from the motors' state through sensors, controller and transmission.
 
         Args:
-          carried: torque [joints] that the motors' inertia takes to keep up with the joints.
-          rotor: inertia of the motors [joints]; None where they were measured, and went where they went.
+          values: of the effects.
+          memory: before the step.
+          motor: true positions and velocities of the motors, seen at the joints, [2, joints].
+          x: the controller's inputs.
+          carried: torque [joints] Nm that accelerates the rotors with the joints.
+          rotor: inertia of the rotors, [joints] kg m^2; None where their motion was measured and is not simulated.
+
+        Returns:
+          The memories after the step; the torques on the joints [joints] Nm; and what is read, by signal.
         """
         now = self._now(x, motor)
         readings, memory = self.stage("sensor", values, motor, now, memory)
@@ -142,7 +192,10 @@ class Chain:
         return memory, (torque, {"q": readings[0], "dq": readings[1] + running, "tau": torque})
 
     def ahead(self, memory) -> jax.Array:
-        """How far and how fast the motors run ahead of the joints, [2, joints] rad and rad/s."""
+        """Sums how far and how fast the motors run ahead of their joints, [2, joints] rad and rad/s.
+
+        The sum is over the effects of the transmission, from their memories.
+        """
         rows = self.entering("transmission")
         return sum((memory[row.name] for row in rows), start=jnp.zeros((2, len(self.dof))))
 

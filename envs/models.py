@@ -1,4 +1,4 @@
-"""Models by the name that a log gives its robot."""
+"""Looks up the model of a robot by the name that a log gives it."""
 
 from pathlib import Path
 
@@ -15,6 +15,10 @@ BUILT_IN = {
 
 
 def spec(robot: str) -> mujoco.MjSpec:
-    """The model of a robot: a built-in name, or a path."""
+    """Loads the MJCF of a robot, so that it can be compiled or changed before.
+
+    Args:
+      robot: the name of a built-in robot, or the path of an MJCF file, as in a log's `meta.yaml`.
+    """
     path = BUILT_IN[robot][0] if robot in BUILT_IN else Path(robot)
     return mujoco.MjSpec.from_file(str(path))

@@ -1,10 +1,13 @@
-"""What a log would look like if nothing were missing: the nominal model in another engine, with the log's own noise.
+"""Simulated null logs: what a measured log would look like if the model lacked nothing.
 
-Something always mimics an engine's step, its integrator or the moment at which a controller looks. So the nominal
-model is moved by MuJoCo C with half the step, another integrator and a controller whose ticks wander, its masses,
-armatures and dampings drawn as the prior has them, and read with the noise and the rounding found in the log.
+Discovery compares the gain of an effect with the gains that it has on such logs. Among many effects one always fits
+differences that are no physics: an engine's step, its integrator, the moment at which a controller reads the joint.
+A null log therefore has such differences too. The nominal model is simulated by MuJoCo C with half the step, another
+integrator and a controller whose ticks jitter; its masses, armatures, dampings and frictions are drawn from the prior;
+and the readings get the noise and the rounding found in the measured log.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import mujoco
@@ -16,18 +19,28 @@ from envs.rig import suspended
 from envs.segments import noise, quantum_of, smoothed
 
 _STEP_S = 0.0005
-_SPREAD = 0.1
+_SPREAD = 0.1  # standard deviation of the logarithm of every drawn parameter, as in `Rig.prior_sd`
 
 
 def simulate_null_log(log: Log, spec: mujoco.MjSpec, seed: int) -> Log:
-    """Draws a log without a missing effect, its targets and conditions those of a measured one."""
+    """Simulates a log in which no effect is missing, with the targets and conditions of a measured one.
+
+    Args:
+      log: the measured log; its targets are played again and its noise is imitated.
+      spec: MJCF of the nominal robot.
+      seed: of the drawn parameters, the controller's jitter and the noise.
+
+    Returns:
+      A log of the same runs, joints and signals. A signal of the controller (targets, supply, enabling) is kept;
+      measured ones are simulated.
+    """
     rng = np.random.default_rng(seed)
     model = _drawn(spec, rng)
     return replace(log, runs=tuple(replay(run, model, log.joints, rng) for run in log.runs))
 
 
 def _drawn(spec: mujoco.MjSpec, rng: np.random.Generator) -> mujoco.MjModel:
-    """The nominal model, every parameter off as the prior has it."""
+    """Compiles the nominal model with its parameters drawn from the prior, suspended and without actuators."""
     model = suspended(spec)
     model.opt.timestep = _STEP_S
     model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
@@ -43,11 +56,25 @@ def _drawn(spec: mujoco.MjSpec, rng: np.random.Generator) -> mujoco.MjModel:
 
 
 def _factors(rng: np.random.Generator, count: int) -> np.ndarray:
+    # Cut at two standard deviations: a null log should be a plausible robot.
     return np.exp(_SPREAD * rng.standard_normal(count).clip(-2.0, 2.0))
 
 
-def replay(run: Run, model: mujoco.MjModel, joints, rng: np.random.Generator) -> Run:
-    """Plays a run's targets through a controller whose ticks wander by up to a step of the physics."""
+def replay(run: Run, model: mujoco.MjModel, joints: Sequence[str], rng: np.random.Generator) -> Run:
+    """Plays a run's targets (or its torques, where it has no targets) on a model in MuJoCo C.
+
+    The controller's law is `envs.logs.Controller`'s. It reads the joint at its own rate, each time up to one step of
+    the physics early or late, because a robot's ticks and a simulation's steps never coincide.
+
+    Args:
+      run: the measured run; it gives targets, controller, time stamps and the first state.
+      model: what is moved, without actuators.
+      joints: names of the joints, in the log's order.
+      rng: of jitter and noise.
+
+    Returns:
+      The same run with `q`, `dq`, `tau` and `gravity` simulated, those of them that it has.
+    """
     data = mujoco.MjData(model)
     qpos = np.array([model.joint(name).qposadr[0] for name in joints])
     dof = np.array([model.joint(name).dofadr[0] for name in joints])
@@ -57,7 +84,7 @@ def replay(run: Run, model: mujoco.MjModel, joints, rng: np.random.Generator) ->
     steps = int(np.ceil(1.0 / run.controller.rate_hz / _STEP_S - 1e-9))
     model.opt.timestep = 1.0 / run.controller.rate_hz / steps
     count = int(np.ceil((run.time[-1] - run.time[0]) * run.controller.rate_hz)) + 2
-    # An early look one time is a late one the next.
+    # Jitter does not add up: a tick that comes early is followed by a longer interval.
     looks = np.cumsum(np.append(rng.integers(0, steps), steps + np.diff(rng.integers(0, 2, count))))
     times = run.time[0] + model.opt.timestep * looks
     last = np.clip(np.searchsorted(run.time, times + 1e-9, side="right") - 1, 0, len(run.time) - 1)
@@ -85,7 +112,7 @@ def replay(run: Run, model: mujoco.MjModel, joints, rng: np.random.Generator) ->
 
 
 def _as_read(values: np.ndarray, like: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Values with the noise and the rounding of others."""
+    """Gives exact values the noise and the rounding of measured ones."""
     quantum = quantum_of(like)
     extra = max(noise(like) ** 2 - quantum**2 / 12.0, 0.0) ** 0.5
     values = values + extra * rng.standard_normal(values.shape)

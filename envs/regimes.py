@@ -1,4 +1,4 @@
-"""What a joint was doing: the rows of a run by regime."""
+"""Sorts the rows of a run by what each joint was doing, so that a misfit can be localised."""
 
 import numpy as np
 
@@ -6,18 +6,25 @@ from envs.logs import Run
 from envs.segments import smoothed
 
 REGIMES = ("steady", "fast", "loaded", "reversal", "saturated", "motor off")
-"""Later ones rule where two apply."""
+"""Names of the regimes; where two apply, the later one counts."""
 
-_FAST, _LOADED, _STILL, _SATURATED = (
-    1.5,
-    1.5,
-    0.15,
-    0.98,
-)  # shares of the joint's own root mean square, and of the limit
+# Of a joint's own root mean square of speed or torque.
+_FAST, _LOADED, _STILL = 1.5, 1.5, 0.15
+_SATURATED = 0.98  # share of the controller's limit
 
 
 def regimes(run: Run) -> np.ndarray:
-    """Index of the regime, [rows, joints]."""
+    """Assigns a regime to every joint at every row.
+
+    `fast` and `loaded` are 1.5 times the joint's own rms of speed and of commanded torque, `reversal` is below 0.15 of
+    the rms speed, `saturated` is within 2 % of the torque limit, and `steady` is what is left.
+
+    Args:
+      run: with positions, and targets or torques.
+
+    Returns:
+      Indices into `REGIMES`, [rows, joints].
+    """
     position, speed = np.moveaxis(smoothed(run), 1, 0)
     torque, limit = control_torque(run, position, speed)
     found = np.zeros(position.shape, int)

@@ -1,7 +1,10 @@
 """A robot on the test rig, suspended or clamped, with every effect of the library built in.
 
-An effect that is not there has coordinates of zero and changes nothing, so one compiled program serves all hypotheses:
-what is missing is a vector.
+Every effect has coordinates, which are zero where it is not there. A hypothesis about what a model lacks is therefore a
+vector, and one compiled program simulates all of them.
+
+Three forms of the same numbers occur. *Coordinates* are what is searched. *Values* are what effects read
+(`Rig.values`). *Physical values*, in units, are what reports and files hold (`jaxtune.types.Parameter.value`).
 """
 
 import copy
@@ -23,14 +26,15 @@ from jaxtune.mjx import parameters
 from jaxtune.types import Effect, Parameter
 
 ByEffect = Mapping[str, Mapping[str, jax.Array]]
-"""Coordinates by effect and parameter, [places] each."""
+"""Coordinates or values by effect and parameter, [places] each."""
 
-# Of the solver. With friction in every joint that is 0.003 of a floor unit from twice as many; with four line searches
-# it would be 0.2.
+# Of the solver. With friction in every joint the error is 0.003 of a floor unit (the rms of the noise floor) against
+# twice as many; with four line searches it would be 0.2.
 _ITERATIONS, _LINE_SEARCHES = 4, 6
 _LONGEST_STEP_S = 0.001
 
-# Parameters that every model has, by the effect that changes them. Each may be off by a tenth of its nominal value.
+# Parameters that every model has, by the effect that changes them. Each may be off by a tenth of its nominal value, and
+# discovery fits them under all hypotheses, so that an inaccurate number is not taken for a missing effect.
 _PRIOR_SHARE = 0.1
 _NOMINAL_RATIOS = ("link_mass", "gain_error")
 _NOMINAL_FIELDS = {"armature": "dof_armature", "viscous": "dof_damping", "coulomb": "dof_frictionloss"}
@@ -47,6 +51,7 @@ class Axis:
     effect: str
     parameter: str
     place: str
+    """A joint, a body, or `robot`."""
     index: int
     """Of the place, among all places where the effect may sit."""
     scale: float
@@ -61,12 +66,18 @@ class Axis:
 
 
 class Rig:
-    """A robot whose base does not move.
+    """A robot whose base does not move, simulated in MJX with every effect of the library.
+
+    Make it from the nominal MJCF, scale its coordinates to what the robot did in a log (`scaled`), and simulate
+    segments of the log (`envs.segments`) under any vector of coordinates:
+
+        values = rig.values(rig.tree(vector))
+        read = rig.simulate(values, segment)
 
     Args:
-      spec: the robot; free joints are taken away, contacts and its own actuators switched off.
-      joints: those that are controlled and read, in the log's order.
-      control_hz: the controller's rate; a simulation step divides its period.
+      spec: of the robot; free joints are removed, contacts and its own actuators switched off.
+      joints: names of the joints that are controlled and read, in the log's order.
+      control_hz: rate of the controller; its period is a multiple of the simulation's step, which is 1 ms at most.
     """
 
     def __init__(
@@ -92,7 +103,7 @@ class Rig:
         self._bodies = np.array(moving)
         self.bodies = tuple(model.body(i).name for i in moving)
         self.mj_model = model
-        # Joints that move, and that nobody controls or reads.
+        # Joints that move but are neither controlled nor read.
         self.others = tuple(
             model.joint(i).name or f"joint {i}" for i in range(model.njnt) if model.jnt_qposadr[i] not in self.qpos
         )
@@ -103,7 +114,7 @@ class Rig:
         device.dof_frictionloss[self.dof] = np.maximum(model.dof_frictionloss[self.dof], MIN_FRICTION_NM)
         self._model = mjx.put_model(device)
         self._data = mjx.make_data(self._model)
-        # The IMU sits on the body that holds the others.
+        # The IMU is taken to sit on the first body, which carries the others.
         self._gravity = sensing.projected_gravity(jnp.asarray(model.body_quat[1], jnp.float32))
         self._scales: Mapping[str, np.ndarray] = {}
         self.places = {"joint": self.joints, "body": self.bodies, "foot": (), "robot": ("robot",)}
@@ -112,7 +123,10 @@ class Rig:
         self.axes = self._describe_axes()
 
     def scaled(self, scales: Mapping[str, np.ndarray]) -> "Rig":
-        """Returns the same robot with other units of its coordinates, so that all coordinates are of one size.
+        """Returns the same robot with other units of its coordinates.
+
+        Without scales a coordinate of one is one unit of its parameter. With them it is a typical size of this robot's
+        motion (say its rms torque), so that coordinates of different effects can be compared.
 
         Args:
           scales: [places] by the name of the scale (`jaxtune.types.Scale`); a name that is left out stays one unit.
@@ -151,7 +165,7 @@ class Rig:
         )
 
     def tree(self, vector: jax.Array) -> dict[str, dict[str, jax.Array]]:
-        """A vector [axes] by effect and parameter."""
+        """Splits a vector [axes] into [places] by effect and parameter, in the order of `axes`."""
         tree, start = {}, 0
         for name, row in self.effects.items():
             count = len(self.places[row.on])
@@ -162,12 +176,19 @@ class Rig:
         return tree
 
     def scale(self, effect: Effect, parameter: Parameter) -> np.ndarray:
-        """What a coordinate of one stands for at every place."""
+        """Returns what a coordinate of one stands for at every place, [places], in the parameter's own unit."""
         ones = np.ones(len(self.places[effect.on]), np.float32)
         return np.asarray(self._scales.get(parameter.scale, 1.0) * ones, np.float32)
 
     def inertias(self, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Masses of the links in kg, and what each joint feels of the robot in a pose [joints], in kg m^2."""
+        """Computes masses and joint-space inertias, from which scales of coordinates follow.
+
+        Args:
+          pose: of the joints, [joints] rad.
+
+        Returns:
+          Masses of the bodies, [bodies] kg, and the diagonal of the inertia matrix in this pose, [joints] kg m^2.
+        """
         data, dense = mujoco.MjData(self.mj_model), np.zeros((self.mj_model.nv, self.mj_model.nv))
         data.qpos[self.qpos] = pose
         mujoco.mj_forward(self.mj_model, data)
@@ -175,7 +196,15 @@ class Rig:
         return self.mj_model.body_mass[self._bodies], np.diag(dense)[self.dof]
 
     def moves(self, on: str, place: str) -> set[int]:
-        """Numbers of the joints beside which something at this place shows: the joint, or those that carry a link."""
+        """Finds the joints whose motion an effect at a place changes directly.
+
+        Args:
+          on: what the effect is on: `joint`, `body` or `robot`.
+          place: name of the joint or body.
+
+        Returns:
+          Indices of the joints: the joint itself, or those that carry the body; none for the whole robot.
+        """
         if on == "joint":
             return {self.joints.index(place)}
         found, body = set(), self.mj_model.body(place).id if on == "body" else 0
@@ -186,7 +215,7 @@ class Rig:
         return found
 
     def model(self, values: ByEffect) -> mjx.Model:
-        """The model with what effects do to its fields."""
+        """Makes the MJX model whose fields have the values of the effects that enter the model."""
         entries, params = {}, {}
         for name, row in self.effects.items():
             if row.enters != "model":
@@ -207,12 +236,12 @@ class Rig:
         return parameters.apply(self._model, params, entries)
 
     def inner(self, vectors: np.ndarray) -> np.ndarray:
-        """What the physics reads of coordinates [n, axes], [n, axes]."""
+        """Translates vectors of coordinates [n, axes] into values [n, axes], the form that effects read."""
         trees = [self.values(self.tree(vector)) for vector in vectors]
         return np.array([np.concatenate([leaf for row in tree.values() for leaf in row.values()]) for tree in trees])
 
     def values(self, coords: ByEffect) -> ByEffect:
-        """What the physics reads of coordinates."""
+        """Translates coordinates into values, the form that effects read (`jaxtune.types.Parameter.inner`)."""
         return {
             name: {
                 parameter.name: parameter.inner(coords[name][parameter.name], self.scale(row, parameter))
@@ -222,14 +251,17 @@ class Rig:
         }
 
     def simulate(self, values: ByEffect, segment: Segment) -> dict[str, jax.Array]:
-        """Moves the robot through a segment.
+        """Simulates a segment of a log under one hypothesis.
+
+        The history of the segment fills the memories of the effects; then the robot starts from its measured state,
+        with the errors of its sensors undone, and is simulated to the segment's end.
 
         Args:
-          values: what the physics reads of all effects, one hypothesis.
-          segment: what was sent, and what was measured before it.
+          values: of all effects, as `values` returns them.
+          segment: the controller's inputs, and the motion measured before the segment.
 
         Returns:
-          What is read at the rows, [rows, joints] by signal; of `gravity` [rows, 3].
+          Readings at the segment's rows by signal: `q`, `dq` and `tau` [rows, joints], `gravity` [rows, 3].
         """
         model = self.model(values)
         before = len(segment.measured) - 1 - round(LONGEST_S / self.dt)
@@ -245,7 +277,7 @@ class Rig:
             if row.undo is not None:
                 truth = row.undo(values[row.name], truth, self.dt)
         rotor, acceleration = model.dof_armature[self.dof], jnp.gradient(truth[:, 1], self.dt, axis=0)
-        # What is read of the motor stands still for what is read of the joint until play and wind-up are known.
+        # Until backlash and wind-up are known, the motor's readings are taken for the joint's.
         memory = chain.start(values, truth[0], jax.tree.map(lambda x: x[0], drive))
 
         def remember(memory, inputs):
@@ -274,11 +306,15 @@ class Rig:
 
 
 def suspended(spec: mujoco.MjSpec) -> mujoco.MjModel:
-    """A robot without its free joint and without contacts."""
+    """Compiles a robot as it hangs on a test rig: without its free joints and without contacts.
+
+    Args:
+      spec: of the robot; it is copied. Keyframes are dropped where a free joint is, because they contain its pose.
+    """
     spec = spec.copy()
     free = [joint for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_FREE]
     if free:
-        # Poses in keyframes have the base in them.
+        # Keyframes would have the wrong size without the base.
         for key in spec.keys:
             spec.delete(key)
     for joint in free:

@@ -1,8 +1,8 @@
-"""Logs cut into segments: short pieces that a simulation starts anew from measured states.
+"""Cuts logs into segments: short pieces, each simulated from a measured state.
 
-Over a short piece the simulation cannot run away, a wrong effect cannot make up for a missing one over time, and
-whether the base is held or free makes no difference. A piece brings along what came before it, so that everything that
-remembers (delays, lags, play in gears) starts with what it would remember.
+Over a short piece the simulation stays close to the robot, and a wrong effect cannot compensate for a missing one over
+time. Each segment carries the history before it, so that effects with a memory (delays, lags, backlash) start with what
+they would remember. The module also estimates states and noise of a run, which segments are made with.
 """
 
 from collections.abc import Sequence
@@ -15,43 +15,55 @@ import numpy as np
 from envs.effects.memory import LONGEST_S
 from envs.logs import Run
 
-_SMOOTHING_S = 0.012  # half width of the fit that finds measured states
+_SMOOTHING_S = 0.012  # half width of the local fit behind `smoothed`
 _MIN_HALF_ROWS = 2
 HISTORY_S = LONGEST_S + 0.02
+"""Length of the history before a segment, in s: the longest delay and some time for lags to settle."""
 
 
 @chex.dataclass(frozen=True)
 class Segment:
-    """A piece of a run on the simulation's grid: `before` steps of history, then `after` steps to be simulated."""
+    """A piece of a run on the simulation's grid: `before` steps of history, then `after` steps to be simulated.
 
-    target: jax.Array  # [before + after, joints] rad, held between rows
-    feed: jax.Array  # [before + after, joints] Nm, torque that was sent where no target was
+    The controller's law is `envs.logs.Impedance`'s, with `feed` added to its torque.
+    """
+
+    target: jax.Array  # [before + after, joints] rad; a row's target holds until the next row
+    feed: jax.Array  # [before + after, joints] Nm, torque that was sent directly, where there are no targets
     stiffness: jax.Array  # [before + after, joints] Nm/rad of the controller, zero where it is off
     damping: jax.Array  # [before + after, joints] Nm s/rad
-    limit: jax.Array  # [before + after, joints] Nm, of both
-    emf: jax.Array  # [before + after, joints] Nm s/rad, beyond the limit
-    sample: jax.Array  # [before + after] 1 where the controller looks anew
-    measured: jax.Array  # [before + 1 + ahead, 2, joints] rad and rad/s, smoothed; the segment starts at `before`
-    row_step: jax.Array  # [rows] the step before each row
-    row_share: jax.Array  # [rows] how far it is on the way to the next
+    limit: jax.Array  # [before + after, joints] Nm, of stiffness and damping together
+    emf: jax.Array  # [before + after, joints] Nm s/rad, back electromotive force, not limited
+    sample: jax.Array  # [before + after] true where the controller reads the joint anew
+    measured: jax.Array  # [before + 1 + ahead, 2, joints] rad and rad/s, smoothed; index `before` is the start
+    row_step: jax.Array  # [rows] the last step before each row
+    row_share: jax.Array  # [rows] share of a step between that step and the row
 
 
 @dataclass(frozen=True)
 class Cut:
-    """Segments of one length of several runs, and what was measured in them."""
+    """Segments of several runs, all of one length, and the measured signals at their rows."""
 
     segments: Segment
     """[segments, ...] on every field."""
     signals: dict[str, np.ndarray]
     """[segments, rows, components] by name."""
     run: np.ndarray
-    """[segments] index of the run."""
+    """[segments] index of the run that each is from."""
     row: np.ndarray
-    """[segments, rows] index of the row."""
+    """[segments, rows] index of each row in its run."""
 
 
 def smoothed(run: Run) -> np.ndarray:
-    """Positions and velocities by a local parabola through positions and, where they are, velocities.
+    """Estimates positions and velocities at every row by local parabolas.
+
+    A parabola is fitted by least squares to the positions within 12 ms (two rows at least) on both sides, and to the
+    velocities where they were recorded, each weighted by its noise:
+
+        q(t + s) = q + dq s + ddq s^2 / 2,   dq(t + s) = dq + ddq s
+
+    Args:
+      run: with `q` and perhaps `dq`.
 
     Returns:
       [rows, 2, joints] rad, rad/s.
@@ -68,7 +80,7 @@ def smoothed(run: Run) -> np.ndarray:
         slopes = np.stack([zeros, ones, offset], axis=-1) / sd
         design, value = np.concatenate([design, slopes], axis=1), np.concatenate([value, velocity[index] / sd], axis=1)
     width = half * np.median(np.diff(time))
-    scale = np.array([1.0, 1.0 / width, 1.0 / width**2])  # of the fit's numbers
+    scale = np.array([1.0, 1.0 / width, 1.0 / width**2])  # or the normal equations would be badly conditioned
     design = design * scale
     normal = np.einsum("rki,rkj->rij", design, design) + 1e-9 * np.eye(3)
     fit = np.linalg.solve(normal, np.einsum("rki,rkj->rij", design, value)) * scale[:, None]
@@ -76,7 +88,14 @@ def smoothed(run: Run) -> np.ndarray:
 
 
 def velocity_lag(run: Run) -> float:
-    """By how many seconds the recorded velocity is late against that of the positions."""
+    """Estimates by how many seconds recorded velocities lag behind the slopes of recorded positions.
+
+    A lag means that the robot filtered its velocities before they were logged. It is searched on a grid of 1 ms from
+    -10 to 50 ms, by least squares over all joints.
+
+    Args:
+      run: with `q` and `dq`.
+    """
     own = smoothed(replace(run, signals={"q": run.signals["q"]}))[:, 1]
     lags = np.arange(-0.01, 0.051, 0.001)
     misfit = [
@@ -90,14 +109,30 @@ def velocity_lag(run: Run) -> float:
 
 
 def noise(values: np.ndarray) -> float:
-    """Standard deviation of what changes from row to row in [rows, ...], from third differences; never zero."""
+    """Estimates the standard deviation of white noise in a signal, from its third differences.
+
+        1.4826 median |third difference| / sqrt(20)
+
+    Motion that is smooth over four rows drops out of a third difference, whose variance is 20 times that of the noise.
+    The estimate is at least that of the signal's rounding, and never zero.
+
+    Args:
+      values: [rows, ...].
+    """
     differences = np.diff(values, n=3, axis=0) / np.sqrt(20.0)
     quantum = quantum_of(values)
     return float(max(1.4826 * np.median(np.abs(differences)), quantum / np.sqrt(12.0), 1e-6))
 
 
 def quantum_of(values: np.ndarray) -> float:
-    """Smallest step between two values; rounding of floats aside, zero where nothing was rounded."""
+    """Finds the step of rounding in a signal: an encoder's count, or the last digit of a file.
+
+    Args:
+      values: [rows, ...].
+
+    Returns:
+      The smallest step between consecutive rows where the other steps are its multiples, else zero.
+    """
     steps = np.unique(np.round(np.abs(np.diff(values, axis=0)), 9))
     steps = steps[steps > 1e-7]
     if not len(steps):
@@ -108,16 +143,19 @@ def quantum_of(values: np.ndarray) -> float:
 
 
 def cut(runs: Sequence[Run], horizon_s: float, dt: float, bin_s: float = 0.01) -> Cut:
-    """Cuts runs into segments that follow on each other.
+    """Cuts runs into consecutive segments of one length.
 
     Args:
-      runs: of one robot.
-      horizon_s: length of a segment.
-      dt: step of the simulation.
-      bin_s: a segment's rows are a multiple of as many as are taken together later.
+      runs: of one robot and one rate.
+      horizon_s: length of a segment in s, rounded to whole bins.
+      dt: step of the simulation in s.
+      bin_s: length of the bins that residuals are averaged over later; a segment is a whole number of them.
+
+    Returns:
+      The segments and the signals that all runs have. `tau` is left out where it is what was sent, not measured.
 
     Raises:
-      ValueError: no run is long enough.
+      ValueError: no run is longer than a segment and its history.
     """
     period = float(np.median([np.median(np.diff(run.time)) for run in runs]))
     together = rows_together(period, bin_s)
@@ -148,9 +186,13 @@ def cut(runs: Sequence[Run], horizon_s: float, dt: float, bin_s: float = 0.01) -
 
 
 def whole(runs: Sequence[Run], dt: float) -> Cut:
-    """Every run in one piece, from its first state with a history to its end.
+    """Takes every run as one segment, from the first state that has a history to the run's end.
 
-    Runs are of equal shape: rows past a run's end are its last one again.
+    Use it to simulate or draw whole runs. So that all have one shape, the last row of a shorter run is repeated.
+
+    Args:
+      runs: of one robot.
+      dt: step of the simulation in s.
     """
     prepared = [_Prepared(run, dt) for run in runs]
     first = [int(np.searchsorted(run.time, run.time[0] + HISTORY_S)) for run in runs]
@@ -173,12 +215,17 @@ def whole(runs: Sequence[Run], dt: float) -> Cut:
 
 
 def rows_together(period_s: float, bin_s: float) -> int:
-    """How many rows make a bin."""
+    """Returns how many rows a bin has, one at least.
+
+    Args:
+      period_s: time between rows.
+      bin_s: length of a bin.
+    """
     return max(1, round(bin_s / period_s))
 
 
 class _Prepared:
-    """A run, its states smoothed and its controller as numbers."""
+    """A run with smoothed states and its controller's numbers at every row, ready to be cut."""
 
     def __init__(self, run: Run, dt: float):
         self._run, self._dt = run, dt
@@ -196,7 +243,7 @@ class _Prepared:
         }
 
     def segment(self, start: int, rows: np.ndarray, after: int) -> Segment:
-        """From row `start` on, read at `rows`, all later."""
+        """Makes the segment that starts at row `start`, has `after` steps and is read at `rows`, all later."""
         run, dt = self._run, self._dt
         before, ahead = round(HISTORY_S / dt), round(LONGEST_S / dt)
         begin = run.time[start]
@@ -216,7 +263,7 @@ class _Prepared:
         )
 
     def _at(self, times: np.ndarray) -> np.ndarray:
-        """Smoothed states at other times: a cubic through positions and slopes."""
+        """Interpolates smoothed states at other times, by a cubic through positions and velocities of two rows."""
         time, states = self._run.time, self._states
         times = np.clip(times, time[0], time[-1])
         left = np.clip(np.searchsorted(time, times, side="right") - 1, 0, len(time) - 2)

@@ -1,4 +1,4 @@
-"""What the robot perceives: one observation function, whatever engine moves it."""
+"""The policy's observation: one function, whatever engine moves the robot, and the noise on its readings."""
 
 import jax
 import jax.numpy as jnp
@@ -22,24 +22,33 @@ NOISE = {"velocity": 0.1, "gyro": 0.2, "gravity": 0.05, "joint": 0.01, "joint_ve
 
 
 def rotate(quat: jax.Array, vector: jax.Array) -> jax.Array:
-    """Takes a vector [3] of a body with orientation `quat` [4] (w, x, y, z) into the world."""
+    """Rotates a vector [3] from the frame of a body into the world's, by its orientation `quat` [4] (w, x, y, z)."""
     w, axis = quat[0], quat[1:]
     cross = jnp.cross(axis, vector)
     return vector + 2.0 * (w * cross + jnp.cross(axis, cross))
 
 
 def rotate_inverse(quat: jax.Array, vector: jax.Array) -> jax.Array:
-    """Takes a world vector [3] into the frame of a body with orientation `quat` [4] (w, x, y, z)."""
+    """Rotates a world vector [3] into the frame of a body with orientation `quat` [4] (w, x, y, z)."""
     return rotate(quat * jnp.array([1.0, -1.0, -1.0, -1.0]), vector)
 
 
 def projected_gravity(quat: jax.Array) -> jax.Array:
-    """Direction of gravity in the body frame, [3], a unit vector."""
+    """Computes the direction of gravity in the body frame, a unit vector [3]; (0, 0, -1) of an upright body.
+
+    It is what an accelerometer gives of orientation, without heading.
+
+    Args:
+      quat: orientation of the body, [4] (w, x, y, z).
+    """
     return rotate_inverse(quat, jnp.array([0.0, 0.0, -1.0]))
 
 
 def clock(phase: jax.Array) -> jax.Array:
-    """Sine and cosine of each foot's phase: [2] cycles to [4]."""
+    """Encodes each foot's phase, [2] cycles, as sine and cosine, [4]: left sine, left cosine, right sine, right cosine.
+
+    A phase itself jumps from one to zero, which a network should not see.
+    """
     angle = 2.0 * jnp.pi * phase
     return jnp.stack([jnp.sin(angle), jnp.cos(angle)], axis=-1).reshape(-1)
 
@@ -57,14 +66,15 @@ def observe(
     phase: jax.Array,
     stand: jax.Array,
 ) -> jax.Array:
-    """Builds the observation, laid out as `LAYOUT` says.
+    """Builds the policy's observation, laid out and scaled as `LAYOUT` says (section IV-A.2 of the paper).
 
     Args:
       velocity: [3] m/s, of the trunk's origin, body frame.
       command: [3] m/s, m/s, rad/s.
       gyro: [3] rad/s, body frame.
       gravity: [3] projected gravity.
-      joint, joint_velocity: [6] rad, rad/s.
+      joint: [6] rad.
+      joint_velocity: [6] rad/s.
       last_action: [6].
       joint_error: [6] rad, last target less position.
       phase: [2] cycles, of each foot.
@@ -89,12 +99,27 @@ def observe(
 
 
 def with_command(obs: jax.Array, command: jax.Array, phase: jax.Array) -> jax.Array:
-    """The observation [40] that another command [3] and another gait clock [2] would have made."""
+    """Replaces command and gait clock in an observation [40], as if the robot had had them from the start.
+
+    Args:
+      obs: [40], as `observe` builds it.
+      command: [3] m/s, m/s, rad/s.
+      phase: [2] cycles.
+    """
     return obs.at[3:6].set(command * LAYOUT["command"]).at[36:40].set(clock(phase) * LAYOUT["clock"])
 
 
 def disturb(key: jax.Array, readings: dict[str, jax.Array], scale: float) -> dict[str, jax.Array]:
-    """Adds uniform sensor noise to the readings named in `NOISE`, `scale` times as wide."""
+    """Adds uniform sensor noise to the readings that `NOISE` names.
+
+    Args:
+      key: random key.
+      readings: by name, before they are scaled into an observation.
+      scale: multiplies the widths of `NOISE`; zero is no noise.
+
+    Returns:
+      All readings, those named in `NOISE` with noise.
+    """
     noisy = dict(readings)
     for (name, width), key_channel in zip(NOISE.items(), jax.random.split(key, len(NOISE)), strict=True):
         reading = readings[name]

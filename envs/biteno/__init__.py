@@ -5,6 +5,7 @@ that discovery corrected is in `envs.corrected`.
 """
 
 from envs.biteno.batch import BraxBiteno
-from envs.biteno.env import Biteno, Drive, Motion, State, TaskConfig
+from envs.biteno.env import Biteno
+from envs.biteno.task import Drive, Motion, State, TaskConfig
 
 __all__ = ["Biteno", "BraxBiteno", "Drive", "Motion", "State", "TaskConfig"]

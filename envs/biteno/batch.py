@@ -1,4 +1,4 @@
-"""BITeno many times behind Brax's interface, for training."""
+"""A batch of BITenos behind Brax's environment interface, for PPO."""
 
 import jax
 import jax.numpy as jnp
@@ -6,14 +6,20 @@ from brax.envs.base import Env as BraxEnv
 from brax.envs.base import State as BraxState
 
 from envs.biteno import constants
-from envs.biteno.env import Biteno, State
+from envs.biteno.env import Biteno
+from envs.biteno.task import State
 from jaxtune.mjx import parameters
 
 
 class BraxBiteno(BraxEnv):
-    """A batch of robots behind Brax's interface, each with its own parameters, reset when its episode ends.
+    """A batch of robots behind Brax's interface, each with its own physical parameters.
 
-    The parameters travel in `state.info["params"]`: set them with `with_params`, nothing is compiled anew.
+    A robot whose episode ends, by a fall or by the time limit, starts a new one in the same step. The parameters travel
+    in `state.info["params"]`; `with_params` changes them without compiling anything again. An episode cut by the time
+    limit is marked in `state.info["truncation"]`, so that PPO bootstraps its value.
+
+    Args:
+      robot: robot and task, unbatched.
     """
 
     def __init__(self, robot: Biteno):
@@ -21,7 +27,7 @@ class BraxBiteno(BraxEnv):
         self._limit = round(robot.config.episode_s / constants.POLICY_DT_S)
 
     def reset(self, rng: jax.Array) -> BraxState:
-        """Resets a batch of nominal robots, one for each key in `rng` [batch, ...]."""
+        """Resets a batch of nominal robots, one for each key in `rng` [batch, ...]; Brax's own entry point."""
         count = rng.shape[0]
         params = {
             name: jnp.full(count, value, jnp.float32) for name, value in parameters.nominal(self._robot.entries).items()
@@ -29,19 +35,31 @@ class BraxBiteno(BraxEnv):
         return self.start(params, rng)
 
     def start(self, params: parameters.Params, keys: jax.Array) -> BraxState:
-        """Resets a batch of robots with the given parameters, each value [batch]."""
+        """Resets a batch of robots with the given parameters.
+
+        Args:
+          params: physical values by name, [batch] each; every name of the robot's table.
+          keys: [batch] random keys, of `jax.random.PRNGKey`'s kind.
+        """
         robots = jax.vmap(self._robot.reset)(params, keys)
         return self._as_brax(params, robots, robots, jnp.zeros_like(robots.done))
 
     @staticmethod
     def with_params(state: BraxState, params: parameters.Params) -> BraxState:
-        """The same robots, wherever they are, with other parameters [batch]."""
+        """Gives the robots other parameters, [batch] by name, in the middle of their episodes.
+
+        The tuner's distribution moves while PPO trains on; robots do not start anew because of it.
+        """
         # A weakly typed value would have the next step compiled anew.
         params = {name: jnp.asarray(value, jnp.float32) for name, value in params.items()}
         return state.replace(info={**state.info, "params": params})
 
     def step(self, state: BraxState, action: jax.Array) -> BraxState:
-        """Steps every robot under its action [batch, 6]; those whose episode ended start a new one."""
+        """Moves every robot by one policy step under its action [batch, 6].
+
+        Reward, `done` and metrics are of the step; observations of robots whose episode ended are those of the next
+        one.
+        """
         params = state.info["params"]
         robots = jax.vmap(self._robot.step)(params, state.pipeline_state, action)
         truncation = (robots.steps >= self._limit) * (1.0 - robots.done)
@@ -54,7 +72,7 @@ class BraxBiteno(BraxEnv):
 
     @staticmethod
     def _as_brax(params, robots: State, following: State, truncation: jax.Array) -> BraxState:
-        # Brax calls an episode cut by the clock done as well, and tells it apart by `truncation`.
+        # Brax counts an episode that the time limit cut as done, and distinguishes it by `truncation`.
         return BraxState(
             pipeline_state=following,
             obs=following.obs,
@@ -66,12 +84,15 @@ class BraxBiteno(BraxEnv):
 
     @property
     def observation_size(self) -> int:
+        """Number of components of an observation: 40."""
         return self._robot.observation_size
 
     @property
     def action_size(self) -> int:
+        """Number of components of an action: 6."""
         return self._robot.action_size
 
     @property
     def backend(self) -> str:
+        """Name of the physics engine, which Brax asks for."""
         return "mjx"

@@ -1,9 +1,9 @@
 """What is known of BITeno, what is chosen, and the parameters by which its simulation may be wrong.
 
 Public: 15.5 kg, 0.95 m tall, legs of 0.65 m, three joints a leg, a policy at 100 Hz over a joint PD at 1000 Hz, 40
-  observations, 6 actions and Table I of the paper. Everything else (masses of single links, limits, gains, feet) is a
-  choice of this project, scaled from the nearest public robot, the point-footed LimX TRON1 (18.6 kg, the same six
-  joints).
+observations, 6 actions and Table I of the paper. Everything else (masses of single links, limits, gains, feet) is a
+choice of this project, scaled from the nearest public robot, the point-footed LimX TRON1 (18.6 kg, the same six
+joints).
 """
 
 from dataclasses import replace
@@ -19,16 +19,16 @@ SIDES = ("left", "right")
 JOINTS = tuple(f"{side}_{joint}" for side in SIDES for joint in ("abad", "hip", "knee"))
 FEET = tuple(f"{side}_foot" for side in SIDES)
 
-STAND_RAD = np.array([0.0, -0.35, 0.70] * 2)  # foot under the hip
+STAND_RAD = np.array([0.0, -0.35, 0.70] * 2)  # [6], each foot under its hip
 HIP_HEIGHT_M = 0.612
-HIP_Y_M = np.array([0.10, -0.10])
+HIP_Y_M = np.array([0.10, -0.10])  # left, right, from the trunk's middle
 LINK_M = 0.31  # thigh and shank alike
 STANCE_DEPTH_M = 0.582  # hip axis to the foot's centre: HIP_HEIGHT_M less the foot's radius
 FOOT_RADIUS_M = 0.03
 POLICY_DT_S = 0.01
 
-CLOCK_HZ = 1.75
-DUTY = 0.5
+CLOCK_HZ = 1.75  # strides a second
+DUTY = 0.5  # share of a stride in which a foot is in stance
 SWING_HEIGHT_M = 0.08
 
 TABLE_ONE = {
@@ -43,14 +43,15 @@ TABLE_ONE = {
     "joint_default": -0.35,
     "raibert": -1.25,
 }
-"""Weights of the paper's Table I."""
+"""Weights of the reward's terms in the paper's Table I (`rewards.terms`); what a policy is scored by."""
 
 WALKING = {**TABLE_ONE, "raibert": -5.0, "action_rate": -0.01}
-"""Weights that make it walk. Under Table I alone this robot earns as much by buzzing (13 touchdowns a second and
-foot)."""
+"""Weights that the policy is trained with. Under Table I alone this robot earns as much by buzzing, 13 touchdowns a
+second and foot, as by walking."""
 
 SHAPING = {"clock_contact": -1.0}
-"""Weights of terms beside Table I. Without them it walks, but lands one and a half times a step."""
+"""Weights of training terms beside Table I (`rewards.shaping`). Without them the robot walks, but its feet bounce: one
+and a half touchdowns a step."""
 
 
 def _mass(name: str, *bodies: str) -> Entry:
@@ -99,17 +100,20 @@ ENTRIES = {
             column=0,
             bounds=(0.5, 4.0),
         ),
-        # Until it is over, the joints still follow the target before.
+        # For as long, the joints still follow the previous target.
         Entry(name="action_delay_s", kind="control", targets=(), fields=(), bounds=(0.0, POLICY_DT_S), log=False),
     )
 }
-"""Everything that can be tuned, by name; multipliers of the nominal model, but where a unit says that it is added."""
+"""Every parameter that can be tuned, by name. Those whose name ends in a unit are added to the nominal value; the
+others multiply it."""
 
 PARAMETER_SETS = {
-    # The paper's own seven, in its order.
+    # The seven parameters of the paper, in its order.
     "legs6": (
         "foot_friction",
         *(f"{side}_{link}_mass" for side in SIDES for link in ("abductor", "thigh", "shank")),
     ),
+    # Left and right tied; it shows the robot's total mass.
     "whole_body": ("foot_friction", "trunk_mass", "abductor_mass", "thigh_mass", "shank_mass"),
 }
+"""Sets of parameters that are tuned together, by the name that `--parameters` takes."""

@@ -1,18 +1,15 @@
-"""BITeno follows velocity commands: the task of the paper's section IV, its physical parameters an argument.
+"""The walking task of the paper's section IV: BITeno follows velocity commands.
 
-`Biteno` is one robot, pure and unbatched; `vmap` it. A state holds positions and velocities, not a whole `mjx.Data`, so
-a reset is cheap and fresh.
+`Biteno` is one robot, pure and unbatched; `vmap` it. Physical parameters are an argument of every step. A state holds
+positions and velocities, not a whole `mjx.Data`, so resets are cheap.
 
-The sum of Table I can be negative, and then falling early pays. The remedy is an explicit cost of termination
-(`TaskConfig.termination_cost`); it is part of the trained reward, never of the scored one (`State.score`).
+The sum of Table I can be negative, and then an early fall earns more than a walk. An explicit cost of termination
+(`TaskConfig.termination_cost`) prevents that; it is part of the trained reward, never of the score (`State.score`).
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
 
-import chex
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -21,6 +18,7 @@ from mujoco import mjx
 
 from envs import sensing
 from envs.biteno import constants, gait, rewards
+from envs.biteno.task import Drive, Motion, State, TaskConfig
 from envs.chain import MIN_FRICTION_NM
 from jaxtune.mjx import parameters
 
@@ -33,90 +31,19 @@ _BASES = ("stand", "raibert")
 _PHYSICS = {"exact": (0.001, 10, 3, 5), "fast": (0.002, 5, 2, 5)}
 
 
-@dataclass(frozen=True, kw_only=True)
-class TaskConfig:
-    """The task; defaults are the paper's where it has one."""
-
-    physics: Literal["exact", "fast"] = "exact"
-    """`exact`: 10 sub-steps of 1 ms. `fast`: 5 of 2 ms with fewer solver iterations; what is learnt there walks at 1
-    ms."""
-    base: Literal["stand", "raibert"] = "stand"
-    """What an action is added to: the standing pose, or Raibert's reference."""
-    action_scale: float = 0.25
-    """Joint target in rad per unit of action."""
-    noise: float = 0.0
-    """Width of the observation noise in units of `sensing.NOISE`."""
-    weights: Mapping[str, float] = field(default_factory=lambda: dict(constants.WALKING))
-    """Trained reward: weight of every term of Table I."""
-    shaping: Mapping[str, float] = field(default_factory=lambda: dict(constants.SHAPING))
-    """Trained reward: weight of terms beside Table I (`rewards.shaping`)."""
-    termination_cost: float = 1.0
-    """Taken from the trained reward where an episode ends in a fall."""
-    episode_s: float = 20.0
-    """Time limit of an episode."""
-    command_s: float = 5.0
-    """Time between two commands."""
-    command_max: tuple[float, float, float] = (1.0, 0.3, 0.8)
-    """Largest command forward in m/s, sideways in m/s, turning in rad/s."""
-    zero_command_share: float = 0.1
-    """Share of commands that are zero."""
-    push_mps: float = 0.0
-    """Speed that a push adds to the trunk, in a random horizontal direction."""
-    push_s: float = 4.0
-    """Time between two pushes."""
-
-
-@chex.dataclass(frozen=True)
-class State:
-    """One robot between two policy steps."""
-
-    qpos: jax.Array  # [13]
-    qvel: jax.Array  # [12]
-    qacc_warmstart: jax.Array  # [12]
-    command: jax.Array  # [3] m/s, m/s, rad/s
-    phase: jax.Array  # [2] cycles
-    action: jax.Array  # [6]
-    joint_error: jax.Array  # [6] rad
-    obs: jax.Array  # [40]
-    reward: jax.Array  # trained reward
-    score: jax.Array  # reward under the weights of Table I
-    done: jax.Array  # 1 where the robot fell or is not finite
-    not_finite: jax.Array  # 1 where the simulation broke
-    steps: jax.Array  # policy steps since the reset
-    terms: dict  # unweighted terms of Table I, and of the shaping that has a weight
-    key: jax.Array
-    memory: dict = field(default_factory=dict)  # of motors and sensors that are not ideal
-
-
-@chex.dataclass(frozen=True)
-class Drive:
-    """What an action asks of the joints during a policy step."""
-
-    action: jax.Array  # [6] clipped
-    target: jax.Array  # [6] rad
-    targets: jax.Array  # [substeps, 6] rad, what has arrived of it at each sub-step
-    reference: jax.Array  # [6] rad, Raibert's q*
-
-
-@chex.dataclass(frozen=True)
-class Motion:
-    """Where an engine leaves the robot after a policy step."""
-
-    qpos: jax.Array  # [13] m, quaternion (w, x, y, z) and rad, in MuJoCo's order
-    qvel: jax.Array  # [12] m/s in the world, rad/s in the trunk, rad/s
-    qacc_warmstart: jax.Array  # [12]; zeros where the engine keeps its own
-    torque: jax.Array  # [6] Nm, of the last sub-step
-    foot_force: jax.Array  # [2, 3] N, world frame, of the floor on each foot in the last sub-step
-    memory: dict = field(default_factory=dict)  # of motors and sensors that are not ideal
-
-
 class Biteno:
-    """One robot.
+    """BITeno and its task as pure functions of a state: `reset`, `step`, and the parts that other engines replace.
+
+    A step is `settle(state, drive, simulate(params, state, drive))`. Another engine simulates a `Drive` and hands its
+    `Motion` to `settle` (`envs.targets.host`), so observation, reward and termination are the same code everywhere.
 
     Args:
       config: the task.
-      entries: the parameters that a step may be given; joint friction costs time even where it is zero.
-      path: of the model.
+      entries: the parameters that a step may be given. Joint friction among them costs time even where it is zero.
+      path: of the MJCF.
+
+    Raises:
+      ValueError: a field of the task has a value that is not allowed.
     """
 
     observation_size = 40
@@ -150,27 +77,32 @@ class Biteno:
         self._data = mjx.make_data(model)
 
     def _prepare(self, model: mujoco.MjModel) -> None:
-        """What a model needs before it goes on the device."""
+        """Changes what MJX needs to find in a model when it is put on the device."""
         for entry in self.entries.values():
             if "dof_frictionloss" in entry.fields:
                 # MJX solves for friction only in joints that had some when the model was put on the device.
                 rows = entry.rows(model)
                 model.dof_frictionloss[rows] = np.maximum(model.dof_frictionloss[rows], MIN_FRICTION_NM)
         if (model.dof_frictionloss > 0).any():
-            # Its kinks take twice the iterations: at 2 Nm three are off by 2e-4 rad after 10 ms, six by nothing.
+            # Dry friction takes twice the iterations: at 2 Nm three are off by 2e-4 rad after 10 ms, six by nothing.
             model.opt.iterations *= 2
             model.opt.ls_iterations *= 2
 
     def model(self, params: parameters.Params) -> mjx.Model:
-        """The robot with these parameters."""
+        """Makes the MJX model of the robot with these physical parameters (`jaxtune.mjx.apply`)."""
         return parameters.apply(self._model, params, self.entries)
 
     def reset(self, params: parameters.Params, key: jax.Array) -> State:
         """Starts an episode near the standing pose, at a random phase, under a random command.
 
         Args:
-          params: physical values by name (`jaxtune.mjx`); a reset does not depend on them, a step does.
-          key: random key.
+          params: physical values by name (`jaxtune.mjx`). A reset does not depend on them; the argument is there
+          because
+            a robot with effects may.
+          key: random key; it is also the source of everything random in the episode.
+
+        Returns:
+          The state before the first step: joints within 0.1 rad of the stand, velocities within 0.2.
         """
         del params
         key, key_joint, key_velocity, key_phase, key_command, key_noise = jax.random.split(key, 6)
@@ -197,30 +129,41 @@ class Biteno:
         return state.replace(obs=self._observe(state, key_noise))
 
     def step(self, params: parameters.Params, state: State, action: jax.Array) -> State:
-        """Moves the robot on by one policy step of 10 ms under an action [6]."""
+        """Moves the robot by one policy step of 10 ms.
+
+        Args:
+          params: physical values by name; those left out are nominal.
+          state: of the robot before the step.
+          action: [6], clipped to +-10; the joint targets are the base pose plus `action_scale` times it.
+        """
         return self.move(params, state, action)[0]
 
     def move(self, params: parameters.Params, state: State, action: jax.Array) -> tuple[State, Motion]:
-        """A step, and the motion behind it."""
+        """Moves the robot by one policy step, as `step` does, and returns the engine's motion as well."""
         drive = self.drive(params, state, action)
         motion = self.simulate(params, state, drive)
         return self.settle(state, drive, motion), motion
 
     def drive(self, params: parameters.Params, state: State, action: jax.Array) -> Drive:
-        """What an action [6] asks of the joints."""
+        """Turns an action [6] into joint targets for every sub-step.
+
+            target = base + action_scale clip(action, -10, 10)
+
+        With an `action_delay_s` among the parameters the previous target acts until the delay is over.
+        """
         action = jnp.clip(action, -ACTION_LIMIT, ACTION_LIMIT)
         reference = gait.joint_reference(state.phase, state.command)
         base = reference if self.config.base == "raibert" else jnp.asarray(constants.STAND_RAD)
         target = base + self.config.action_scale * action
         held = state.joint_error + self.perceive(state)["joint"]
         delay = params.get("action_delay_s", 0.0) / self.mj_model.opt.timestep
-        # A sub-step in which the target changes has the mean of both.
+        # In the sub-step in which the delay ends, the two targets are averaged by their shares of time.
         arrived = jnp.clip(jnp.arange(1, self.substeps + 1) - delay, 0.0, 1.0)
         targets = target + (1.0 - arrived[:, None]) * (held - target)
         return Drive(action=action, target=target, targets=targets, reference=reference)
 
     def simulate(self, params: parameters.Params, state: State, drive: Drive) -> Motion:
-        """Physics in MJX; another engine may stand in for it."""
+        """Simulates one policy step in MJX; the only part of a step that other engines replace."""
         model = self.model(params)
         data = self._data.replace(qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.qacc_warmstart)
         data, _ = jax.lax.scan(lambda data, ctrl: (mjx.step(model, data.replace(ctrl=ctrl)), None), data, drive.targets)
@@ -237,7 +180,16 @@ class Biteno:
         return mjx.rne_postconstraint(model, data)._impl.cfrc_ext[self._shanks, 3:]
 
     def settle(self, state: State, drive: Drive, motion: Motion) -> State:
-        """Observation, rewards, termination and the next command, after the robot moved."""
+        """Computes observation, rewards, termination and the next command after the robot moved.
+
+        A motion that is not finite ends the episode: the robot is put back to its home pose, earns nothing and is
+        counted in `not_finite`.
+
+        Args:
+          state: before the step.
+          drive: the targets of the step.
+          motion: where an engine left the robot.
+        """
         finite = jnp.isfinite(motion.qpos).all() & jnp.isfinite(motion.qvel).all()
         zeros = jnp.zeros_like(state.qvel)
         qpos, qvel, warmstart, torque, action, target = jax.tree.map(
@@ -295,7 +247,10 @@ class Biteno:
         }
 
     def perceive(self, state: State) -> dict[str, jax.Array]:
-        """What the sensors say, by signal; here they are ideal."""
+        """Returns what the sensors read, by signal: `velocity`, `gyro`, `gravity`, `joint`, `joint_velocity`.
+
+        The nominal robot's sensors are ideal; a corrected robot overrides this.
+        """
         return self._readings(state)
 
     def _observe(self, state: State, key: jax.Array) -> jax.Array:
@@ -313,7 +268,10 @@ class Biteno:
 
     @staticmethod
     def with_command(state: State, command: jax.Array, phase: jax.Array) -> State:
-        """The same robot under another command [3], its gait clock at another phase [2]."""
+        """Gives the robot another command [3] and gait clock [2]; the observation is rewritten accordingly.
+
+        Use it to repeat the commands of measured episodes.
+        """
         return state.replace(command=command, phase=phase, obs=sensing.with_command(state.obs, command, phase))
 
     def _push(self, key: jax.Array, qvel: jax.Array, steps: jax.Array) -> jax.Array:
@@ -331,5 +289,13 @@ class Biteno:
 
 
 def fallen(gravity: jax.Array, height: jax.Array) -> jax.Array:
-    """True where a robot has fallen: by projected gravity [..., 3] and height [...] of its trunk in m."""
+    """Decides whether a robot has fallen: tilted by more than 45 degrees, or its hip axis below 0.35 m.
+
+    Args:
+      gravity: projected gravity [..., 3] in the body frame.
+      height: [...] m, of the hip axis above the floor.
+
+    Returns:
+      Booleans [...].
+    """
     return (gravity[..., 2] > -_MAX_TILT_COS) | (height < _MIN_HEIGHT_M)

@@ -1,4 +1,4 @@
-"""The gait clock, the joint angles of a foot that follows it (Raibert's heuristic), and how well a gait does."""
+"""The gait clock, Raibert's reference for feet and joints, leg kinematics, and measures of a gait's quality."""
 
 import jax
 import jax.numpy as jnp
@@ -7,25 +7,35 @@ import numpy as np
 from envs import sensing
 from envs.biteno import constants
 
-_TOUCH_N = 1.0  # a foot touches the floor
-_PRESS_N = 10.0  # and presses on it enough for a ratio of forces to mean something
+_TOUCH_N = 1.0  # normal force from which on a foot is in contact
+_PRESS_N = 10.0  # normal force from which on the ratio of tangential to normal force is meaningful
 
 
 def advance(phase: jax.Array, steps: int = 1) -> jax.Array:
-    """Moves the phases on by policy steps, or back, in cycles."""
+    """Advances phases [...] in cycles by a number of policy steps, which may be negative.
+
+    Each foot's phase is in stance below 0.5 and in swing above; it runs at 1.75 cycles a second.
+    """
     return jnp.mod(phase + steps * constants.CLOCK_HZ * constants.POLICY_DT_S, 1.0)
 
 
 def foot_reference(phase: jax.Array, command: jax.Array) -> jax.Array:
-    """Where each foot's centre should be below its hip.
+    """Computes Raibert's reference: where each foot's centre should be relative to its hip.
 
     In stance (phase below the duty of one half) the foot sweeps back at the commanded speed, half a stride before to
-    half a stride behind the hip; in swing it returns and lifts. A reference without the lift would ask the robot to
-    stand still.
+    half a stride behind the hip; in swing it returns and lifts. With phase p, stance time T = duty / clock rate and
+    command (vx, vy, w):
+
+        r = |1 - 2 p| - 0.5
+        x = r (vx - w y_hip) T
+        y = r vy T
+        z = -0.582 m + 0.08 m sin(pi (2 p - 1)) in swing
+
+    Without the lift the reference would have the robot stand still.
 
     Args:
-      phase: [2] cycles.
-      command: [3] m/s, m/s, rad/s.
+      phase: [2] cycles, left and right.
+      command: [3] forward m/s, sideways m/s, turning rad/s.
 
     Returns:
       [2, 3] m, in the trunk's axes, from each hip.
@@ -40,7 +50,17 @@ def foot_reference(phase: jax.Array, command: jax.Array) -> jax.Array:
 
 
 def leg_angles(foot: jax.Array) -> jax.Array:
-    """Inverse kinematics of one leg: foot centre [..., 3] m from the hip to (abduction, hip, knee) [..., 3] rad."""
+    """Solves the inverse kinematics of a leg in closed form.
+
+    Both links have length l = 0.31 m. With d the distance from hip to foot, the knee is 2 arccos(d / 2 l), and the hip
+    turns back by half of it. Points out of reach are answered with a straight leg.
+
+    Args:
+      foot: centre of the foot from the hip, [..., 3] m.
+
+    Returns:
+      (abduction, hip, knee), [..., 3] rad.
+    """
     x, y, z = foot[..., 0], foot[..., 1], foot[..., 2]
     depth = jnp.hypot(y, z)
     length = jnp.hypot(x, depth)
@@ -51,17 +71,25 @@ def leg_angles(foot: jax.Array) -> jax.Array:
 
 
 def joint_reference(phase: jax.Array, command: jax.Array) -> jax.Array:
-    """Raibert's joint angles q* [6] rad for phases [2] and a command [3]."""
+    """Computes Raibert's joint reference q*, [6] rad: `leg_angles` of `foot_reference`.
+
+    The reward compares joints with it, and with `TaskConfig.base` = raibert actions are added to it.
+
+    Args:
+      phase: [2] cycles.
+      command: [3] m/s, m/s, rad/s.
+    """
     return leg_angles(foot_reference(phase, command)).reshape(-1)
 
 
 def foot_motion(qpos: jax.Array, qvel: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Where the feet are, and how fast the lowest point of each moves over the ground.
+    """Computes where the feet are, and how fast the lowest point of each moves over the ground.
 
-    The lowest point and not the centre, which moves while the foot rolls.
+    Slip is the velocity of the lowest point: the centre moves even where a foot rolls without slipping.
 
     Args:
-      qpos, qvel: [13], [12], as in `Motion`.
+      qpos: [13], as in `Motion`.
+      qvel: [12], as in `Motion`.
 
     Returns:
       Centres [2, 3] m and velocities of the lowest points [2, 3] m/s, both in the world.
@@ -79,7 +107,10 @@ def foot_motion(qpos: jax.Array, qvel: jax.Array) -> tuple[jax.Array, jax.Array]
 
 
 def trunk_height(gravity: jax.Array, joint: jax.Array) -> jax.Array:
-    """Over flat ground that the lower foot stands on, m; in the air, less than it is.
+    """Estimates the height of the hip axis above flat ground in m, from the legs alone.
+
+    It assumes that the lower foot stands on the ground; in flight the estimate is too low. Logs without motion capture
+    have no other measure of whether the trunk has sunk.
 
     Args:
       gravity: [3] projected gravity.
@@ -89,6 +120,7 @@ def trunk_height(gravity: jax.Array, joint: jax.Array) -> jax.Array:
 
 
 def _foot_in_trunk(joint: jax.Array) -> jax.Array:
+    """Forward kinematics: centres of both feet [2, 3] m in the trunk's frame, for joints [2, 3] rad."""
     hips = jnp.stack([jnp.zeros(2), jnp.asarray(constants.HIP_Y_M), jnp.zeros(2)], axis=-1)
     thigh, shank = joint[:, 1], joint[:, 1] + joint[:, 2]
     flat = -constants.LINK_M * jnp.stack(
@@ -98,6 +130,7 @@ def _foot_in_trunk(joint: jax.Array) -> jax.Array:
 
 
 def _about_x(angle: jax.Array) -> jax.Array:
+    """Rotation matrix [3, 3] about the forward axis, which abduction turns about."""
     sin, cos = jnp.sin(angle), jnp.cos(angle)
     return jnp.array([[1.0, 0.0, 0.0], [0.0, cos, -sin], [0.0, sin, cos]])
 
@@ -113,11 +146,17 @@ def quality(
     alive: np.ndarray,
     fell: np.ndarray,
 ) -> dict[str, float]:
-    """What tells a walk from a buzz; return does not.
+    """Measures a gait. These numbers distinguish a walk from a buzz of the feet, which earns nearly the same return.
 
     Args:
-      qpos, qvel, torque, foot_force, command, phase: a recording, [episodes, time, ...].
-      alive, fell: of the same episodes, [episodes, time] and [episodes].
+      qpos: [episodes, time, 13], as in `Motion`; a recording (`envs.targets.protocol.Recording`), as are the next five.
+      qvel: [episodes, time, 12].
+      torque: [episodes, time, 6] Nm.
+      foot_force: [episodes, time, 2, 3] N.
+      command: [episodes, time, 3] m/s, m/s, rad/s.
+      phase: [episodes, time, 2] cycles.
+      alive: [episodes, time], of the same episodes; steps that are not alive do not count.
+      fell: [episodes].
 
     Returns:
       By name: touchdowns a second and foot; swing clearance in m, the mean over swings of the foot's highest point
@@ -156,12 +195,21 @@ def quality(
 
 
 def power(torque: jax.Array, joint_velocity: jax.Array) -> jax.Array:
-    """Mechanical power in W of torques [..., 6] in Nm at velocities in rad/s, braking not regained."""
+    """Computes the mechanical power that the motors spend, in W.
+
+        sum over joints of max(torque velocity, 0)
+
+    Braking is not regained.
+
+    Args:
+      torque: [..., 6] Nm.
+      joint_velocity: [..., 6] rad/s.
+    """
     return jnp.maximum(torque * joint_velocity, 0.0).sum(axis=-1)
 
 
 def _clearance(height: np.ndarray, contact: np.ndarray, living: np.ndarray) -> float:
-    """Mean over swings, from lift-off to touchdown, of the foot's highest point."""
+    """Mean over swings, from lift-off to touchdown, of the foot's highest point, in m."""
     highest = []
     for episode, foot in np.ndindex(height.shape[0], height.shape[2]):
         touching = contact[episode, living[episode, :, 0], foot]
@@ -180,7 +228,7 @@ def _foot_motions(qpos, qvel):
 
 @jax.jit
 def _trunk_velocities(qpos, qvel):
-    """Forward, sideways, turning: [episodes, time, 3]."""
+    """Velocities forward, sideways and of turning, in the body frame, [episodes, time, 3]."""
 
     def one(qpos, qvel):
         return jnp.append(sensing.rotate_inverse(qpos[3:7], qvel[:3])[:2], qvel[5])

@@ -1,16 +1,17 @@
-"""What is wrong with a log itself, before anything is learnt from it.
+"""The log doctor: finds what is wrong with a log itself, before anything is learnt from it.
 
-Structure first: time stamps, rows, steps of rounding, clipping. Then physics, by trying: a repair (two joints
-exchanged, a sign turned, degrees made radians, an offset or a delay taken out, a clock set right) is believed where the
-log agrees much better with itself and with the model after it. Agreement has up to five parts for every joint, each
-between none (0) and all of it (2) of the signal's own size:
+`structure` looks at time stamps and rows. `physics` tries repairs: two joints swapped back, a sign flipped, degrees
+converted to radians, an offset or a delay removed. A repair is believed where the log agrees much better with itself
+and with the model after it. Disagreement is the sum over joints of up to five parts, each from 0 (agreement) to 2, in
+units of the signals' own size:
 
-- measured velocities are the slopes of measured positions;
-- the controller's torque is what the model needs for the measured motion (robots that are suspended or clamped);
-- the measured torque is the controller's;
-- positions follow their targets, and stay within the joints' ranges.
+- measured velocities against the slopes of measured positions;
+- the controller's torque against what the model needs for the measured motion (fixed base alone);
+- the measured torque against the controller's;
+- positions against their targets, and against the joints' ranges.
 
-Repairs are looked for one after the other, the best first.
+Repairs are searched greedily, the best first, three at most; two at once where units are wrong, because nothing agrees
+in wrong units.
 """
 
 from collections.abc import Mapping, Sequence
@@ -26,11 +27,11 @@ from envs.rig import suspended
 
 __all__ = ["Finding", "diagnose", "diagnose_log", "shared_findings"]
 
-_LEAST_ROWS = 100  # in one piece
+_LEAST_ROWS = 100  # consecutive ones, without which nothing but structure can be judged
 
 
 def diagnose_log(log: Log) -> dict[str, list[Finding]]:
-    """Diagnoses every run of a log, each for itself.
+    """Diagnoses every run of a log, each separately; what `python -m experiments.doctor` reports.
 
     Args:
       log: as it was read; its robot's model is loaded by name or path.
@@ -69,16 +70,23 @@ def _with_count(name: str, count: int) -> str:
 
 
 def diagnose(run: Run, joints: tuple[str, ...], model: mujoco.MjModel, base: str = "fixed") -> list[Finding]:
-    """Everything that is suspected of a run.
+    """Finds everything that is suspected of one run.
 
     Args:
       run: as it was read.
-      joints: of the log.
-      model: of the robot, hung (`envs.rig.suspended`) where the base is fixed.
-      base: fixed or free; what a robot on the ground needs of its joints depends on forces that nobody measured.
+      joints: names of the joints, in the log's order.
+      model: of the robot, suspended (`envs.rig.suspended`) where the base is fixed.
+      base: `fixed` or `free`. On a free base torques are not compared with the model's, because they depend on ground
+        forces that were not measured.
+
+    Returns:
+      Findings of structure first, then of physics; an empty list where nothing is suspected.
     """
     found, clean = structure(run)
     if len(clean.time) < _LEAST_ROWS:
-        text = f"no more than {len(clean.time)} rows follow on each other in order: nothing else can be said"
+        text = (
+            f"only {len(clean.time)} consecutive rows are in order, expected {_LEAST_ROWS} or more: "
+            "joints, signs, units and delays were not checked"
+        )
         return [*found, Finding("in pieces", "t", (), float(len(clean.time)), text)]
     return found + physics(clean, joints, model, base == "fixed")

@@ -1,28 +1,35 @@
-"""What the log doctor says."""
+"""What a diagnosis consists of: findings."""
 
 from dataclasses import dataclass
 
 MEASURED = ("q", "dq", "tau")
-"""What sensors say of joints."""
+"""Signals of the joints that sensors give, in contrast to targets."""
 
 _WRONG = ("swapped joints", "flipped sign", "degrees", "radians twice", "millinewtonmetres")
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One suspicion."""
+    """One thing that is suspected of a run, for a report and for code that decides whether to go on.
+
+    Two findings with the same kind, signal and joints say the same of two runs (`envs.diagnosis.shared_findings`).
+    """
 
     kind: str
-    """What is wrong, as one word or two."""
+    """What is wrong, in one word or two (`swapped joints`, `late`, `clipped`); reports and files keep these words."""
     signal: str
-    """Where: a signal, `measured` for all that sensors say, or `t`."""
+    """Where it is wrong: a signal, `measured` for all signals of sensors, `all` for these and the targets, or `t`."""
     joints: tuple[str, ...]
+    """Of the model, whose signals are wrong; empty where all are or where it is not about joints."""
     size: float
     """How much, in the unit of the sentence."""
     sentence: str
-    """For a person, with what to do about it."""
+    """The finding for a person, with the remedy where there is one."""
 
     @property
     def wrong(self) -> bool:
-        """Whether numbers mean something else than the log says: nothing can be learnt from it as it is."""
+        """Whether numbers have another meaning than the log declares (joint, sign or unit).
+
+        Nothing can be learnt from such a log before it is corrected; other findings only limit what can be learnt.
+        """
         return self.kind in _WRONG

@@ -1,4 +1,7 @@
-"""Orders, signs, units, offsets, delays and the clock, by trying repairs; rounding and clipping of what is repaired."""
+"""Finds swapped joints, flipped signs, wrong units, offsets and delays by trying repairs; then drift and quantisation.
+
+Drift, quantisation and clipping are looked for in the repaired run, or degrees would look coarse.
+"""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -12,23 +15,25 @@ from envs.diagnosis.finding import MEASURED, Finding
 from envs.logs import Run
 from envs.segments import quantum_of, smoothed
 
-_MOST = 2.0
-_BETTER = 0.25  # by how much all parts together must agree better, in units of one joint's whole signal
-_SHARE = 0.1  # and by which share of what they disagree
+_MOST = 2.0  # disagreement of two signals that have opposite signs
+# A repair is believed where the disagreement falls by more than both.
+_BETTER = 0.25  # in units of one joint's whole signal
+_SHARE = 0.1  # of the disagreement before
 _MOST_REPAIRS = 3
 _UNITS = ("degrees", "radians twice", "millinewtonmetres")
-_ROWS = 250  # that the model is evaluated at, at most
+_ROWS = 250  # at which inverse dynamics are evaluated, at most
 _DELAYS_S = (0.004, 0.008, 0.012, 0.016, 0.024, 0.032, 0.045)
 _LEAST_OFFSET_RAD = 0.025
 _LEAST_DRIFT = 0.015
-_COARSE = 0.004  # share of a joint's motion: larger steps of an encoder hide what matters
-_CLIPPED = 0.01  # share of rows at a signal's own largest or smallest value
-_LEAST_CLIPPED = 8  # and number
+_COARSE = 0.004  # largest step of an encoder, as a share of the joint's range of motion
+# A signal is clipped where at least this share and this number of rows lie at its own largest or smallest value.
+_CLIPPED = 0.01
+_LEAST_CLIPPED = 8
 
 
 @dataclass(frozen=True)
 class _Repair:
-    """What is tried."""
+    """One repair to be tried: what it would mean, and the function that applies it."""
 
     kind: str
     signal: str
@@ -38,16 +43,26 @@ class _Repair:
 
 
 def physics(run: Run, joints: tuple[str, ...], model: mujoco.MjModel, held: bool) -> list[Finding]:
-    """Orders, signs, units, offsets and delays that a run agrees better without."""
+    """Finds the repairs after which a run agrees best with itself and with the model, and what else is wrong then.
+
+    Args:
+      run: a piece without structural defects (`structure`).
+      joints: names of the joints, in the log's order.
+      model: of the robot, suspended where its base is fixed.
+      held: whether the base is fixed, so that the model's inverse dynamics hold.
+
+    Returns:
+      Findings: repairs in the order in which they were made, then drift of the clock, quantisation and clipping.
+    """
     run, found = _thinned(run), []
-    # Accelerations behind coarse encoders say nothing.
+    # Coarse encoders make accelerations useless, and with them the comparison with the model.
     disagreement = _Disagreement(run, joints, model, held and not _is_coarse(run))
     now = disagreement(run)
     for _ in range(_MOST_REPAIRS):
         repairs = _repairs(run, disagreement)
         chain, repaired, then = _best([[repair] for repair in repairs], run, disagreement)
         if chain[0].kind in _UNITS or not _believed(now, then):
-            # Nothing agrees in wrong units, so what is wrong beside them does not show alone.
+            # Nothing agrees in wrong units, so a second error shows only once the units are repaired: try both at once.
             units = [repair for repair in repairs if repair.kind in _UNITS]
             others = [repair for repair in repairs if repair.kind in ("swapped joints", "flipped sign")]
             both = _best([[unit, other] for unit in units for other in others], run, disagreement)
@@ -57,12 +72,11 @@ def physics(run: Run, joints: tuple[str, ...], model: mujoco.MjModel, held: bool
             break
         found += [_as_finding(repair, joints) for repair in chain]
         run, now = repaired, then
-    # In the model's units, or degrees would look coarse.
     return [*found, *_drift(run), *_coarse(run, joints), *_clipped(run, joints)]
 
 
 def _best(chains: list[list[_Repair]], run: Run, disagreement: "_Disagreement") -> tuple[list[_Repair], Run, float]:
-    """The repairs, one after the other, after which a run disagrees least; that run; and how much it still does."""
+    """Returns the chain of repairs after which a run disagrees least, the repaired run, and its disagreement."""
     found = [(chain, reduce(lambda run, repair: repair.apply(run), chain, run)) for chain in chains]
     return min(((chain, one, disagreement(one)) for chain, one in found), key=lambda each: each[2])
 
@@ -72,7 +86,7 @@ def _believed(now: float, then: float) -> bool:
 
 
 def _thinned(run: Run) -> Run:
-    """No more rows than are needed, in the piece in which most is moved."""
+    """Keeps no more rows than are needed: the piece in which the joints move most."""
     count = 6 * _ROWS
     if len(run.time) <= count:
         return run
@@ -83,13 +97,13 @@ def _thinned(run: Run) -> Run:
 
 
 class _Disagreement:
-    """How much a run disagrees with itself and with the model, [0, 2] for every part and joint, summed.
+    """How much a run disagrees with itself and with the model: parts from 0 to 2 for every joint, summed.
 
     Args:
       run: as it was read; what is not in it is not examined.
-      joints: of the log.
+      joints: names of the joints, in the log's order.
       model: of the robot.
-      dynamics: whether torques are examined.
+      dynamics: whether torques are compared with the model's inverse dynamics.
     """
 
     def __init__(self, run: Run, joints: tuple[str, ...], model: mujoco.MjModel, dynamics: bool):
@@ -103,11 +117,11 @@ class _Disagreement:
         self._range = np.where(limited[:, None], span, [-np.inf, np.inf]).T
 
     def __call__(self, run: Run) -> float:
-        """Of a run."""
+        """Sums all parts over all joints."""
         return float(sum(part.sum() for part in self.parts(run).values()))
 
     def parts(self, run: Run) -> dict[str, np.ndarray]:
-        """By name, [joints]."""
+        """Computes the parts of the disagreement by name, [joints] each; those whose signals are there."""
         position, slope = np.moveaxis(smoothed(replace(run, signals={"q": run.signals["q"]})), 1, 0)
         found = {}
         if "dq" in run.signals:
@@ -126,16 +140,16 @@ class _Disagreement:
         return found
 
     def commanded(self, run: Run) -> np.ndarray | None:
-        """Torque of the controller, [rows, joints]; None where it has none that is known."""
+        """Torque that the controller commanded, [rows, joints] Nm; None of a servo or where there are no targets."""
         if not self._driven:
             return None
         speed = run.signals["dq"] if "dq" in run.signals else smoothed(run)[:, 1]
         return run.impedance().torque(run.signals["target"], run.signals["q"], speed)
 
     def needed(self, run: Run, position: np.ndarray, slope: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Torque that the model needs for the motion [some rows, joints], and which rows."""
+        """Torque that the model needs for the motion, [some rows, joints] Nm, and which rows these are."""
         acceleration = np.gradient(_together(slope), run.time, axis=0)
-        # The ends are not smoothed.
+        # At the ends the fit behind the smoothed states is one-sided.
         rows = np.unique(np.linspace(10, len(run.time) - 11, _ROWS).astype(int))
         found = np.empty((len(rows), len(self._dof)))
         for index, row in enumerate(rows):
@@ -147,20 +161,20 @@ class _Disagreement:
 
 
 def _together(values: np.ndarray) -> np.ndarray:
-    """Means over a few rows, [rows, joints]."""
+    """Moving mean over seven rows, [rows, joints]."""
     kernel = np.ones(7) / 7.0
     return np.stack([np.convolve(column, kernel, "same") for column in values.T], axis=1)
 
 
 def _apart(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """How far two signals [rows, joints] are apart, as a share of the mean of their root mean squares, [joints]."""
+    """Rms difference of two signals [rows, joints], over the mean of their rms, [joints]; at most 2."""
     difference = np.sqrt(((one - other) ** 2).mean(axis=0))
     size = 0.5 * (np.sqrt((one**2).mean(axis=0)) + np.sqrt((other**2).mean(axis=0)))
     return np.minimum(difference / np.maximum(size, 1e-9), _MOST)
 
 
 def _repairs(run: Run, disagreement: _Disagreement) -> list[_Repair]:
-    """Everything that is tried."""
+    """Lists every repair to be tried."""
     count = run.signals["q"].shape[1]
     measured = tuple(name for name in MEASURED if name in run.signals)
     groups = {"measured": measured} | {name: (name,) for name in (*MEASURED, "target") if name in run.signals}
@@ -183,12 +197,12 @@ def _repairs(run: Run, disagreement: _Disagreement) -> list[_Repair]:
 
 
 def _on(names: tuple[str, ...], change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Run], Run]:
-    """The run with some of its signals changed."""
+    """Returns a function that changes some signals of a run."""
     return lambda run: replace(run, signals={**run.signals, **{name: change(run.signals[name]) for name in names}})
 
 
 def _delays(run: Run, measured: tuple[str, ...]) -> list[_Repair]:
-    """What was measured, taken earlier; alone, and velocities alone."""
+    """Repairs of a delay: all measured signals taken earlier, or velocities alone."""
     period, found = float(np.median(np.diff(run.time))), []
     for label, names in {"measured": measured, "dq": ("dq",)}.items():
         for delay in _DELAYS_S if "target" in run.signals and set(names) <= set(measured) else ():
@@ -199,13 +213,16 @@ def _delays(run: Run, measured: tuple[str, ...]) -> list[_Repair]:
 
 
 def _earlier(names: tuple[str, ...], rows: int, run: Run) -> Run:
-    """The run with some of its signals taken some rows earlier."""
+    """Takes some signals of a run some rows earlier."""
     signals = {name: values[rows:] if name in names else values[:-rows] for name, values in run.signals.items()}
     return replace(run, time=run.time[:-rows], signals=signals)
 
 
 def _offsets(run: Run, disagreement: _Disagreement) -> list[_Repair]:
-    """Positions moved by what the controller's torque lacks in the mean."""
+    """Repairs of a constant offset of positions.
+
+    An offset shows as a constant difference of the controller's torque from what the model needs, kp times the offset.
+    """
     commanded = disagreement.commanded(run)
     if commanded is None or not disagreement.dynamics:
         return []
@@ -226,7 +243,7 @@ def _offsets(run: Run, disagreement: _Disagreement) -> list[_Repair]:
 
 
 def _drift(run: Run) -> list[Finding]:
-    """A clock that runs fast or slow, by what velocities say of positions at all joints alike."""
+    """Finds a clock that runs fast or slow: velocities and slopes of positions differ by one factor at all joints."""
     if "dq" not in run.signals:
         return []
     slope = smoothed(replace(run, signals={"q": run.signals["q"]}))[:, 1]
@@ -235,15 +252,17 @@ def _drift(run: Run) -> list[Finding]:
     apart = [_apart(run.signals["dq"], slope * factor).mean() for factor in (1.0, np.median(ratio))]
     if abs(drift) < _LEAST_DRIFT or np.ptp(ratio) > 0.5 * abs(drift) or apart[1] > 0.6 * apart[0]:
         return []
-    text = f"the clock runs {abs(drift):.1%} too {'fast' if drift > 0 else 'slow'}, by what velocities say of positions"
+    speed = "fast" if drift > 0 else "slow"
+    text = f"the clock drifts: it is {abs(drift):.1%} too {speed}, by velocities against positions"
     return [Finding("clock drift", "t", (), drift, text)]
 
 
 def _coarse(run: Run, joints: tuple[str, ...]) -> list[Finding]:
+    """Finds positions that were rounded more coarsely than the motion allows."""
     quantum = quantum_of(run.signals["q"])
     if not _is_coarse(run):
         return []
-    text = f"positions come in steps of {quantum:.3g} rad: what is smaller cannot be seen"
+    text = f"quantisation: positions come in steps of {quantum:.3g} rad; smaller motion cannot be seen"
     return [Finding("quantised", "q", joints, quantum, text)]
 
 
@@ -252,7 +271,7 @@ def _is_coarse(run: Run) -> bool:
 
 
 def _clipped(run: Run, joints: tuple[str, ...]) -> list[Finding]:
-    """Signals that stay at their own largest or smallest value, again and again."""
+    """Finds signals that return to their own largest or smallest value too often, short of the controller's limit."""
     found = []
     for name in ("q", "dq", "tau"):
         if name not in run.signals:
@@ -265,7 +284,8 @@ def _clipped(run: Run, joints: tuple[str, ...]) -> list[Finding]:
         for side, end in ((1.0, values.max(axis=0)), (-1.0, values.min(axis=0))):
             inward = side * (end - values)
             stays = (inward < 0.5 * quantum) & (np.abs(end) < 0.99 * limit)
-            # What is rounded comes back to the same values, but to its ends no more often than to those beside them.
+            # A rounded signal returns to every one of its values; a clipped one returns to its end more often than to
+            # the values beside it.
             beside = (inward < 3.5 * quantum).mean(axis=0) - stays.mean(axis=0)
             moving = np.ptp(values, axis=0) > 20 * quantum
             share = np.where(
@@ -274,19 +294,19 @@ def _clipped(run: Run, joints: tuple[str, ...]) -> list[Finding]:
                 0.0,
             )
             for joint in np.flatnonzero(share > _CLIPPED):
-                text = f"{name} of {joints[joint]} is cut off at {end[joint]:.4g}, in {share[joint]:.0%} of the rows"
+                text = f"{name}: {joints[joint]} is clipped at {end[joint]:.4g}, in {share[joint]:.0%} of the rows"
                 found.append(Finding("clipped", name, (joints[joint],), float(end[joint]), text))
     return found
 
 
 _SENTENCES: Mapping[str, str] = {
-    "swapped joints": "{signal}: {joints} are exchanged; say so under `columns` in meta.yaml",
-    "flipped sign": "{signal}: {joints} turns the other way; say so under `sign` in meta.yaml, or turn the column",
-    "degrees": "{signal}: angles are in degrees; say so under `units` in meta.yaml",
-    "radians twice": "{signal}: angles are 57 times too small: they were made radians twice",
-    "millinewtonmetres": "{signal}: torques are in mNm; say so under `units` in meta.yaml",
-    "late": "{signal}: what was measured is {size:.0f} ms late",
-    "offset": "{signal}: {joints} reads {size:+.3f} rad too much",
+    "swapped joints": "{signal}: {joints} are swapped; map their `columns` in meta.yaml",
+    "flipped sign": "{signal}: {joints} has a flipped sign; set its `sign` in meta.yaml, or negate the column",
+    "degrees": "{signal}: degrees for radians; set `units: {{angle: deg}}` in meta.yaml",
+    "radians twice": "{signal}: angles are 57 times too small; they were converted to radians twice",
+    "millinewtonmetres": "{signal}: torques are in mNm; set `units: {{torque: mNm}}` in meta.yaml",
+    "late": "{signal}: an apparent delay of {size:.0f} ms",
+    "offset": "{signal}: {joints} has a constant offset of {size:+.3f} rad",
 }
 
 

@@ -1,4 +1,7 @@
-"""Between the target and the torque of the motor."""
+"""Effects between the target and the motor's torque.
+
+Signals are [joints]: targets in rad (`command`), target less position in rad (`error`), motor torques in Nm (`torque`).
+"""
 
 import jax.numpy as jnp
 
@@ -9,46 +12,56 @@ _ACTUATOR = {"family": "actuator", "on": "joint"}
 
 
 def _torque_scale(values, torque, now, memory):
+    """torque' = ratio torque; `values` hold the logarithm of the ratio."""
     del now
     return torque * jnp.exp(values["ratio"]), memory
 
 
 def _torque_limit(values, torque, now, memory):
+    """torque' = clip(torque, -limit, limit); `values` hold 1 / limit, which is zero where there is none."""
     del now
     limit = 1.0 / jnp.maximum(values["torque_nm"], 1e-9)
     return jnp.clip(torque, -limit, limit), memory
 
 
 def _torque_speed(values, torque, now, memory):
-    """A motor's line: what it can give falls with speed by its back-EMF."""
+    """torque' = clip(torque, -limit - c speed, limit - c speed), a DC motor's torque-speed line.
+
+    The limit is the controller's; c is what the back electromotive force takes from it.
+    """
     drop = values["nm_s_per_rad"] * now.speed
     low, high = -now.limit - drop, now.limit - drop
-    # A motor that is off gives nothing, at any speed.
+    # Else the line would have a motor that is off brake or drive the joint.
     there = (values["nm_s_per_rad"] > 0) & (now.limit > 0)
     return jnp.where(there, jnp.clip(torque, low, high), torque), memory
 
 
 def _command_delay(values, target, now, memory):
+    """target'(t) = target(t - seconds)."""
     return delayed(memory, target, values["seconds"], now.dt)
 
 
 def _target_slew(values, target, now, memory):
+    """d target' / dt = clip((target - target') / dt, -rate, rate); `values` hold 1 / rate."""
     step = now.dt / jnp.maximum(values["rad_per_s"], 1e-9)
     memory = memory + jnp.clip(target - memory, -step, step)
     return memory, memory
 
 
 def _deadband(values, error, now, memory):
+    """error' = sign(error) max(|error| - width / 2, 0)."""
     del now
     return jnp.sign(error) * jnp.maximum(jnp.abs(error) - 0.5 * values["rad"], 0.0), memory
 
 
 def _gain_error(values, error, now, memory):
+    """error' = ratio error, which scales the proportional gain alone; `values` hold the logarithm of the ratio."""
     del now
     return error * jnp.exp(values["ratio"]), memory
 
 
 def _torque_lag(values, torque, now, memory):
+    """seconds d torque' / dt = torque - torque'."""
     return lagged(memory, torque, values["seconds"], now.dt)
 
 
@@ -62,7 +75,7 @@ ROWS = (
         sizes=(0.001, 0.008),
         act=_command_delay,
         start=delay_line,
-        sentence="Targets act later than they were sent.",
+        sentence="Targets act later than they are sent.",
         excited_by="steps and a chirp to 10 Hz at two controller gains",
         **_ACTUATOR,
     ),
@@ -73,7 +86,7 @@ ROWS = (
         sizes=(0.2, 0.6),
         act=_target_slew,
         start=as_it_is,
-        sentence="The controller follows its target no faster than at a certain speed.",
+        sentence="The controller limits how fast its target may move.",
         excited_by="steps of two sizes",
         **_ACTUATOR,
     ),
@@ -113,7 +126,7 @@ ROWS = (
         parameters=(Parameter(name="torque_nm", form="reciprocal", scale="torque", bounds=(0.0, 3.0), prior=0.3),),
         sizes=(0.25, 0.6),
         act=_torque_limit,
-        sentence="The motor gives no more than a certain torque.",
+        sentence="The motor's torque has a limit that the model does not know.",
         excited_by="saturating steps",
         **_ACTUATOR,
     ),
@@ -124,7 +137,7 @@ ROWS = (
         sizes=(0.001, 0.008),
         act=_torque_lag,
         start=as_it_is,
-        sentence="The motor's torque follows what the controller asks with a lag.",
+        sentence="The motor's torque follows the commanded torque with a lag.",
         excited_by="a chirp to 10 Hz at two controller gains",
         **_ACTUATOR,
     ),
@@ -134,8 +147,8 @@ ROWS = (
         parameters=(Parameter(name="ratio", form="ratio", bounds=(-1.0, 1.0), prior=0.3),),
         sizes=(0.05,),
         act=_torque_scale,
-        sentence="The motor gives a share of the torque that it is asked for.",
-        excited_by="a motor-off swing beside driven motion, which tells torque from mass",
+        sentence="The motor gives a fixed share of the commanded torque.",
+        excited_by="a motor-off swing beside driven motion, which distinguishes torque from mass",
         **_ACTUATOR,
     ),
 )

@@ -1,4 +1,4 @@
-"""Between the feet and the ground; seen on a free base alone."""
+"""Effects between the feet and the ground. They show on a free base alone, not on the test rig."""
 
 from jaxtune.types import Effect, Parameter
 
@@ -21,7 +21,7 @@ ROWS = (
         on="foot",
         parameters=(Parameter(name="seconds", bounds=(-0.005, 0.1), prior=0.01, fields=("geom_solref",), column=0),),
         sizes=(0.005,),
-        sentence="The ground gives way and comes back more slowly.",
+        sentence="The ground is softer: it gives way and recovers more slowly.",
         excited_by="stepping in place, harder and softer",
         **_CONTACT,
     ),

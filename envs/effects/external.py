@@ -1,4 +1,7 @@
-"""From outside the robot."""
+"""Effects from outside the robot: forces on its links and torques on its joints.
+
+The signal is a `envs.chain.Wrench`; effects add to it.
+"""
 
 import jax.numpy as jnp
 
@@ -8,18 +11,19 @@ _EXTERNAL = {"family": "external", "enters": "wrench"}
 
 
 def _drag(values, wrench, now, memory):
-    """A force at every link's centre, against its velocity."""
+    """force = -c v at every link's centre of mass, v its velocity."""
     force = -values["n_s_per_m"][:, None] * now.body_velocity
     return wrench.replace(force=wrench.force + force), memory
 
 
 def _constant_push(values, wrench, now, memory):
+    """torque = a constant."""
     del now
     return wrench.replace(torque=wrench.torque + values["nm"]), memory
 
 
 def _residual_torque(values, wrench, now, memory):
-    """What nobody has a name for: a torque that depends on where the joint is and how it moves."""
+    """torque = a + b sin q + c cos q + d tanh(dq / 0.1 rad/s) + e dq: any smooth torque of position and velocity."""
     torque = (
         values["constant_nm"]
         + values["sine_nm"] * jnp.sin(now.position)
@@ -42,11 +46,13 @@ RESIDUAL = Effect(
     ),
     sizes=(0.05,),
     act=_residual_torque,
-    sentence="Something that the library has no name for acts on the joint.",
+    sentence="A torque acts on the joint that no effect of the library explains.",
     excited_by="a longer log of this joint in more postures",
     **_EXTERNAL,
 )
-"""No hypothesis, but what is left where none fits: it names nothing, and is bounded."""
+"""A torque on every joint for what no effect of the library explains.
+
+It is no hypothesis and names no cause: discovery fits it last, within bounds, where a misfit is left."""
 
 ROWS = (
     Effect(
@@ -55,7 +61,7 @@ ROWS = (
         parameters=(Parameter(name="n_s_per_m", scale="drag", bounds=(0.0, 5.0), prior=0.3),),
         sizes=(0.05,),
         act=_drag,
-        sentence="Something drags on the link in proportion to its speed, a cable or the air.",
+        sentence="A cable or the air drags on the link in proportion to its speed.",
         excited_by="a motor-off swing and fast motion of several joints at once",
         **_EXTERNAL,
     ),
@@ -65,7 +71,7 @@ ROWS = (
         parameters=(Parameter(name="nm", scale="torque", bounds=(-5.0, 5.0), prior=0.3),),
         sizes=(0.03,),
         act=_constant_push,
-        sentence="A constant torque pulls at the joint.",
+        sentence="A constant torque acts on the joint.",
         excited_by="postures on both sides of the vertical at two controller gains",
         **_EXTERNAL,
     ),

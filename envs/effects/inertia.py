@@ -1,4 +1,4 @@
-"""Masses, and where they are."""
+"""Effects of masses and of where they are; they change the model's own fields."""
 
 from jaxtune.types import Effect, Parameter
 
@@ -22,7 +22,7 @@ ROWS = (
             for column, axis in enumerate("xyz")
         ),
         sizes=(0.005,),
-        sentence="The link's centre of mass is elsewhere.",
+        sentence="The link's centre of mass is not where the model has it.",
         excited_by="slow motion through postures on both sides of the vertical",
         **_INERTIA,
     ),
@@ -30,7 +30,7 @@ ROWS = (
         name="payload",
         parameters=(Parameter(name="kg", scale="mass", bounds=(0.0, 4.0), prior=0.3, fields=("body_mass",)),),
         sizes=(0.05,),
-        sentence="Something heavy and small hangs at the link's centre.",
+        sentence="A small heavy object is attached at the link's centre of mass.",
         excited_by="a motor-off swing, and postures of high gravity torque",
         **_INERTIA,
     ),

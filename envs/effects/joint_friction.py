@@ -1,7 +1,7 @@
-"""Friction in the joints.
+"""Effects of friction in the joints.
 
-Dry friction is a bound on a torque: the stage hands the bound [joints] in Nm from effect to effect, and the engine
-solves for the torque within it that brings the joint to rest.
+Dry friction is a bound on a torque. The signal is this bound, [joints] Nm; effects add to it, and the engine solves for
+the torque within the bound that brings the joint to rest.
 """
 
 import jax.numpy as jnp
@@ -12,17 +12,18 @@ _JOINT_FRICTION = {"family": "joint_friction", "on": "joint"}
 
 
 def _coulomb(values, bound, now, memory):
+    """bound' = bound + torque."""
     del now
     return bound + values["torque_nm"], memory
 
 
 def _stribeck(values, bound, now, memory):
-    """Extra friction that decays with speed, exp(-|v| / v_s)."""
+    """bound' = bound + torque exp(-|speed| / Stribeck speed)."""
     return bound + values["torque_nm"] * jnp.exp(-jnp.abs(now.speed) / values["speed_rad_s"]), memory
 
 
 def _load_friction(values, bound, now, memory):
-    """In proportion to what loads the gears: the motor's torque or the robot's weight and inertia, the larger."""
+    """bound' = bound + ratio load, the load being the larger of motor torque and of gravity and Coriolis torque."""
     return bound + values["ratio"] * now.load, memory
 
 
@@ -33,7 +34,7 @@ ROWS = (
         parameters=(Parameter(name="torque_nm", scale="torque", bounds=(0.0, 5.0), prior=0.3),),
         sizes=(0.03, 0.3),
         act=_coulomb,
-        sentence="The joint needs a fixed torque to get going and loses the same torque while it moves.",
+        sentence="The joint needs a fixed torque to start moving and loses the same torque while it moves.",
         excited_by="slow triangular reversals",
         **_JOINT_FRICTION,
     ),
@@ -67,7 +68,7 @@ ROWS = (
         parameters=(Parameter(name="ratio", bounds=(0.0, 0.9), prior=0.2),),
         sizes=(0.03, 0.2),
         act=_load_friction,
-        sentence="The gears rub more the more torque they pass on.",
+        sentence="Friction in the gears grows with the torque that they transmit.",
         excited_by="the same reversals in postures of low and of high gravity torque",
         **_JOINT_FRICTION,
     ),

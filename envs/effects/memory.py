@@ -1,36 +1,59 @@
-"""What effects remember: lines of delayed signals, and first-order lags."""
+"""Memories that effects share: delay lines and first-order lags."""
 
 import jax
 import jax.numpy as jnp
 
 LONGEST_S = 0.04
+"""Longest delay that a line can hold, in s; simulations start with as much history."""
 
 
 def as_it_is(values, signal: jax.Array, dt: float) -> jax.Array:
-    """The memory of a filter that has always been given this signal."""
+    """Starts the memory of a lag or a slew limit whose input has always been this signal."""
     del values, dt
     return signal
 
 
 def delay_line(values, signal: jax.Array, dt: float) -> jax.Array:
-    """A line [steps, ...] that has always held this signal, newest first."""
+    """Starts a delay line [steps, ...], newest first, whose input has always been this signal."""
     del values
     return jnp.broadcast_to(signal, (round(LONGEST_S / dt) + 1, *signal.shape))
 
 
 def delayed(line: jax.Array, signal: jax.Array, seconds: jax.Array, dt: float) -> tuple[jax.Array, jax.Array]:
-    """The signal [..., joints] as it was `seconds` [joints] ago, between samples in proportion; and the line."""
+    """Delays a signal: signal(t - seconds), interpolated linearly between samples.
+
+    It is differentiable with respect to the delay, which a line read at a whole number of steps would not be.
+
+    Args:
+      line: [steps, ..., joints], newest first.
+      signal: [..., joints], of this step.
+      seconds: [joints], from 0 to `LONGEST_S`.
+      dt: step of the simulation in s.
+
+    Returns:
+      The delayed signal, and the line with this step's signal in front.
+    """
     line = jnp.concatenate([signal[None], line[:-1]])
     steps = jnp.clip(seconds / dt, 0.0, len(line) - 1)
     age = jnp.arange(len(line), dtype=signal.dtype)[:, None]
-    # A triangle about the delay: the two samples beside it, in proportion.
+    # A triangle about the delay picks the two samples beside it, in proportion.
     weight = jnp.maximum(1.0 - jnp.abs(age - steps), 0.0)
     weight = weight.reshape(len(line), *(1,) * (signal.ndim - 1), -1)
     return (weight * line).sum(axis=0), line
 
 
 def lagged(memory: jax.Array, signal: jax.Array, seconds: jax.Array, dt: float) -> tuple[jax.Array, jax.Array]:
-    """A first-order lag, exact for a signal that is held; none where the time constant is zero."""
+    """Filters a signal by a first-order lag, seconds dy/dt = signal - y, exactly for a signal that is held over a step.
+
+    Args:
+      memory: y after the step before, [..., joints].
+      signal: [..., joints], of this step.
+      seconds: time constant [joints]; the signal passes unchanged where it is zero.
+      dt: step of the simulation in s.
+
+    Returns:
+      y after this step, twice: as the signal and as the memory.
+    """
     stays = jnp.where(seconds > 0, jnp.exp(-dt / jnp.maximum(seconds, 1e-9)), 0.0)
     memory = signal + stays * (memory - signal)
     return memory, memory

@@ -1,7 +1,7 @@
-"""Between the joint and what is read of it, by the controller and by the log alike.
+"""Effects between the joint and its reading, by which the controller and the log are misled alike.
 
-The signal is [2, joints], positions in rad and velocities in rad/s. `undo` takes what was read back to what was there,
-so that a simulation can start where the robot was.
+The signal is [2, joints], positions in rad and velocities in rad/s. `undo` recovers the true motion from readings, so
+that a simulation can start where the robot was.
 """
 
 import jax
@@ -14,21 +14,24 @@ _SENSING = {"family": "sensing"}
 
 
 def _encoder_bias(values, readings, now, memory):
+    """q' = q + bias; velocities are as they were."""
     del now
     return readings.at[0].add(values["rad"]), memory
 
 
 def _undo_bias(values, readings, dt):
+    """q = q' - bias."""
     del dt
     return readings.at[:, 0].add(-values["rad"])
 
 
 def _sensor_delay(values, readings, now, memory):
+    """readings'(t) = readings(t - seconds)."""
     return delayed(memory, readings, values["seconds"], now.dt)
 
 
 def _undo_delay(values, readings, dt):
-    """What will be read one delay later; past the end, the last that was."""
+    """Takes the reading of one delay later; past the end, the last one."""
     count = len(readings)
     at = jnp.clip(jnp.arange(count)[:, None] + values["seconds"] / dt, 0, count - 1)
     interpolate = jax.vmap(jnp.interp, in_axes=(1, None, 1), out_axes=1)
@@ -37,15 +40,17 @@ def _undo_delay(values, readings, dt):
 
 
 def _sensor_lag(values, readings, now, memory):
+    """seconds d readings' / dt = readings - readings'."""
     return lagged(memory, readings, values["seconds"], now.dt)
 
 
 def _undo_lag(values, readings, dt):
+    """readings = readings' + seconds d readings' / dt."""
     return readings + values["seconds"] * jnp.gradient(readings, dt, axis=0)
 
 
 def _imu_tilt(values, gravity, now, memory):
-    """Turns the IMU by small angles about the body's x and y axes."""
+    """gravity' = gravity + turn gravity, for small angles about the body's x and y axes; the IMU is turned."""
     del now
     roll, pitch = values["roll_rad"][0], values["pitch_rad"][0]
     turn = jnp.array([[0.0, 0.0, -pitch], [0.0, 0.0, roll], [pitch, -roll, 0.0]])
@@ -63,7 +68,7 @@ ROWS = (
         sizes=(0.004,),
         act=_encoder_bias,
         undo=_undo_bias,
-        sentence="The encoder's zero is not the joint's.",
+        sentence="The encoder's zero differs from the joint's.",
         excited_by="postures on both sides of the vertical at two controller gains",
         **_SENSING,
     ),
@@ -76,7 +81,7 @@ ROWS = (
         act=_sensor_delay,
         start=delay_line,
         undo=_undo_delay,
-        sentence="Positions are read later than they were.",
+        sentence="Positions and velocities are read late.",
         excited_by="a chirp to 10 Hz at two controller gains",
         **_SENSING,
     ),
@@ -89,7 +94,7 @@ ROWS = (
         act=_sensor_lag,
         start=as_it_is,
         undo=_undo_lag,
-        sentence="Positions are read through a filter.",
+        sentence="Positions and velocities are read through a low-pass filter.",
         excited_by="a chirp to 10 Hz at two controller gains",
         **_SENSING,
     ),

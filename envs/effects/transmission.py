@@ -1,62 +1,70 @@
-"""Between the motor and the joint.
+"""Effects between the motor and the joint: backlash, compliance, and the rotor's inertia.
 
-Encoders sit on the motor. Its rotor is part of the joint's armature, so play and springs let it run ahead of the joint
-while the joint goes on without it: how far follows from the balance of torques on the rotor over one step, where the
-controller answers with its stiffness and damping. The memory is that offset in rad and its rate in rad/s, [2, joints].
+Encoders sit on the motor. Backlash and compliance let the motor run ahead of its joint by an offset o. The rotor is
+part of the joint's armature, so o follows from the balance of torques on the rotor over one step, in which the
+controller reacts to o with its stiffness kp and damping kd. With J the rotor's inertia and dt the step, every rad of
+offset costs
+
+    R = kp + (kd + J / dt) / dt
+
+of torque (`_resistance`). The memory is the offset in rad and its rate in rad/s, [2, joints].
 """
 
 import jax.numpy as jnp
 
 from jaxtune.types import Effect, Parameter
 
-_SLOPE_S = 0.006
+_SLOPE_S = 0.006  # over which the rate of a measured motor's offset is averaged
 _TRANSMISSION = {"family": "transmission", "on": "joint"}
 
 
 def _resistance(now):
-    """Torque that a motor loses for every rad that it runs ahead within a step."""
+    """R: torque that a motor loses for every rad that it runs ahead within a step, [joints] Nm/rad."""
     return jnp.maximum(now.stiffness + (now.damping + now.rotor / now.dt) / now.dt, 1e-9)
 
 
 def _pressing(torque, now, rate):
-    """What would press on the gears if the motor kept up with the joint."""
+    """Torque that would press on the gears if the motor kept up with the joint, [joints] Nm."""
     return torque - now.carried + now.rotor * rate / now.dt
 
 
 def _passed(torque, now, memory, following):
-    """What moves the joint, of whose inertia the rotor is a part."""
+    """Torque that moves the joint, [joints] Nm: the motor's less what its offset took within the step."""
     offset, rate = memory
     return torque + now.rotor * rate / now.dt - _resistance(now) * (following - offset)
 
 
 def _backlash(values, torque, now, memory):
+    """o' = clip(o + pressing / R, -rad / 2, rad / 2): inside the play the motor runs free, at its ends it pushes."""
     offset, rate = memory
     half = 0.5 * values["rad"]
     following = jnp.clip(offset + _pressing(torque, now, rate) / _resistance(now), -half, half)
-    # Of a motor that was measured nobody knows when it let go.
+    # When a measured motor left its side of the play is unknown, so its rate starts at zero.
     rate = jnp.where(now.measured, 0.0, (following - offset) / now.dt)
     return _passed(torque, now, memory, following), jnp.stack([following, rate])
 
 
 def _compliance(values, torque, now, memory):
+    """A spring of stiffness k = 1 / softness: o' = softness (pressing + R o) / (1 + softness R)."""
     offset, rate = memory
     softness = values["nm_per_rad"]
     resistance = _resistance(now)
     following = softness * (_pressing(torque, now, rate) + resistance * offset) / (1.0 + softness * resistance)
     fresh = (following - offset) / now.dt
-    # Of a motor that was measured the torque is known row by row: its slope takes a few.
+    # The torque of a measured motor is known only row by row, so its slope is averaged over a few.
     rate = jnp.where(now.measured, rate + now.dt / _SLOPE_S * (fresh - rate), fresh)
     return _passed(torque, now, memory, following), jnp.stack([following, rate])
 
 
 def _taken_up(values, torque, dt):
-    """The motor leans on the side of the play to which its torque drives it."""
+    """Starts with the motor on the side of the play to which its torque drives it."""
     del dt
     offset = 0.5 * values["rad"] * jnp.sign(torque)
     return jnp.stack([offset, jnp.zeros_like(offset)])
 
 
 def _wound_up(values, torque, dt):
+    """Starts with the spring wound up by the motor's torque: o = softness torque."""
     del dt
     return jnp.stack([values["nm_per_rad"] * torque, jnp.zeros_like(torque)])
 
@@ -69,7 +77,7 @@ ROWS = (
         sizes=(0.003, 0.02),
         act=_backlash,
         start=_taken_up,
-        sentence="The gears have play: the motor turns a little before the joint does.",
+        sentence="The gears have backlash: the motor turns a little before the joint does.",
         excited_by="slow triangular reversals through the posture without gravity torque",
         **_TRANSMISSION,
     ),
@@ -89,7 +97,7 @@ ROWS = (
         enters="model",
         parameters=(Parameter(name="kg_m2", scale="inertia", bounds=(-0.5, 5.0), prior=0.3, fields=("dof_armature",)),),
         sizes=(0.03,),
-        sentence="The motor's rotor weighs more, seen through the gears, than the model says.",
+        sentence="The rotor's inertia, seen through the gears, differs from the model's.",
         excited_by="a chirp to 10 Hz at two controller gains",
         **_TRANSMISSION,
     ),

@@ -1,4 +1,4 @@
-"""A servo that turns a pendulum: the bench for one joint."""
+"""A servo that turns a pendulum: the model of the bench on which single motors are measured (`envs.logs.xl330`)."""
 
 from pathlib import Path
 

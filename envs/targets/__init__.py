@@ -1,1 +1,6 @@
-"""Where measured episodes come from."""
+"""Targets: where measured episodes come from.
+
+`protocol` says what a target is. `mjx`, `mujoco_c` and `bullet` are simulated robots that hide their parameters, each
+in another engine; `host` is what the last two share. `recorded` makes episodes of the same form from logs of a robot
+that walked.
+"""
