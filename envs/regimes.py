@@ -31,17 +31,22 @@ def regimes(run: Run) -> np.ndarray:
 
 
 def control_torque(run: Run, position: np.ndarray, speed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """What the controller asked for and the most it could have, [rows, joints] Nm."""
-    gains = run.controller.gains
+    """Computes the torque that the controller commanded, and the largest that it could have commanded.
+
+    Of a run without targets the recorded torque is what was commanded, and nothing limited it.
+
+    Args:
+      run: as it was read.
+      position: [rows, joints] rad, what the controller is taken to have read.
+      speed: [rows, joints] rad/s, likewise.
+
+    Returns:
+      Torque and limit, [rows, joints] Nm each.
+    """
+    controller = run.impedance()
     if "target" not in run.signals:
-        return run.signals["tau"], np.full(position.shape, np.inf)
-    on = run.signals.get("enabled", np.ones(len(position)))[:, None]
-    error = run.signals["target"] - position
-    if run.controller.kind == "servo":
-        limit = on * run.signals["volts"][:, None] * gains["kt"] / gains["resistance_ohm"] * np.ones_like(error)
-        return limit * np.clip(gains["gain"] * error, -1, 1), limit
-    limit = np.where(on > 0, gains["torque_limit_nm"] * np.ones_like(error), 0.0)
-    return np.clip(on * (gains["kp"] * error - gains["kd"] * speed), -limit, limit), limit
+        return run.signals["tau"], controller.limit
+    return controller.torque(run.signals["target"], position, speed), controller.limit
 
 
 def _rms(values: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""A robot on the test rig, hung or clamped, with every effect of the library built in.
+"""A robot on the test rig, suspended or clamped, with every effect of the library built in.
 
 An effect that is not there has coordinates of zero and changes nothing, so one compiled program serves all hypotheses:
 what is missing is a vector.
@@ -14,14 +14,15 @@ import mujoco
 import numpy as np
 from mujoco import mjx
 
-from envs import domain, sensing
+from envs import sensing
 from envs.chain import MIN_FRICTION_NM, Chain
 from envs.effects import EVERY
 from envs.effects.memory import LONGEST_S
 from envs.segments import Segment
+from jaxtune.mjx import parameters
 from jaxtune.types import Effect, Parameter
 
-Coordinates = Mapping[str, Mapping[str, jax.Array]]
+ByEffect = Mapping[str, Mapping[str, jax.Array]]
 """Coordinates by effect and parameter, [places] each."""
 
 # Of the solver. With friction in every joint that is 0.003 of a floor unit from twice as many; with four line searches
@@ -56,7 +57,7 @@ class Rig:
         joints: Sequence[str],
         control_hz: float,
     ):
-        model = hung(spec)
+        model = suspended(spec)
         self.control_hz = control_hz
         self.dt = 1.0 / control_hz / np.ceil(1.0 / control_hz / _LONGEST_STEP_S - 1e-9)
         model.opt.timestep = self.dt
@@ -78,7 +79,7 @@ class Rig:
             model.joint(i).name or f"joint {i}" for i in range(model.njnt) if model.jnt_qposadr[i] not in self.qpos
         )
         # MJX solves for friction only in joints that had some when the model was put on the device.
-        device = hung(spec)
+        device = suspended(spec)
         device.opt.timestep, device.opt.disableflags = self.dt, model.opt.disableflags
         device.opt.iterations, device.opt.ls_iterations = _ITERATIONS, _LINE_SEARCHES
         device.dof_frictionloss[self.dof] = np.maximum(model.dof_frictionloss[self.dof], MIN_FRICTION_NM)
@@ -138,7 +139,7 @@ class Rig:
             body = self.mj_model.body_parentid[body]
         return found
 
-    def nominal(self) -> dict[Axis, float]:
+    def prior_sd(self) -> dict[Axis, float]:
         """The parameters that every model has, and how far they may be off: a standard deviation in coordinates.
 
         A tenth of the nominal value, for every link's mass and every joint's armature, damping, friction and
@@ -157,7 +158,7 @@ class Rig:
                     spread[axis] = share * float(value / self.scale(row, row.parameters[0])[axis.index])
         return spread
 
-    def model(self, values: Coordinates) -> mjx.Model:
+    def model(self, values: ByEffect) -> mjx.Model:
         """The model with what effects do to its fields."""
         entries, params = {}, {}
         for name, row in self.effects.items():
@@ -165,7 +166,7 @@ class Rig:
                 continue
             for parameter in row.parameters:
                 key = f"{name}.{parameter.name}"
-                entries[key] = domain.Entry(
+                entries[key] = parameters.Entry(
                     name=key,
                     kind=row.on,
                     targets=self.places[row.on],
@@ -176,24 +177,24 @@ class Rig:
                 )
                 inner = values[name][parameter.name]
                 params[key] = jnp.exp(inner) if parameter.form == "ratio" else inner
-        return domain.apply(self._model, params, entries)
+        return parameters.apply(self._model, params, entries)
 
     def inner(self, vectors: np.ndarray) -> np.ndarray:
         """What the physics reads of coordinates [n, axes], [n, axes]."""
         trees = [self.values(self.tree(vector)) for vector in vectors]
         return np.array([np.concatenate([leaf for row in tree.values() for leaf in row.values()]) for tree in trees])
 
-    def values(self, coordinates: Coordinates) -> dict:
+    def values(self, coords: ByEffect) -> ByEffect:
         """What the physics reads of coordinates."""
         return {
             name: {
-                parameter.name: parameter.inner(coordinates[name][parameter.name], self.scale(row, parameter))
+                parameter.name: parameter.inner(coords[name][parameter.name], self.scale(row, parameter))
                 for parameter in row.parameters
             }
             for name, row in self.effects.items()
         }
 
-    def simulate(self, values: Coordinates, segment: Segment) -> dict[str, jax.Array]:
+    def simulate(self, values: ByEffect, segment: Segment) -> dict[str, jax.Array]:
         """Moves the robot through a segment.
 
         Args:
@@ -245,7 +246,7 @@ class Rig:
         return read | {"gravity": jnp.broadcast_to(gravity, (len(step), 3))}
 
 
-def hung(spec: mujoco.MjSpec) -> mujoco.MjModel:
+def suspended(spec: mujoco.MjSpec) -> mujoco.MjModel:
     """A robot without its free joint and without contacts."""
     spec = spec.copy()
     free = [joint for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_FREE]

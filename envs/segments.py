@@ -184,30 +184,15 @@ class _Prepared:
         self._run, self._dt = run, dt
         self._states = smoothed(run)
         joints = run.signals["q"].shape[1]
-        on = run.signals.get("enabled", np.ones(len(run.time)))[:, None] * np.ones(joints)
-        gains = run.controller.gains
+        controller = run.impedance()
         none = np.zeros((len(run.time), joints))
-        if "target" not in run.signals:
-            numbers = {"stiffness": none, "damping": none, "limit": none + np.inf, "emf": none}
-        elif run.controller.kind == "pd":
-            numbers = {
-                "stiffness": on * gains["kp"],
-                "damping": on * gains["kd"],
-                "limit": np.where(on > 0, gains["torque_limit_nm"], 0.0),
-                "emf": none,
-            }
-        else:
-            stall = on * run.signals["volts"][:, None] * gains["kt"] / gains["resistance_ohm"]
-            numbers = {
-                "stiffness": stall * gains["gain"],
-                "damping": none,
-                "limit": stall,
-                "emf": on * gains["kt"] ** 2 / gains["resistance_ohm"],
-            }
         self._held = {
             "target": run.signals.get("target", none),
             "feed": none if "target" in run.signals else run.signals["tau"],
-            **numbers,
+            "stiffness": controller.stiffness,
+            "damping": controller.damping,
+            "limit": controller.limit,
+            "emf": controller.back_emf,
         }
 
     def segment(self, start: int, rows: np.ndarray, after: int) -> Segment:

@@ -88,7 +88,7 @@ def observe(
     return jnp.concatenate([parts[name] * scale for name, scale in LAYOUT.items()])
 
 
-def with_request(obs: jax.Array, command: jax.Array, phase: jax.Array) -> jax.Array:
+def with_command(obs: jax.Array, command: jax.Array, phase: jax.Array) -> jax.Array:
     """The observation [40] that another command [3] and another gait clock [2] would have made."""
     return obs.at[3:6].set(command * LAYOUT["command"]).at[36:40].set(clock(phase) * LAYOUT["clock"])
 

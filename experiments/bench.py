@@ -1,6 +1,6 @@
-"""Speeds, and how often the gate rings: `python -m experiments.bench speed`, `... targets`, `... logs`, `... alarm`.
+"""Measures speeds, and how often the gate rejects: `python -m experiments.bench speed`, or `targets`, `logs`, `alarm`.
 
-Ratios come from one run on one machine; nothing here is a test.
+Speeds are facts about one machine on one day: compare ratios within one run. None of them is asserted in a test.
 """
 
 import dataclasses
@@ -35,7 +35,7 @@ FIELDS = ("novelty", "threshold", "p_value")
 
 @dataclass(frozen=True, kw_only=True)
 class Args:
-    """Measures one thing and writes it as JSON."""
+    """Measures one thing, prints it as a table and writes it as JSON."""
 
     what: tyro.conf.Positional[Literal["speed", "targets", "logs", "alarm"]]
     """speed: training steps a second with both physics presets. targets: steps a second of every engine that is
@@ -49,11 +49,14 @@ class Args:
     seeds: int = 10
     """Gate calls for each target."""
     radius: float = 0.2
-    """Radius of the alarm's distribution, in log space."""
+    """Radius of the distribution in `alarm`, in log space."""
 
 
 def speed(args: Args) -> dict:
-    """Environment steps a second of whole PPO updates, compilation apart."""
+    """Measures environment steps a second of whole PPO updates (rollout and learning), with both physics presets.
+
+    The first call compiles and is listed apart; the speed is that of the fastest of three more.
+    """
     rows = {}
     for physics in ("exact", "fast"):
         sizes = preset(args.preset)
@@ -75,7 +78,10 @@ def speed(args: Args) -> dict:
 
 
 def targets(args: Args) -> dict:
-    """Steps a second of the shipped policy's episodes in every engine, at sub-steps of 1 ms, compilation apart."""
+    """Measures steps a second of whole episodes in every engine that is installed, at sub-steps of 1 ms.
+
+    The policy is the shipped one, because a robot that falls at once makes an engine look fast. Compilation is apart.
+    """
     sizes = preset(args.preset)
     sizes = dataclasses.replace(sizes, task=dataclasses.replace(sizes.task, physics="exact"))
     learner = Learner(sizes, chosen("foot_friction"))
@@ -99,7 +105,10 @@ def targets(args: Args) -> dict:
 
 
 def logs(args: Args) -> dict:
-    """Seconds to read ten minutes of 40 columns at 1 kHz, a hundredth of that with the preset `smoke`, by format."""
+    """Measures how long reading a log takes, by format: ten minutes of 40 columns at 1 kHz.
+
+    With the preset `smoke` it is a hundredth of that.
+    """
     rows, joints = 600_000 // (100 if args.preset == "smoke" else 1), constants.JOINTS
     rng = np.random.default_rng(0)
     signals = {name: rng.standard_normal((rows, len(joints))) for name in ("q", "dq", "target", "tau", "action")}
@@ -125,7 +134,10 @@ def logs(args: Args) -> dict:
 
 
 def alarm(args: Args) -> dict:
-    """First gate calls with the target outside the radius, at its centre and drawn within it."""
+    """Counts how often a first gate call rejects: target outside the radius, at its centre, and drawn within it.
+
+    The share of rejections within the radius is the false-alarm rate, outside it the power.
+    """
     sizes = preset(args.preset)
     learner = Learner(sizes, chosen("legs6"))
     policy = starting_policy(args.policy, learner)
@@ -148,7 +160,7 @@ def alarm(args: Args) -> dict:
         measured = learner.simulate(key_measure, policy, jax.tree.map(lambda x: jnp.repeat(x, each), targets))
         sets = jax.tree.map(lambda x: x.reshape(-1, each, *x.shape[1:]), measured)
         collected = machine.collect(key_collect, policy, dist)
-        # The model is trained once: only its score depends on the set.
+        # The verification model is trained once, since only the score depends on the measured set.
         gate = jax.vmap(lambda one: tuner.calibrated_gate(key_verify, sizes.tuner, collected, one, tuner.knobs()))
         return gate(sets)
 
@@ -170,7 +182,7 @@ def alarm(args: Args) -> dict:
 
 
 def main(args: Args) -> None:
-    """Measures, prints and writes."""
+    """Measures what was asked for, prints it and writes it."""
     checkpoint.set_up_compiler(preset(args.preset).xla_flags)
     begin = time.monotonic()
     rows = {"speed": speed, "targets": targets, "logs": logs, "alarm": alarm}[args.what](args)

@@ -1,7 +1,7 @@
-"""Names what a model lacks: `python -m experiments.discover --logs LOG [LOG ...] --out DIR`.
+"""Names what a model lacks, from measured logs: `python -m experiments.discover --logs LOG [LOG ...] --out DIR`.
 
-Reads measured logs, finds where simulation and measurement disagree, names the missing effect, adds it to the model and
-shows on runs that nothing was fitted to what that is worth; or says that nothing is missing, or something unnamed.
+It finds where simulation and measurement disagree, names the missing effect, adds it to the model, and shows on runs
+that nothing was fitted to what that is worth. Or it says that nothing is missing, or something without a name.
 """
 
 import json
@@ -22,22 +22,22 @@ _SHOWN = 12  # cells in the summary
 
 @dataclass(frozen=True, kw_only=True)
 class Args:
-    """Finds what a model lacks, from measured logs of the robot on the rig."""
+    """Finds what a model lacks, from measured logs of the robot, suspended or clamped."""
 
     logs: tuple[Path, ...]
     """Folders of logs of one robot; a folder of the XL330 pendulum's JSON files will do as well."""
     out: Path = Path("runs/discover")
     """Folder of the results; the same command with the same folder goes on after the last accepted effect."""
     horizons: tuple[float, ...] = HORIZONS_S
-    """Lengths in s of the segments that are simulated, three of them."""
+    """Lengths in s of the segments that are simulated: three, rising."""
     healthy: int = 20
-    """Simulated logs in which nothing is missing; they make the floor and the threshold."""
+    """Number of simulated null logs, in which nothing is missing. They set the noise floor and the thresholds."""
     seed: int = 0
     """Seed of everything random."""
 
 
 def main(args: Args) -> None:
-    """Asks, answers, proves, and writes it down."""
+    """Sets the question up, discovers, and writes summary, details, model and page."""
     checkpoint.set_up_compiler(checkpoint.a_device_a_core())
     began = time.monotonic()
     log = gathered(args.logs)

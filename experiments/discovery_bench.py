@@ -1,9 +1,9 @@
-"""The blind benchmark: `python -m experiments.discovery_bench --size smoke --out DIR`.
+"""Measures blind how often discovery is right: `python -m experiments.discovery_bench --size smoke --out DIR`.
 
-Hides an effect in a robot that another engine moves (`experiments.discovery.blind_robots`), writes a log as a user would and the truth
-into a folder that only the scorer reads, has discovery work on the log and the nominal model, and scores what it says.
-Every case is a file of its own: the same command goes on where it stopped, and `--piece 0/2` and `--piece 1/2` share
-the work between two processes.
+It hides an effect in a robot that another engine moves, writes a log as a user would and the truth into a folder that
+only the scorer reads, has discovery work on the log and the nominal model, and scores what it says. Every case is a
+file of its own: the same command goes on where it stopped, and `--piece 0/2` and `--piece 1/2` share the work between
+two processes.
 """
 
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ from experiments.discovery.scores import shown
 
 @dataclass(frozen=True, kw_only=True)
 class Args:
-    """Hides effects, has them found, and counts."""
+    """Hides effects in simulated robots, has discovery look for them, and counts how often it is right."""
 
     out: Path = Path("runs/discovery_bench")
     """Folder of the cases and the scores."""
@@ -29,13 +29,13 @@ class Args:
     seed: int = 0
     """Seed of everything random."""
     nominal_error: float = 0.1
-    """By how much nominal parameters are wrong, half of it to one and a half times; gains by a third of that."""
+    """By how much nominal parameters are wrong: half of it to one and a half times it; gains by a third of that."""
     piece: str = "0/1"
     """Which share of the cases to work on."""
 
 
 def main(args: Args) -> None:
-    """Works off this piece's cases and scores all that are done."""
+    """Answers this piece's cases, and scores all that are answered."""
     checkpoint.set_up_compiler(checkpoint.a_device_a_core())
     if args.size not in SIZES:
         raise ValueError(f"size: got '{args.size}', expected one of {', '.join(SIZES)}")

@@ -14,7 +14,8 @@ from experiments.common.cli import console, run
 
 @dataclass(frozen=True, kw_only=True)
 class Args:
-    """Looks for swapped joints, turned signs, wrong units, offsets, delays, and a clock that is off."""
+    """Looks for swapped joints, flipped signs, degrees for radians, offsets, delays, and a clock that jumps or
+    drifts."""
 
     log: Path
     """Folder of the log."""
@@ -23,7 +24,7 @@ class Args:
 
 
 def main(args: Args) -> None:
-    """Reads, examines, prints and draws."""
+    """Reads the log, prints what is suspected, and writes doctor.json and a picture of the worst run."""
     log = read(args.log)
     out = args.out or Path("runs/doctor") / args.log.resolve().name
     found = diagnose_log(log)

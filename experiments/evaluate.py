@@ -1,7 +1,7 @@
-"""How well a policy walks in a target: `python -m experiments.evaluate --out DIR --target mujoco_c`.
+"""Measures how well a policy walks in a target: `python -m experiments.evaluate --out DIR --target mujoco_c`.
 
-Three measurements: a grid of commands that stay for 5 s, episodes of the full time limit under the task's own commands,
-and the same with pushes.
+It makes three measurements: a grid of commands that are held for 5 s each, episodes of the full time limit under the
+task's own commands, and the same with pushes.
 """
 
 import dataclasses
@@ -74,7 +74,7 @@ def check(args: Args) -> dict[str, float]:
 
 
 def main(args: Args) -> None:
-    """Measures, prints and draws."""
+    """Measures in all three ways, prints a table, and writes evaluation.json and pictures."""
     checkpoint.set_up_compiler(preset(args.preset).xla_flags)
     params = check(args)
     sizes = preset(args.preset)

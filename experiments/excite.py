@@ -1,9 +1,8 @@
-"""Motion in which effects can be told apart: `python -m experiments.excite --robot MODEL --out DIR`.
+"""Writes targets in which missing effects are distinguishable: `python -m experiments.excite --robot MODEL --out DIR`.
 
-Every run is a medley about one posture at one controller gain: slow triangular reversals, a chirp to 10 Hz, steps that
-saturate where the controller can, and a swing with the motors off. Postures and gains differ from run to run, so that a
-log splits by condition with everything in every part. What is written is a log without measurements: play its targets
-on the robot, and put what was measured beside them.
+What is written is a log without measurements. Play its targets on the robot, suspended or clamped, and put what was
+measured beside them; `experiments.discover` then reads the log. `experiments.discovery.excitation` says what the motion
+is made of.
 """
 
 import shutil
@@ -16,11 +15,12 @@ import numpy as np
 from envs import models
 from envs.logs import Controller, Log, Run, write
 from experiments.common.cli import console, run
+from experiments.discovery.excitation import excitation, scaled
 
 
 @dataclass(frozen=True, kw_only=True)
 class Args:
-    """Writes targets for a log in which effects can be told apart."""
+    """Writes targets for a log in which missing effects are distinguishable."""
 
     out: Path
     """Folder of the log: meta.yaml, and a run_*.csv of times, targets and motor switches for every run."""
@@ -33,7 +33,7 @@ class Args:
     rate_hz: float = 500.0
     """Rows a second."""
     kp: float = 60.0
-    """Proportional gain of the joint controllers in Nm/rad; half of the runs have half of both gains."""
+    """Proportional gain of the joint controllers in Nm/rad. Half of the runs have half of both gains."""
     kd: float = 2.0
     """Damping of the joint controllers in Nm s/rad."""
     torque_limit_nm: float = 60.0
@@ -45,7 +45,7 @@ class Args:
 
 
 def main(args: Args) -> None:
-    """Writes the log that is to be recorded."""
+    """Writes the targets, and a copy of the model where it is not a built-in one."""
     for name in ("seconds", "rate_hz", "kp", "torque_limit_nm", "control_hz"):
         if not 0 < getattr(args, name) < np.inf:
             raise ValueError(f"{name}: got {getattr(args, name)}, expected a positive, finite number")
@@ -59,14 +59,14 @@ def main(args: Args) -> None:
     )
     runs = tuple(
         Run(
-            name=motion.name,
-            condition=motion.condition,
-            split=motion.split,
-            controller=scaled(controller, motion.gain),
-            time=motion.time,
-            signals={"target": motion.target, "enabled": motion.enabled},
+            name=one.name,
+            condition=one.condition,
+            split=one.split,
+            controller=scaled(controller, one.gain),
+            time=one.time,
+            signals={"target": one.target, "enabled": one.enabled},
         )
-        for motion in excitation(spec, joints, args.runs, args.seconds, args.rate_hz, args.seed)
+        for one in excitation(spec, joints, args.runs, args.seconds, args.rate_hz, args.seed)
     )
     built_in = args.robot in models.BUILT_IN
     name = args.robot if built_in else Path(args.robot).name

@@ -1,8 +1,8 @@
 """Writes a policy that a robot's computer can run without JAX: `python -m experiments.export --out DIR`.
 
-`policy.onnx` is the network with its normaliser, observation in and action out; `policy.npz` is the same for
-`experiments.robot.player`. Both carry, as JSON under `meta`, what is around the network: the observation's layout and scales,
-the gait clock, the reference that an action is added to, joints, gains and rate.
+`policy.onnx` is the network with its normaliser, observation in and action out; `policy.npz` holds the same for
+`player.py`, which is copied beside them. Both carry, as JSON under `meta`, what is around the network: the
+observation's layout and scales, the gait clock, the reference that an action is added to, joints, gains and rate.
 """
 
 from dataclasses import dataclass

@@ -1,7 +1,7 @@
-"""What a gap costs a policy that knows nothing of it: `python -m experiments.gaps --out DIR`.
+"""Measures what a gap costs a policy that was not tuned: `python -m experiments.gaps --out DIR`.
 
-A gap in which an untuned policy loses nothing is no transfer problem. Friction, mass and motor strength vary one at a
-time; the policy walks as it is under the task's own commands.
+A gap in which an untuned policy loses nothing is no transfer problem, so look here before tuning. Friction, mass and
+motor strength vary one at a time, and the policy walks under the task's own commands.
 """
 
 from dataclasses import dataclass
@@ -54,7 +54,14 @@ class Args:
 
 
 def points(friction: float) -> list[tuple[str, float, dict[str, float]]]:
-    """Every point as (sweep, value, parameters); `friction` is the nominal coefficient."""
+    """Lists the points of all sweeps.
+
+    Args:
+      friction: the nominal coefficient; friction sweeps in coefficients, the others in multiples of nominal.
+
+    Returns:
+      (sweep, value, physical values by name) for every point.
+    """
     return [
         (sweep, value, dict.fromkeys(names, value / friction if sweep == "friction" else value))
         for sweep, (names, values) in SWEEPS.items()
@@ -63,7 +70,7 @@ def points(friction: float) -> list[tuple[str, float, dict[str, float]]]:
 
 
 def main(args: Args) -> None:
-    """Walks, prints and draws."""
+    """Walks at every point, prints a table, and writes gaps.json and gaps.png."""
     checkpoint.set_up_compiler(preset(args.preset).xla_flags)
     if args.episodes < 1:
         raise ValueError(f"episodes: got {args.episodes}, expected 1 or more")

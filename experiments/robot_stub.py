@@ -1,9 +1,9 @@
-"""A robot that answers only through files: `python -m experiments.robot_stub --folder RUN`.
+"""Plays a robot that answers through files alone: `python -m experiments.robot_stub --folder RUN`.
 
-It stands in for the real one; what its body is like says `robot_body`. It finds `RUN/**/round_*/request.json` beside an
-exported policy, walks with `player.py`'s policy, falls where it falls, and writes `round_*/log`; nothing else of it can
-be seen. Where it finds targets that `experiments.excite` wrote, `RUN/**/hung/targets`, it hangs, plays them and writes
-`hung/log`.
+It stands in for a real robot; `experiments.robot.surrogate` says what its body is like. Where it finds
+`RUN/**/round_*/request.json` beside an exported policy it walks with that policy, falls where it falls, and writes
+`round_*/log`. Where it finds targets of `experiments.excite`, `RUN/**/hung/targets`, it plays them while it is
+suspended and writes `hung/log`. Nothing else of it can be seen.
 """
 
 import json
@@ -27,20 +27,32 @@ from experiments.robot.surrogate import ROW_S, Body, Robot
 
 @dataclass(frozen=True, kw_only=True)
 class Args:
-    """Plays the robot: walks with the policies that a folder holds, hangs where it holds targets, and writes logs."""
+    """Plays the robot: walks with the policies in a folder, plays targets while suspended, and writes logs."""
 
     folder: Path
     """Folder of requests, `round_*/request.json` beside `round_*/policy`, and of targets, `hung/targets`."""
     body: Body = field(default_factory=Body)
-    """What the robot is."""
+    """What the robot's body is like."""
     idle_s: float = 3600.0
-    """Goes home when nothing was asked for so long."""
+    """Ends after so long without a request."""
     seed: int = 0
-    """Of its noise and, with the request's own, of its commands."""
+    """Seed of its noise and, with the request's own, of its commands."""
 
 
 def answer(place: Path, robot: Robot, seed: int) -> Sequence[bool]:
-    """Walks as a request asks, and writes the log; which of the runs ended in a fall."""
+    """Walks as a request asks, and writes the log.
+
+    Args:
+      place: folder of the request and the policy.
+      robot: stands on the ground.
+      seed: of its noise.
+
+    Returns:
+      Whether each walk ended in a fall.
+
+    Raises:
+      ValueError: request or policy cannot be read.
+    """
     request = _request(place / "request.json")
     exported = place / "policy" / "policy.npz"
     try:
@@ -76,8 +88,17 @@ def _request(path: Path) -> dict:
     return request
 
 
-def hang(place: Path, robot: Robot, seed: int) -> None:
-    """Plays what is in `targets` while hanging, and writes the log."""
+def play_targets(place: Path, robot: Robot, seed: int) -> None:
+    """Plays the targets of a folder while the robot is suspended, and writes the log.
+
+    Args:
+      place: holds `targets`, and then `log`.
+      robot: is suspended.
+      seed: of its noise.
+
+    Raises:
+      ValueError: the targets are for other joints or a free base, or cannot be played.
+    """
     targets = read(place / "targets", measured=False)
     for name, expected in {"joints": constants.JOINTS, "base": "fixed"}.items():
         if getattr(targets, name) != expected:
@@ -88,7 +109,7 @@ def hang(place: Path, robot: Robot, seed: int) -> None:
 
 
 def _put(log: Log, place: Path) -> None:
-    """Whole or not at all: who waits for the folder may read it at once."""
+    """Writes the log whole or not at all, because another process may be waiting to read it."""
     draft = place / f"log.{os.getpid()}.partial"
     shutil.rmtree(draft, ignore_errors=True)
     write(log, draft, ".parquet")
@@ -96,12 +117,14 @@ def _put(log: Log, place: Path) -> None:
 
 
 def main(args: Args) -> None:
-    """Answers requests until none has come for a while."""
-    stands, hangs = Robot(args.body), Robot(args.body, hangs=True)
+    """Answers requests until none has come for a while; what it cannot answer it refuses in `refused.txt`."""
+    standing, suspended = Robot(args.body), Robot(args.body, suspended=True)
     last = time.monotonic()
     while time.monotonic() - last < args.idle_s:
-        jobs = [(path.parent, answer, stands) for path in args.folder.glob("**/round_*/request.json")]
-        jobs += [(path.parent.parent, hang, hangs) for path in args.folder.glob("**/hung/targets/meta.yaml")]
+        jobs = [(path.parent, answer, standing) for path in args.folder.glob("**/round_*/request.json")]
+        jobs += [
+            (path.parent.parent, play_targets, suspended) for path in args.folder.glob("**/hung/targets/meta.yaml")
+        ]
         for place, does, robot in sorted(jobs, key=lambda job: job[0]):
             if (place / "log").exists() or (place / "refused.txt").exists():
                 continue

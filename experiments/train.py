@@ -33,7 +33,7 @@ class Args:
 
 
 def main(args: Args) -> None:
-    """Trains, saves and draws the curve."""
+    """Trains, saves the policy, and draws the training curve."""
     checkpoint.set_up_compiler(preset(args.preset).xla_flags)
     sizes, entries = preset(args.preset), chosen(args.parameters)
     updates = sizes.scratch_updates if args.updates is None else args.updates

@@ -1,8 +1,11 @@
-"""The paper's baselines, each a variant of the same `Tuner` (section IV-B).
+"""The methods that the paper compares with (section IV-B), each a variant of the same `Tuner`.
 
-`spm` is Algorithm 1 without its gate: the paper's rule on whatever was measured, in a radius that never changes.
-`Untuned` trains on and never moves the distribution: wide, it is domain randomisation; around the target's
-parameters, the oracle that the paper calls pseudo-real.
+- `spm` is the original search-parameter method: Algorithm 1 without its gate. It applies the paper's update to whatever
+  was measured, within a radius that never changes.
+- `Untuned` trains the policy and never moves the distribution. With a wide distribution (radius 0.4 in the paper) it is
+  domain randomisation; around the target's true parameters it is the oracle that the paper calls pseudo-real.
+
+Both have the interface of a `Tuner`, and their `Info` has the same fields and shapes, so one experiment runs them all.
 """
 
 import dataclasses
@@ -11,41 +14,75 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 
-from jaxtune.rules import GateInfo, no_gate_log, no_update, vote_update
-from jaxtune.tuner import Info, Tuner, TunerState
-from jaxtune.types import Trajectory
+from jaxtune.rules import Collected, GateInfo, Knobs, TunerConfig, no_gate_log, no_update, vote_update
+from jaxtune.tuner import Info, Policy, Tuner, TunerState
+from jaxtune.types import ParamDist, Trajectory
 
 
-def open_gate(key, config, collected, measured, knobs) -> GateInfo:
-    """Accepts every measured set that has a step in it, unread."""
+def open_gate(
+    key: jax.Array, config: TunerConfig, collected: Collected, measured: Trajectory, knobs: Knobs
+) -> GateInfo:
+    """Accepts every measured set that holds at least one living step, without comparing it with anything.
+
+    It takes the place of `rules.calibrated_gate` in the ungated baseline. Its `GateInfo` has novelty 0 at threshold 0,
+    or novelty nan for an empty set, which the tuner reports as `not_finite`. No verification model is trained.
+
+    Args:
+      key: not used.
+      config: not used.
+      collected: not used.
+      measured: the measured set, [set_episodes, time].
+      knobs: not used.
+    """
     nothing = jnp.asarray(jnp.nan)
+    # A set without a step must not move the centre; a novelty of nan ends the tuning as `not_finite`.
     usable = jnp.where(measured.alive.any(), 0.0, jnp.nan)
     return GateInfo(novelty=usable, threshold=jnp.zeros(()), p_value=nothing, uncovered=nothing, elbo=nothing)
 
 
 def spm(tuner: Tuner) -> Tuner:
-    """The original search-parameter method over the same functions."""
+    """Makes the paper's ungated baseline from a tuner.
+
+    The result keeps the tuner's settings and its functions for training, simulating and measuring. It replaces the gate
+    by `open_gate` and the update by `vote_update`, so a comparison shows what gate and posterior add.
+    """
     return dataclasses.replace(tuner, verify=open_gate, update=vote_update)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Untuned:
-    """Trains in a distribution that stays what it is; steps like a `Tuner`, and measures nothing."""
+    """Trains the policy in a distribution that never changes.
+
+    Use it for domain randomisation or for the oracle; the distribution given to `init` decides which. One step trains
+    for as long as a tuning of the wrapped tuner does, so returns compare after equally many steps. It measures nothing,
+    so the tuner's `measure` may be None.
+    """
 
     tuner: Tuner
 
-    def init(self, policy, dist, knobs) -> TunerState:
-        """The state before the first step."""
+    def init(self, policy: Policy, dist: ParamDist, knobs: Knobs) -> TunerState:
+        """Makes the state before the first step, as `Tuner.init` does.
+
+        `dist` is the distribution that all training happens in. The knobs are carried along, so that states of all
+        methods have one structure, but not used.
+        """
         return self.tuner.init(policy, dist, knobs)
 
     def step(self, key: jax.Array, state: TunerState) -> tuple[TunerState, Info]:
-        """Trains the policy for as long as a tuning does."""
+        """Trains the policy for as long as one tuning of the wrapped tuner does.
+
+        Returns the state with the new policy, and an `Info` in which no gate call and no update were made.
+        """
         state, metrics = self.tuner.train(key, state)
         state, info = self.tune(key, state)
         return state, info.replace(train=metrics)
 
     def tune(self, key: jax.Array, state: TunerState, measured: Trajectory | None = None) -> tuple[TunerState, Info]:
-        """Nothing, whatever was measured."""
+        """Returns the state as it is, whatever was measured.
+
+        It stands where `Tuner.tune` does in a loop over a target that is not JAX. The `Info` reports no gate call
+        (`calls` is 0, verdicts are -1) and no update.
+        """
         del key, measured
         return state, Info(
             train={},

@@ -1,4 +1,10 @@
-"""Operations on the parameter distribution."""
+"""Makes, samples, moves and widens the parameter distribution (`ParamDist`).
+
+All functions are pure and, but for `make`, can be traced and vmapped over stacked distributions. Named values become
+vectors only at a network's door, sorted by name (`ravel`). Two units occur: *coordinates* (log space for multipliers)
+and *radii*, which are distances from the centre divided by the radius. Networks and steps use radii, so that sizes
+mean the same for every parameter and after every widening.
+"""
 
 from collections.abc import Sequence
 
@@ -6,15 +12,20 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Shaped
 
-from jaxtune.types import Named, ParamDist
+from jaxtune.types import Coords, ParamDist
 
 
-def make(centre: Named, radius: float, lower: Named, upper: Named) -> ParamDist:
-    """A distribution with one radius for all of its parameters.
+def make(centre: Coords, radius: float, lower: Coords, upper: Coords) -> ParamDist:
+    """Makes a distribution that starts with the same radius for every parameter, and checks it.
+
+    Use it once, on the host, to describe where a search begins: the nominal model as `centre`, a `radius` that is small
+    (the paper starts at 0.2) and bounds that no physical robot exceeds.
 
     Args:
-      centre, lower, upper: scalars by name, in search coordinates.
-      radius: half width, in search coordinates.
+      centre: scalars by name, in coordinates: 0.0 for a multiplier of one.
+      radius: half width of the distribution, in coordinates. A radius of 0.2 spans multipliers of 0.82 to 1.22.
+      lower: smallest coordinate by name.
+      upper: largest coordinate by name.
 
     Raises:
       ValueError: names differ, the radius is not positive, or a centre lies outside its bounds.
@@ -26,8 +37,9 @@ def make(centre: Named, radius: float, lower: Named, upper: Named) -> ParamDist:
             raise ValueError(f"{field}: got {sorted(named)}, expected {sorted(centre)}")
     for name, value in centre.items():
         if not lower[name] <= value <= upper[name]:
-            raise ValueError(f"centre['{name}']: got {value}, allowed {lower[name]} to {upper[name]}")
+            raise ValueError(f"centre['{name}']: got {value}, expected {lower[name]} to {upper[name]}")
 
+    # A weakly typed leaf would become strong in the first step, and the second would be compiled anew.
     def strong(named) -> dict:
         return {name: jnp.asarray(value, jnp.float32) for name, value in named.items()}
 
@@ -37,47 +49,74 @@ def make(centre: Named, radius: float, lower: Named, upper: Named) -> ParamDist:
 
 
 def names(dist: ParamDist) -> tuple[str, ...]:
-    """Names of the parameters, in the order of `ravel`."""
+    """Lists the names of the coordinates in the order of `ravel`, which is alphabetical.
+
+    Use it to label the columns of an `UpdateInfo` or of a search-parameter model's answers.
+    """
     return tuple(sorted(dist.centre))
 
 
-def ravel(params: Named) -> Shaped[Array, "... params"]:
-    """Named values to a vector, at a network's door; sorted by name."""
-    return jnp.stack([params[name] for name in sorted(params)], axis=-1)
+def ravel(coords: Coords) -> Shaped[Array, "... coords"]:
+    """Stacks named values into a vector, sorted by name, along a new last axis.
+
+    It works on any mapping from names to arrays of one shape: a centre ([] each) or the draws of many episodes
+    ([episodes] each).
+    """
+    return jnp.stack([coords[name] for name in sorted(coords)], axis=-1)
 
 
-def unravel(order: Sequence[str], vector: Float[Array, "... params"]) -> dict:
-    """The inverse of `ravel`."""
+def unravel(order: Sequence[str], vector: Float[Array, "... coords"]) -> dict:
+    """Splits the last axis of a vector into named values; the inverse of `ravel`.
+
+    `order` must be the sorted names that `names` gives.
+    """
     return {name: vector[..., column] for column, name in enumerate(order)}
 
 
 def box(dist: ParamDist) -> tuple[dict, dict]:
-    """Lower and upper end of every parameter's support."""
+    """Computes the lower and the upper end of the distribution's support, by name, in coordinates.
+
+    The ends are `max(centre - radius, lower)` and `min(centre + radius, upper)`: draws and guesses come from this box.
+    """
     low = jax.tree.map(lambda c, r, bound: jnp.maximum(c - r, bound), dist.centre, dist.radius, dist.lower)
     high = jax.tree.map(lambda c, r, bound: jnp.minimum(c + r, bound), dist.centre, dist.radius, dist.upper)
     return low, high
 
 
 def sample(key: jax.Array, dist: ParamDist, count: int) -> dict:
-    """Independent draws, [count] by name."""
+    """Draws `count` robots from the distribution, all coordinates independent and uniform over the box.
+
+    Returns coordinates, [count] by name, as `simulate` takes them.
+    """
     low, high = (ravel(side) for side in box(dist))
     draws = jax.random.uniform(key, (count, len(low)), minval=low, maxval=high)
     return unravel(names(dist), draws)
 
 
-def normalise(dist: ParamDist, params: Named) -> Float[Array, "... params"]:
-    """Named values to a vector in units of the radius around the centre."""
-    return (ravel(params) - ravel(dist.centre)) / ravel(dist.radius)
+def normalise(dist: ParamDist, coords: Coords) -> Float[Array, "... coords"]:
+    """Expresses named coordinates as a vector in radii: `(coords - centre) / radius`.
+
+    The centre becomes 0 and the edge of the support 1 or -1 unless a bound cuts it. Networks read and answer in this
+    unit.
+    """
+    return (ravel(coords) - ravel(dist.centre)) / ravel(dist.radius)
 
 
-def normalised_box(dist: ParamDist) -> tuple[Float[Array, " params"], Float[Array, " params"]]:
-    """The support in units of the radius around the centre: -1 to 1, less where the bounds cut it."""
+def normalised_box(dist: ParamDist) -> tuple[Float[Array, " coords"], Float[Array, " coords"]]:
+    """Computes the lower and the upper end of the support in radii.
+
+    They are -1 and 1, or closer to zero where a bound cuts the support. Guesses of the search-parameter model are drawn
+    and swept between them.
+    """
     low, high = box(dist)
     return normalise(dist, low), normalise(dist, high)
 
 
 def at_bounds(dist: ParamDist) -> jax.Array:
-    """True where every parameter's support fills its bounds, so that widening changes nothing."""
+    """Tells whether every coordinate's support fills its bounds, as a boolean scalar.
+
+    Widening such a distribution changes nothing, so the gate's loop must end there.
+    """
     low, high = box(dist)
     # A radius as wide as the bounds fills them from any centre, though the sum may round to less.
     full = jax.tree.map(
@@ -92,15 +131,23 @@ def at_bounds(dist: ParamDist) -> jax.Array:
 
 
 def widen(dist: ParamDist, factor: jax.Array) -> ParamDist:
-    """Multiplies every radius, up to the width of the bounds (Algorithm 1, `r <- r c`)."""
+    """Multiplies every radius by a factor (Algorithm 1, `r <- r c`), up to the width of the bounds.
+
+    The tuner widens only after a failed check, while Algorithm 1 as printed widens before every check. The centre
+    stays.
+    """
+    # A radius as wide as the bounds fills them from any centre.
     radius = jax.tree.map(
         lambda r, lower, upper: jnp.minimum(r * factor, upper - lower), dist.radius, dist.lower, dist.upper
     )
     return dist.replace(radius=radius)
 
 
-def move(dist: ParamDist, step: Float[Array, " params"]) -> ParamDist:
-    """Shifts the centre by a step in units of the radius, within the bounds."""
+def move(dist: ParamDist, step: Float[Array, " coords"]) -> ParamDist:
+    """Shifts the centre by a step in radii, `centre + radius * step`, and clips it to the bounds.
+
+    This is how every update changes the distribution; the radius stays.
+    """
     centre = ravel(dist.centre) + ravel(dist.radius) * step
     centre = jnp.clip(centre, ravel(dist.lower), ravel(dist.upper))
     return dist.replace(centre=unravel(names(dist), centre))

@@ -1,13 +1,20 @@
-"""The verification model: does the simulated data cover a measured window at all? (Section III-B.2 and IV-A.3.)
+"""The data verification model (DVM): do simulated episodes cover a measured window? (Sections III-B.2 and IV-A.3.)
 
-A variational autoencoder on windows of 50 consecutive (observation, action) tuples: four strided convolutions down to a
-latent, a symmetric decoder, a learned noise level for every channel. Eq. 2 is mended in sign: as printed, a badly
-reconstructed window lowers the statistic that the text calls high. Here
+It is a variational autoencoder of windows of 50 consecutive (observation, action) tuples: four strided convolutions
+down to a latent, a symmetric decoder, and a learned noise level s_c per channel. With x the scaled window, the
+encoder's posterior N(m, exp(l)^2) and a latent z drawn from it, it maximises Eq. 1,
 
-    novelty(x) = mean over Q of ELBO(simulated neighbour) - ELBO(x),
+    ELBO(x) = sum over steps and channels of log N(x_tc; decode(z)_tc, exp(s_c)^2) - KL(N(m, exp(l)^2) || N(0, 1)),
+    KL      = sum over the latent of (m^2 + exp(2 l) - 1) / 2 - l.
 
-where Q holds the nearest simulated windows in latent space, so that high means not covered. A window without a
-neighbour within reach has no novelty of its own; it is more novel than any that has.
+A window that the simulator could not have produced is reconstructed badly, so its ELBO is low. But some windows are
+hard to reconstruct wherever they come from. Eq. 2 therefore compares a window with the simulated windows Q that are
+nearest to it in latent space and within a given distance:
+
+    novelty(x) = mean over q in Q of ELBO(q) - ELBO(x).
+
+High means not covered. The sign departs from Eq. 2, which as printed falls where the text says that it rises. A
+window with an empty Q has no novelty of its own; the gate ranks it above all windows that have one.
 """
 
 import math
@@ -30,16 +37,19 @@ _MIN_LOG_STD = -3.0  # noiseless channels (the clock) would otherwise be fitted 
 
 @dataclass(frozen=True, kw_only=True)
 class DVMConfig:
-    """Sizes of the verification model and its training."""
+    """Sizes of the verification model and of its training.
+
+    The defaults are for walking episodes on two CPU cores. `TunerConfig` holds one.
+    """
 
     window: int = 50
     """Steps in a window."""
     stride: int = 10
-    """Steps between the windows of a measured episode."""
+    """Steps from the start of one window to the next, where a set of episodes is scored."""
     latent: int = 16
     """Dimensions of the latent space."""
     channels: int = 64
-    """Channels of every convolution."""
+    """Channels of every hidden convolution."""
     train_steps: int = 800
     """Gradient steps."""
     batch: int = 128
@@ -47,15 +57,19 @@ class DVMConfig:
     learning_rate: float = 2e-3
     """Peak of a one-cycle cosine schedule."""
     references: int = 2048
-    """Simulated windows among which neighbours are sought."""
+    """Simulated windows that are kept as candidates for Q."""
     neighbours: int = 10
-    """Size of Q."""
+    """Largest size of Q (the paper's N)."""
     reach: float = 0.95
-    """Quantile of the distances among references (to their own last neighbour) beyond which nothing counts as near."""
+    """Sets the largest latent distance of a neighbour: this quantile of the distances from the simulated windows to
+    their own last neighbours."""
 
 
 def _halve(x: Float[Array, "batch time channels"]) -> Float[Array, "batch half patch"]:
-    """Patches of four steps at every second step, the edges padded: a strided convolution's input as one matrix."""
+    """Lays out patches of four steps at every second step, edges padded: a strided convolution's input as a matrix.
+
+    A dense layer on it is the convolution.
+    """
     batch, time, channels = x.shape
     odd = time % _STRIDE
     pairs = jnp.pad(x, ((0, 0), (1, 1 + odd), (0, 0))).reshape(batch, -1, _STRIDE * channels)
@@ -63,7 +77,7 @@ def _halve(x: Float[Array, "batch time channels"]) -> Float[Array, "batch half p
 
 
 def _double(x: Float[Array, "batch half patch"], time: int) -> Float[Array, "batch time channels"]:
-    """The transpose of `_halve`: overlapping patches are added up and the padding is cut off."""
+    """Adds up overlapping patches and cuts off the padding: the transpose of `_halve`."""
     batch, _, patch = x.shape
     first, second = jnp.split(x, 2, axis=-1)
     pairs = jnp.pad(first, ((0, 0), (0, 1), (0, 0))) + jnp.pad(second, ((0, 0), (1, 0), (0, 0)))
@@ -71,6 +85,8 @@ def _double(x: Float[Array, "batch half patch"], time: int) -> Float[Array, "bat
 
 
 class _VAE(nn.Module):
+    """The autoencoder, on scaled windows [batch, window, num_channels]."""
+
     config: DVMConfig
     num_channels: int
 
@@ -98,7 +114,7 @@ class _VAE(nn.Module):
         return x
 
     def __call__(self, x, noise):
-        """ELBO [batch] and latent mean [batch, latent] of scaled windows, with latent noise [batch, latent]."""
+        """Computes ELBO [batch] and latent mean [batch, latent]; the latent is mean + std * noise [batch, latent]."""
         mean, log_std = self.encode(x)
         error = x - self.decode(mean + jnp.exp(log_std) * noise)
         channel = jnp.maximum(self.log_std, _MIN_LOG_STD)
@@ -109,20 +125,26 @@ class _VAE(nn.Module):
 
 @chex.dataclass(frozen=True)
 class DVM:
-    """A trained verification model and the simulated windows that measured ones are compared with."""
+    """A trained verification model with the simulated windows (references) that measured ones are compared with.
+
+    `train` returns it; hand it to `novelty` with the config that it was trained with.
+    """
 
     variables: dict
-    scaler: windows.Scaler
-    latent: jax.Array  # [references, latent]
-    elbo: jax.Array  # [references]
-    reach: jax.Array  # largest distance of a neighbour
+    scaler: windows.Scaler  # scales channels by the simulated episodes' mean and standard deviation
+    latent: jax.Array  # [references, latent], where the references lie
+    elbo: jax.Array  # [references], nats per window
+    reach: jax.Array  # largest latent distance of a neighbour
 
 
 def train(key: jax.Array, config: DVMConfig, trajectory: Trajectory) -> tuple[DVM, jax.Array]:
-    """Trains on simulated episodes [episodes, time].
+    """Trains a verification model on simulated episodes [episodes, time].
+
+    Maximises the ELBO (Eq. 1) on random windows by Adam, then draws the reference windows and measures how far apart
+    they lie, which sets the reach of a neighbour. The gate calls this for every distribution that it tests.
 
     Returns:
-      The model, and its ELBO in nats per window, the mean over the last tenth of the steps.
+      The model, and its ELBO in nats per window, as the mean over the last tenth of the steps.
     """
     key_init, key_train, key_reference = jax.random.split(key, 3)
     scaler = windows.fit_scaler(trajectory)
@@ -160,27 +182,35 @@ def train(key: jax.Array, config: DVMConfig, trajectory: Trajectory) -> tuple[DV
 def novelty(
     config: DVMConfig, dvm: DVM, trajectory: Trajectory
 ) -> tuple[Float[Array, " windows"], Bool[Array, " windows"], Bool[Array, " windows"]]:
-    """Eq. 2, window by window, for one set of episodes [episodes, time].
+    """Computes the novelty of every window of a set of episodes [episodes, time]: Eq. 2, sign mended, before averaging.
+
+        novelty(x) = mean over q in Q of ELBO(q) - ELBO(x)
+
+    Q holds those of the `neighbours` nearest references that lie within reach. The ELBO is evaluated at the latent's
+    mean, so the score of a set is repeatable. Windows are not averaged here; the gate ranks them first.
 
     Returns:
-      Novelty in nats per window, nan where a step is not finite; which windows are valid; which of them have a
-      simulated neighbour within reach (the novelty of the others is zero, and means nothing).
+      Novelty in nats per window, nan where a step is not finite; whether the window is valid; and whether it is
+      covered, that is, has a neighbour within reach. The novelty of a window that is not covered is zero and means
+      nothing.
     """
     cut, valid = windows.grid(trajectory, config.window, config.stride)
     elbo, latent = _evaluate(config, dvm.variables, dvm.scaler, cut.reshape(-1, *cut.shape[2:]))
     closeness, index = jax.lax.top_k(-_distances(latent, dvm.latent), config.neighbours)
     near = -closeness <= dvm.reach
     mean = jnp.sum(jnp.where(near, dvm.elbo[index], 0.0), axis=-1) / jnp.maximum(near.sum(axis=-1), 1)
+    # A window that is not finite must stay nan for the gate to see it, not pass for one without a neighbour.
     covered = near.any(axis=-1) | jnp.isnan(elbo)
     return jnp.where(covered, mean - elbo, 0.0), valid.reshape(-1), covered
 
 
 def _evaluate(config, variables, scaler, window):
-    """ELBO [n], decoded at the latent's mean so that a score is repeatable, and latent mean [n, latent]."""
+    """Computes ELBO [n] and latent mean [n, latent] of windows, decoded at that mean so that a score is repeatable."""
     network = _VAE(config, window.shape[-1])
     return network.apply(variables, scaler(window), jnp.zeros((window.shape[0], config.latent)))
 
 
 def _distances(a: Float[Array, "n latent"], b: Float[Array, "m latent"]) -> Float[Array, "n m"]:
+    """Computes all Euclidean distances, from |a|^2 + |b|^2 - 2 a b, which needs no array [n, m, latent]."""
     square = jnp.sum(a**2, axis=-1)[:, None] + jnp.sum(b**2, axis=-1) - 2.0 * a @ b.T
     return jnp.sqrt(jnp.maximum(square, 0.0))

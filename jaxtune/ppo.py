@@ -1,8 +1,24 @@
-"""One pure PPO update, made of Brax's networks, loss, advantage estimate and rollout.
+"""Proximal policy optimisation (PPO) as one pure update, made of Brax's networks, loss, advantages and rollout.
 
-`brax.training.agents.ppo.train` owns its loop, its environments and its optimiser, and cannot be jitted. Here an
-update is a function of the learner's state and the environments' state, so training scans, vmaps over seeds, goes on
-where it stopped, and the physics it trains in may change between two updates without compiling anything anew.
+Use it for a user's `train_policy` where the policy is trained in a Brax environment. `brax.training.agents.ppo.train`
+owns its loop, environments and optimiser, and cannot be jitted. Here an update is a function of the learner's state and
+the environments' state. So training scans and vmaps over seeds, a run resumes where it stopped, and the physics may
+change between two updates without compiling anew. The tuner itself does not need this module.
+
+One update collects `num_envs x unroll_steps` steps and passes over them `epochs` times, in minibatches. For each it
+takes an Adam step on PPO's clipped objective (Schulman et al., 2017), with rho = exp(log pi(a|o) - log pi_old(a|o)):
+
+    loss = -mean(min(rho A, clip(rho, 1 - clip, 1 + clip) A)) + mean((G - V)^2) / 4 - entropy_cost * mean(entropy).
+
+Returns G and advantages A come from generalised advantage estimation (Schulman et al., 2016), as Brax computes it:
+
+    delta_t = reward_t + discount V_{t+1} - V_t
+    G_t     = V_t + sum over k of (discount gae_lambda)^k delta_{t+k}
+    A_t     = reward_t + discount G_{t+1} - V_t,    scaled to mean 0 and standard deviation 1 in the minibatch.
+
+The value after a fall is zero. Where the time limit cut an episode off, delta and A are zero, since the environment is
+reset before the value behind the cut could be known. The step size follows the divergence from the policy that
+collected the rollout (`PPO._steer`).
 """
 
 from collections.abc import Callable
@@ -18,12 +34,18 @@ from brax.training.acting import generate_unroll
 from brax.training.agents.ppo import losses, networks
 from flax import linen
 
-_LEARNING_RATE_RANGE = (1e-5, 1e-2)
+_LEARNING_RATE_RANGE = (1e-5, 1e-2)  # the divergence may drive the step size to these ends
 
 
 @dataclass(frozen=True, kw_only=True)
 class PPOConfig:
-    """Sizes and weights of PPO; defaults are for two CPU cores."""
+    """Sizes and weights of PPO; the defaults are for a walking robot on two CPU cores.
+
+    On a GPU, raise `num_envs` to several thousand first.
+
+    Raises:
+      ValueError: `minibatches` does not divide `num_envs`.
+    """
 
     num_envs: int = 256
     """Environments that run side by side."""
@@ -32,46 +54,63 @@ class PPOConfig:
     epochs: int = 4
     """Passes over a rollout."""
     minibatches: int = 4
-    """Parts of a pass; must divide num_envs."""
+    """Gradient steps in a pass; must divide num_envs."""
     learning_rate: float = 3e-4
-    """First step size; it follows target_kl from there."""
+    """First step size of Adam; it follows target_kl from there."""
     target_kl: float = 0.01
-    """Divergence of the policy within an update that the step size is steered to."""
+    """Divergence (nats) from the policy that collected the rollout that the step size is steered to."""
     clip: float = 0.2
-    """Clipping range of the probability ratio."""
+    """Largest deviation of the probability ratio from one that still counts in the objective."""
     entropy_cost: float = 0.003
     """Weight of the entropy bonus."""
     gae_lambda: float = 0.95
-    """Mix of one-step and Monte Carlo advantages."""
+    """Mix of one-step (0) and Monte Carlo (1) advantages."""
     discount: float = 0.99
-    """Discount of a policy step."""
+    """Discount factor per policy step."""
     max_grad_norm: float = 1.0
-    """Gradients are clipped to this norm."""
+    """Gradients with a larger norm are scaled down to it."""
     init_std: float = 0.7
-    """First standard deviation of every action."""
+    """First standard deviation of every action, in the action's unit."""
     hidden: tuple[int, ...] = (128, 128)
-    """Hidden layers of policy and value, with ELU."""
+    """Widths of the hidden layers of policy and value network, with ELU."""
 
     def __post_init__(self):
         if self.num_envs % self.minibatches:
-            raise ValueError(f"minibatches: {self.minibatches} does not divide num_envs {self.num_envs}")
+            raise ValueError(f"minibatches: got {self.minibatches}, expected a divisor of num_envs, {self.num_envs}")
 
     @property
     def steps_per_update(self) -> int:
+        """Number of environment steps that one update collects, over all environments.
+
+        Divide a training budget in steps by it to get the number of updates.
+        """
         return self.num_envs * self.unroll_steps
 
 
 @chex.dataclass(frozen=True)
 class PPOState:
-    """What the next update needs of the learner."""
+    """What the next update needs of the learner: save it to resume training, and stack it to vmap over seeds.
 
-    params: losses.PPONetworkParams
-    normalizer: running_statistics.RunningStatisticsState
-    opt_state: optax.OptState
+    `params` are network weights here, not physical parameters.
+    """
+
+    params: losses.PPONetworkParams  # of policy and value network
+    normalizer: running_statistics.RunningStatisticsState  # running mean and standard deviation of observations
+    opt_state: optax.OptState  # of Adam, with the current step size
 
 
 class PPO:
-    """PPO with a Gaussian policy that is not squashed (Brax's `distribution_type="normal"`)."""
+    """PPO for one pair of observation and action sizes, with a Gaussian policy.
+
+    `init` makes a learner, `update` improves it, and `act` and `layers` give its policy, in JAX or as plain weights.
+    The object holds no state but the networks' definitions. Actions are not squashed (Brax's
+    `distribution_type="normal"`), so the environment must limit them.
+
+    Args:
+      config: sizes and weights.
+      observation_size: length of an observation.
+      action_size: length of an action.
+    """
 
     def __init__(self, config: PPOConfig, observation_size: int, action_size: int):
         self.config = config
@@ -94,7 +133,11 @@ class PPO:
         )(learning_rate=config.learning_rate)
 
     def init(self, key: jax.Array) -> PPOState:
-        """A fresh learner."""
+        """Makes a learner with random weights, before any update.
+
+        Its policy explores with a standard deviation of `init_std`. The observations' running mean and standard
+        deviation begin at 0 and 1.
+        """
         key_policy, key_value = jax.random.split(key)
         params = losses.PPONetworkParams(
             policy=self._networks.policy_network.init(key_policy),
@@ -105,21 +148,27 @@ class PPO:
             normalizer=running_statistics.init_state(specs.Array((self._observation_size,), jnp.float32)),
             opt_state=self._optimizer.init(params),
         )
-        # Some of Brax's leaves are weakly typed or Python's own; the second update would then be traced anew.
+        # Some of Brax's leaves are weakly typed or Python's own. The second update would then be traced anew.
         return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.asarray(leaf).dtype), state)
 
     def act(self, state: PPOState, *, deterministic: bool = True) -> Callable:
-        """The policy as Brax has it: `(observation [..., obs], key) -> (action [..., act], extras)`."""
+        """Gives the policy as Brax has it: `(observation [..., obs], key) -> (action [..., act], extras)`.
+
+        It answers with the mean action, or with a random one where `deterministic` is False. Observations are
+        normalised inside.
+        """
         make = networks.make_inference_fn(self._networks)
         return make((state.normalizer, state.params.policy), deterministic=deterministic)
 
     @staticmethod
     def layers(state: PPOState) -> tuple[tuple[jax.Array, jax.Array], list[tuple[jax.Array, jax.Array]]]:
-        """The deterministic policy as numbers, for who has no JAX.
+        """Gives the deterministic policy as plain weights, for export to a program without JAX.
+
+        Start from x = (observation - mean) / std. Each layer computes x <- elu(x kernel + bias), the last one without
+        elu, and its result is the action.
 
         Returns:
-          Mean and standard deviation [obs] that observations are normalised by; kernels [in, out] and biases [out] of
-          the layers, with ELU behind all but the last.
+          Mean and standard deviation [obs] of observations; and, for every layer, its kernel [in, out] and bias [out].
         """
         params = state.params.policy["params"]
         hidden = params["MLP_0"]
@@ -127,17 +176,21 @@ class PPO:
         return (state.normalizer.mean, state.normalizer.std), [(layer["kernel"], layer["bias"]) for layer in every]
 
     def update(self, key: jax.Array, state: PPOState, env: Env, env_state: State) -> tuple[PPOState, State, dict]:
-        """Collects one rollout and learns from it.
+        """Collects one rollout and learns from it; the module's docstring has the objective.
+
+        It is pure, so `jax.lax.scan` over keys is a training run. Episodes go on where the last update left them.
 
         Args:
           key: random key.
           state: the learner.
-          env: a batch of environments that reset themselves, with `truncation` in `info`.
-          env_state: where they are, [num_envs].
+          env: a batch of environments that reset themselves, with `truncation` in their state's `info`, as
+            `brax.envs.wrappers.training.wrap` makes it.
+          env_state: the environments' state, [num_envs].
 
         Returns:
-          Learner, environments, and metrics as scalars: the environment's own (means over the rollout), `reward`,
-          `done` (share of steps that ended an episode), `kl`, `learning_rate`, `loss`, `std`.
+          The learner, the environments' state, and metrics as scalars: the environment's own (means over the rollout),
+          `reward` per step, `done` (share of steps that ended an episode), `kl` (nats), `learning_rate`, `loss`, and
+          `std` of the actions.
         """
         key_unroll, key_learn = jax.random.split(key)
 
@@ -151,6 +204,7 @@ class PPO:
             act, env_state, jax.random.split(key_unroll, self.config.unroll_steps)
         )
         normalizer = running_statistics.update(state.normalizer, data.observation)
+        # Brax's loss takes environments first, [num_envs, unroll_steps].
         data = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), data)
         (params, opt_state), learned = jax.lax.scan(
             lambda carry, key: self._pass(key, carry, normalizer, data),
@@ -162,6 +216,7 @@ class PPO:
         return state, env_state, jax.tree.map(jnp.mean, metrics)
 
     def _pass(self, key, carry, normalizer, data):
+        """Goes once over the rollout, environments shuffled into minibatches."""
         key_shuffle, key_loss = jax.random.split(key)
         order = jax.random.permutation(key_shuffle, self.config.num_envs)
         batches = jax.tree.map(lambda x: x[order].reshape(self.config.minibatches, -1, *x.shape[1:]), data)
@@ -169,6 +224,7 @@ class PPO:
         return jax.lax.scan(lambda carry, item: self._descend(*item, carry, normalizer), carry, (keys, batches))
 
     def _descend(self, key, batch, carry, normalizer):
+        """Adapts the step size to this minibatch's divergence and takes one gradient step with it."""
         params, opt_state = carry
         (loss, aux), grads = jax.value_and_grad(losses.compute_ppo_loss, has_aux=True)(
             params,
@@ -193,6 +249,13 @@ class PPO:
         return (optax.apply_updates(params, updates), opt_state), metrics
 
     def _steer(self, learning_rate: jax.Array, kl: jax.Array) -> jax.Array:
+        """Adapts the step size to the divergence, within its range (Rudin et al., CoRL 2021).
+
+            step <- step / 1.5    where kl > 2 target_kl
+            step <- step * 1.5    where 0 < kl < target_kl / 2
+
+        A divergence of zero or nan was not measured and changes nothing.
+        """
         low, high = _LEARNING_RATE_RANGE
         slower = jnp.maximum(learning_rate / 1.5, low)
         faster = jnp.minimum(learning_rate * 1.5, high)

@@ -1,7 +1,20 @@
-"""The two decisions of a tuning: is a measured set covered, and where does the distribution move.
+"""The two decisions of a tuning: is the measured set covered, and where does the distribution move?
 
-Each is a function that a `Tuner` is given: `calibrated_gate` is the default check; `posterior_update` is the default
-update, and `vote_update` the paper's.
+A `Tuner` is given one function for each. They stand in its schedule (drawn in `jaxtune.tuner`) like this:
+
+    D_q, held-out sets, measured set
+      -> verify: train a verification model (`jaxtune.dvm`) on D_q, score all sets by their novelty  -> GateInfo
+      -> the tuner compares novelty with threshold; if the verdict is `accept`
+      -> update: train a search-parameter model (`jaxtune.spm`) on D_q, read the measured set        -> ParamDist
+
+`calibrated_gate` is the default `verify`. `posterior_update` is the default `update`, and `vote_update` is the paper's.
+To change a decision, write a function with the same arguments (`Verify`, `Update`) and hand it to the tuner.
+
+Departures from the paper. Its threshold sigma' is set by hand; here held-out simulated sets calibrate it, so the gate
+is a conformal test with a known rate of false alarms. Its vote can only raise a parameter; here it has a sign. Both
+models are trained anew for every distribution, never continued. `posterior_update` is not in the paper: one sweep over
+guesses gives an estimate and an interval, so it may replace several tunings, and a parameter that the episodes say
+nothing about stays where it is.
 """
 
 from collections.abc import Callable
@@ -17,49 +30,69 @@ from jaxtune.dvm import DVMConfig
 from jaxtune.spm import SPMConfig
 from jaxtune.types import ParamDist, Trajectory
 
-_IDENTIFIABLE = 0.9  # an interval this much narrower than one that ignores the data tells something
+# An interval counts as informative below this share of the one that ignores the data. Chosen below 1, since the two are
+# quantiles over a few dozen sets and differ by chance.
+_IDENTIFIABLE = 0.9
 
 
 @dataclass(frozen=True, kw_only=True)
 class TunerConfig:
-    """Sizes of a tuning."""
+    """Sizes of a tuning: whatever fixes array shapes and loop lengths, so a change compiles the tuner anew.
+
+    The defaults are for walking robots on two CPU cores. More `episodes` sharpen both models and take longer.
+    For scalars that may vary within one compiled program, see `Knobs`.
+    """
 
     episodes: int = 600
-    """Simulated episodes in D_q, each with its own parameters."""
+    """Simulated episodes in D_q, the set that both models are trained on. Each has coordinates of its own."""
     set_episodes: int = 5
     """Episodes in a measured set, and in every held-out set that it is compared with."""
     held_out_sets: int = 39
-    """Simulated sets that calibrate gate and interval, each with its own parameters."""
+    """Simulated sets that calibrate the gate's threshold and the update's interval. Each set is one robot, with
+    coordinates of its own. With 39 sets, p-values are multiples of 1/40."""
     max_widenings: int = 6
-    """Widenings within one tuning."""
+    """Most widenings within one tuning; the gate is called at most once more than that."""
     patience: int = 3
-    """Calls in a row that came no closer after which the verdict is `unexplained`."""
+    """Gate calls in a row without progress after which the verdict is `unexplained`."""
     least_fall: float = 0.01
-    """Fall of the novelty, a mean rank, since the last call that came closer, above which another one does. Chosen; a
-    first call's score differs by 0.01 to 0.04 from seed to seed (`experiments.bench alarm`).
-    """
+    """Smallest novelty decrease that counts as progress, measured from the last call that made some. The novelty is a
+    mean rank between 0 and 1. Chosen; the score of a first call varies by 0.01 to 0.04 between seeds
+    (`experiments.bench alarm`)."""
     coverage: float = 0.9
-    """Share of held-out sets whose truth lies within the interval of the posterior update."""
+    """Share of held-out sets whose true coordinates the interval of the posterior update must contain."""
     min_radius: float = 0.1
-    """The posterior update narrows no radius below this, in search coordinates."""
+    """Smallest radius, in coordinates, that the posterior update narrows to."""
     spm: SPMConfig = field(default_factory=SPMConfig)
+    """Sizes of the search-parameter model."""
     dvm: DVMConfig = field(default_factory=DVMConfig)
+    """Sizes of the verification model."""
 
 
 @chex.dataclass(frozen=True)
 class Knobs:
-    """What a sweep varies: scalars that change no shape."""
+    """Scalars of a tuning that change no array's shape, so a sweep can vmap over them in one compiled program.
 
-    step_size: jax.Array  # radii per unit vote (the paper's alpha)
-    widen_factor: jax.Array  # the paper's c
-    level: jax.Array  # quantile of the held-out novelty that is the threshold
-    threshold: jax.Array  # a fixed mean rank in its stead (the paper's sigma'); nan where there is none
+    They travel in the tuner's state. Make them with `knobs`, which has defaults and checks them.
+    """
+
+    step_size: jax.Array  # the paper's alpha: radii that `vote_update` moves per unit of vote
+    widen_factor: jax.Array  # the paper's c: factor on the radius after a failed check
+    level: jax.Array  # quantile of the held-out sets' novelty that is the threshold
+    threshold: jax.Array  # the paper's sigma': a fixed mean rank instead of that quantile; nan where there is none
 
 
 def knobs(
     *, step_size: float = 0.5, widen_factor: float = 1.5, level: float = 0.95, threshold: float | None = None
 ) -> Knobs:
-    """Knobs, checked.
+    """Makes knobs from plain numbers, and checks them.
+
+    Args:
+      step_size: radii that the centre moves per unit of vote; `posterior_update` does not use it.
+      widen_factor: what every radius is multiplied by after a failed check.
+      level: share of covered sets that the gate lets pass. At 0.95 it rejects a set that came from the distribution
+        with a probability of at most 0.05.
+      threshold: a fixed novelty, as a mean rank in (0, 1), that replaces the calibrated threshold. The paper sets its
+        threshold by hand like this.
 
     Raises:
       ValueError: step size not positive, widening factor not above 1, level or threshold not in (0, 1).
@@ -79,54 +112,90 @@ def knobs(
 
 @chex.dataclass(frozen=True)
 class Collected:
-    """Simulated episodes of one distribution."""
+    """Simulated episodes drawn from one distribution: what `verify` and `update` learn from and are calibrated on.
+
+    The paper's D_q trains both models. The held-out sets imitate a measured set: one draw of the coordinates per set,
+    repeated in `set_episodes` episodes. No network is trained on them.
+    """
 
     trajectory: Trajectory  # D_q, [episodes, time]
-    params: dict  # their parameters, [episodes]
+    coords: dict  # true coordinates of the episodes of D_q, [episodes] by name
     held_out: Trajectory  # [sets, set_episodes, time]
-    held_out_params: dict  # [sets]
+    held_out_coords: dict  # true coordinates of the held-out sets, [sets] by name
 
 
 @chex.dataclass(frozen=True)
 class GateInfo:
-    """One call of the gate."""
+    """What one call of the gate found, scalars each.
 
-    novelty: jax.Array  # mean rank of the measured windows among those of all sets; 1/2 where it is like them
-    threshold: jax.Array
-    p_value: jax.Array  # (1 + number of held-out sets at least as novel) / (sets + 1)
-    uncovered: jax.Array  # share of measured windows without a simulated neighbour
-    elbo: jax.Array  # of the trained model, nats per window
+    The tuner decides by `novelty` and `threshold` alone: the set is covered where novelty <= threshold, and a value
+    that is not finite ends the tuning. The rest is for plots and reports; a gate that does not compute it answers nan.
+    """
+
+    novelty: jax.Array  # mean rank of the measured windows among those of all sets, in (0, 1]; 1/2 where they are alike
+    threshold: jax.Array  # largest novelty of a covered set
+    p_value: jax.Array  # (1 + #{held-out sets at least as novel}) / (held-out sets + 1)
+    uncovered: jax.Array  # share of the measured windows that have no simulated neighbour within reach
+    elbo: jax.Array  # evidence lower bound that the verification model reached in training, nats per window
 
 
 @chex.dataclass(frozen=True)
 class UpdateInfo:
-    """One update, [params] each in the order of `dist.names`; of the radius where a step is meant."""
+    """What one update did, [coords] each in the order of `dist.names`, but for `loss`.
 
-    step: jax.Array  # taken by the centre
-    interval: jax.Array  # half width of the interval around it
-    identifiable: jax.Array  # False where the set says no more than the distribution did
-    loss: jax.Array  # of the search-parameter model, nats
+    Step and interval are in radii of the distribution before the update. The new estimate in coordinates is therefore
+    `centre + radius * step`, give or take `radius * interval`.
+    """
+
+    step: jax.Array  # movement of the centre, before it is clipped to the bounds
+    interval: jax.Array  # half width of the interval around the new centre; nan where the rule gives none
+    identifiable: jax.Array  # False where the measured set says no more than the distribution did
+    loss: jax.Array  # scalar, logistic loss of the search-parameter model, nats per coordinate
 
 
 Verify = Callable[[jax.Array, TunerConfig, Collected, Trajectory, Knobs], GateInfo]
+"""Type of a gate: `(key, config, collected, measured, knobs) -> GateInfo`, pure and traceable."""
 Update = Callable[[jax.Array, TunerConfig, Collected, Trajectory, ParamDist, Knobs], tuple[ParamDist, UpdateInfo]]
+"""Type of an update: `(key, config, collected, measured, dist, knobs) -> (ParamDist, UpdateInfo)`, likewise."""
 
 
 def calibrated_gate(
     key: jax.Array, config: TunerConfig, collected: Collected, measured: Trajectory, knobs: Knobs
 ) -> GateInfo:
-    """Novelty of a measured set against that of held-out simulated sets (Eq. 2, sign mended).
+    """Tests whether simulated episodes cover a measured set: the default gate.
 
-    A set's score is the mean rank of its valid windows among the valid windows of all sets, measured and held out: the
-    novelty of single windows is heavy-tailed, and one held-out fall in the mean of nats hides a measured set that is a
-    little novel everywhere. A window without a neighbour ranks highest. The threshold is the conformal quantile: a set
-    drawn like the held-out ones exceeds it with probability at most `1 - level`.
+    It trains a verification model on D_q and computes the novelty of every window (Eq. 2 with its sign mended, see
+    `dvm.novelty`), for the measured set and for each held-out set. With W the valid windows of all these sets,
+
+        rank(x)    = #{w in W: novelty(w) <= novelty(x)} / #W
+        score(set) = mean of rank(x) over the valid windows of the set
+        p          = (1 + #{held-out sets: score >= score(measured)}) / (held_out_sets + 1)
+        threshold  = the ceil((held_out_sets + 1) level)-th smallest score of the held-out sets.
+
+    A measured set drawn like the held-out ones exceeds the threshold with probability at most `1 - level`; this is a
+    conformal test. It calibrates per set, since the windows of one episode depend on each other.
+
+    The paper averages Eq. 2 itself and sets the threshold by hand. Ranks replace nats because the novelty of single
+    windows is heavy-tailed: one held-out fall raises a mean in nats so far that a measured set which is a little novel
+    everywhere would pass. A window without a neighbour ranks highest.
+
+    Args:
+      key: random key, for training the verification model.
+      config: sizes.
+      collected: D_q and held-out sets of the distribution that is tested.
+      measured: the measured set, [set_episodes, time].
+      knobs: `level`, or a fixed `threshold`.
+
+    Returns:
+      Score (`novelty`), threshold and p-value. The score is nan where the set has no valid window or holds a living
+      step that is not finite.
     """
     model, elbo = dvm.train(key, config.dvm, collected.trajectory)
     held_out = jax.lax.map(lambda episodes: dvm.novelty(config.dvm, model, episodes), collected.held_out)
     scored = dvm.novelty(config.dvm, model, measured)
     novelty, valid, covered = jax.tree.map(lambda sets, one: jnp.concatenate([sets, one[None]]), held_out, scored)
     novelty = jnp.where(covered, novelty, jnp.inf)
+    # Windows that are not valid sort to the end of the pool. One without a neighbour counts them too: hence the cap.
     pool = jnp.sort(jnp.where(valid, novelty, jnp.inf), axis=None)
     rank = jnp.searchsorted(pool, novelty, side="right") / valid.sum()
     rank = jnp.where(jnp.isnan(novelty), jnp.nan, jnp.minimum(rank, 1.0))
@@ -143,33 +212,71 @@ def calibrated_gate(
 
 
 def _conformal_quantile(values: jax.Array, level: jax.Array | float) -> jax.Array:
-    """What one more draw like `values` [n, ...] exceeds with probability at most `1 - level`.
+    """Bound that one more draw like `values` [n, ...] exceeds with probability at most `1 - level`.
 
-    That takes n of at least `level / (1 - level)`; of fewer, it is the largest.
+    It is the ceil((n + 1) level)-th smallest value. The promise needs n of at least `level / (1 - level)`; with fewer,
+    the largest value is returned.
     """
     rank = jnp.ceil((len(values) + 1) * level).astype(int) - 1
     return jnp.sort(values, axis=0)[jnp.minimum(rank, len(values) - 1)]
 
 
-def vote_update(key, config, collected, measured, dist, knobs) -> tuple[ParamDist, UpdateInfo]:
-    """The paper's rule, signed: centre += step_size * radius * vote."""
-    model, loss = spm.train(key, config.spm, collected.trajectory, collected.params, dist)
+def vote_update(
+    key: jax.Array, config: TunerConfig, collected: Collected, measured: Trajectory, dist: ParamDist, knobs: Knobs
+) -> tuple[ParamDist, UpdateInfo]:
+    """Moves the centre by the vote of a search-parameter model: the paper's update, with a sign.
+
+        centre <- centre + step_size * radius * vote,    vote = 2 p(truth > centre) - 1, in [-1, 1]
+
+    (the last line of Algorithm 1). The paper's answer in (0, 1) can only raise a parameter; ours is positive where it
+    must rise and negative where it must fall. The radius stays, no interval is given, and every coordinate counts as
+    identifiable. Use it for the baseline, or to compare with the paper.
+
+    Args:
+      key: random key, for training the search-parameter model.
+      config: sizes.
+      collected: simulated episodes; only D_q and its coordinates are read.
+      measured: the accepted measured set, [set_episodes, time].
+      dist: the distribution that the episodes were drawn from.
+      knobs: `step_size`, in radii per unit of vote.
+    """
+    model, loss = spm.train(key, config.spm, collected.trajectory, collected.coords, dist)
     step = knobs.step_size * spm.vote(config.spm, model, measured)
     unknown = jnp.full_like(step, jnp.nan)
     info = UpdateInfo(step=step, interval=unknown, identifiable=jnp.ones_like(step, bool), loss=loss)
     return dists.move(dist, step), info
 
 
-def posterior_update(key, config, collected, measured, dist, knobs) -> tuple[ParamDist, UpdateInfo]:
-    """Moves the centre to where the sweep's logit crosses zero, and narrows the radius to what is still open.
+def posterior_update(
+    key: jax.Array, config: TunerConfig, collected: Collected, measured: Trajectory, dist: ParamDist, knobs: Knobs
+) -> tuple[ParamDist, UpdateInfo]:
+    """Moves the centre to the posterior's median and narrows the radius to its interval: the default update.
 
-    Held-out sets of known parameters calibrate it: the half width of the interval is the conformal quantile `coverage`
-    of their errors. A parameter whose interval is as wide as one that ignores the data is not identifiable and left
-    as it was. A parameter whose interval reaches past the box moves but keeps its radius.
+    A sweep of guesses through the search-parameter model gives each coordinate's estimate where the logit of
+    p(truth > guess) crosses zero (see `spm.estimate`). Held-out sets, whose coordinates are known, calibrate it. With Q
+    the conformal quantile `coverage` over held-out sets, and all values in radii,
+
+        interval     = Q(|estimate - truth|)
+        ignorant     = Q(|middle of the box - truth|)
+        identifiable = interval < 0.9 ignorant
+        step         = estimate(measured)                           where identifiable, else 0
+        radius      <- max(radius * interval, min_radius)           where identifiable and inside the box; never larger
+
+    A coordinate that is not identifiable keeps centre and radius. One whose interval reaches past the box moves, but
+    keeps its radius, since held-out truths lie inside the box and tell nothing of errors beyond. The paper has no such
+    update: it votes in each tuning (`vote_update`).
+
+    Args:
+      key: random key, for training the search-parameter model.
+      config: sizes, with `coverage` and `min_radius`.
+      collected: D_q and held-out sets, drawn from `dist`.
+      measured: the accepted measured set, [set_episodes, time].
+      dist: the distribution that the episodes were drawn from.
+      knobs: not used.
     """
-    model, loss = spm.train(key, config.spm, collected.trajectory, collected.params, dist)
+    model, loss = spm.train(key, config.spm, collected.trajectory, collected.coords, dist)
     held_out = jax.lax.map(lambda episodes: spm.estimate(config.spm, model, episodes), collected.held_out)
-    truth = dists.normalise(dist, collected.held_out_params)
+    truth = dists.normalise(dist, collected.held_out_coords)
     low, high = dists.normalised_box(dist)
     interval = _conformal_quantile(jnp.abs(held_out - truth), config.coverage)
     ignorant = _conformal_quantile(jnp.abs((low + high) / 2 - truth), config.coverage)
@@ -178,8 +285,8 @@ def posterior_update(key, config, collected, measured, dist, knobs) -> tuple[Par
     moved = dists.move(dist, step)
     radius = dists.ravel(dist.radius)
     narrowed = jnp.clip(radius * interval, jnp.minimum(config.min_radius, radius), radius)
-    # Held-out truths all lie in the box; where the interval reaches past it, their errors do not bound the measured
-    # one.
+    # Held-out truths all lie in the box. Where the interval reaches past it, their errors do not bound the measured
+    # one, and a narrow box at the edge could shut the truth out for good.
     inside = (step - interval >= low) & (step + interval <= high)
     radius = jnp.where(identifiable & inside, narrowed, radius)
     moved = moved.replace(radius=dists.unravel(dists.names(dist), radius))
@@ -187,14 +294,21 @@ def posterior_update(key, config, collected, measured, dist, knobs) -> tuple[Par
 
 
 def no_gate_log(config: TunerConfig) -> dict:
-    """The gate's part of an `Info` before any call was made."""
+    """Makes the gate's part of a `tuner.Info` before any gate call: -1 for verdicts, nan for everything else.
+
+    Every array has `max_widenings + 1` entries, one per possible call, so its shape does not depend on how many calls a
+    tuning needs.
+    """
     log = jnp.full(config.max_widenings + 1, jnp.nan)
     gate = GateInfo(novelty=log, threshold=log, p_value=log, uncovered=log, elbo=log)
     return {"verdicts": jnp.full(log.shape, -1), "radius": log, "gate": gate}
 
 
 def no_update(dist: ParamDist) -> UpdateInfo:
-    """What an update that did not happen reports."""
+    """Reports that no update was made: steps of zero, no coordinate identifiable, intervals and loss nan.
+
+    It has the shapes of a real update's report, so the two can be the branches of one `jax.lax.cond`.
+    """
     zeros = jnp.zeros(len(dist.centre))
     unknown = jnp.full_like(zeros, jnp.nan)
     return UpdateInfo(step=zeros, interval=unknown, identifiable=jnp.zeros_like(zeros, bool), loss=jnp.asarray(jnp.nan))

@@ -1,12 +1,23 @@
-"""The search-parameter model: does the truth lie above a guess? (Section III-B.1 and IV-A.4.)
+"""The search-parameter model (SPM): does the true coordinate lie above a guess? (Sections III-B.1 and IV-A.4.)
 
-A window of 50 steps and a guess of all parameters are encoded by a three-layer MLP each; a two-layer head for every
-parameter reads both and answers with a logit, trained by logistic regression on `truth > guess`. Departures from the
-paper: a window enters as its moments (BayesSim, Ramos et al., RSS 2019, likewise reads covariances of states and
-actions), since a network that sees the raw steps of a few hundred episodes learns them by heart; the answer is used
-with its sign (its rule `mu + alpha q` with q in (0, 1) can only grow); guesses are drawn over the query box
-independently of the truth, the centre among them, so that the answers over a sweep of guesses are one minus a
-distribution function; a window's encoding serves several guesses.
+It turns identification into a yes-no question, coordinate by coordinate. A window of 50 steps and a guess of all
+coordinates are encoded by a three-layer MLP each. A two-layer head per coordinate reads both encodings and answers with
+a logit, trained by logistic regression:
+
+    loss = mean over windows and guesses of  softplus(logit) - label * logit,    label = 1[truth > guess]
+    sigmoid(logit) = p(truth > guess | window).
+
+`train` fits the model to D_q. `vote` asks about the centre alone and gives a direction, as in the paper. `estimate`
+sweeps the guess and gives a value. Everything is in radii of the distribution that the model was trained on.
+
+Departures from the paper:
+
+- A window enters as its moments, since a network that sees the raw steps of a few hundred episodes learns them by
+  heart. BayesSim (Ramos et al., RSS 2019) likewise reads covariances of states and actions.
+- The answer has a sign. The paper's rule `mu + alpha q` with q in (0, 1) can only raise a parameter.
+- Guesses are drawn over the whole query box independently of the truth, the centre among them. Only then is
+  p(truth > guess), as a function of the guess, one minus a distribution function, so that a sweep is a posterior.
+- Each window's encoding serves several guesses, which is cheaper than encoding it for each.
 """
 
 from dataclasses import dataclass
@@ -20,79 +31,89 @@ from jaxtyping import Array, Bool, Float
 
 from jaxtune import dist as dists
 from jaxtune import windows
-from jaxtune.types import Named, ParamDist, Trajectory
+from jaxtune.types import Coords, ParamDist, Trajectory
 
-_SCALED = 2048  # windows that the scale of the moments is read from
+_SCALED = 2048  # windows from which mean and standard deviation of the moments are computed
 _FAR = 10.0  # standard deviations; a moment that hardly varied in training must not drown all others later
 
 
 @dataclass(frozen=True, kw_only=True)
 class SPMConfig:
-    """Sizes of the search-parameter model and its training."""
+    """Sizes of the search-parameter model and of its training.
+
+    The defaults suit the seven coordinates of the paper on two CPU cores. `TunerConfig` holds one.
+    """
 
     window: int = 50
     """Steps in a window."""
     stride: int = 10
-    """Steps between the windows of a measured episode."""
+    """Steps from the start of one window to the next, where a set of episodes is scored."""
     hidden: tuple[int, int, int] = (256, 128, 128)
-    """Layers of the trajectory encoder; the guess encoder has a quarter of their width."""
+    """Layer widths of the window's encoder; the guess's encoder has a quarter of them."""
     head: int = 64
-    """Hidden width of every parameter's head."""
+    """Hidden width of each coordinate's head."""
     train_steps: int = 1200
     """Gradient steps."""
     batch: int = 256
     """Windows in a gradient step."""
     guesses: int = 4
-    """Guesses judged for every window of a batch, the centre among them."""
+    """Guesses per window of a batch, the centre among them."""
     learning_rate: float = 5e-4
     """Peak of a one-cycle cosine schedule."""
     weight_decay: float = 1e-3
-    """Decoupled weight decay."""
+    """Decoupled weight decay of AdamW."""
     sweep: int = 33
-    """Guesses in a sweep over the box."""
+    """Guesses in the sweep over the box that `estimate` makes."""
 
 
 class _Network(nn.Module):
+    """Encoders of window and guess, and all coordinates' heads as one layer and one contraction."""
+
     config: SPMConfig
-    num_params: int
+    num_coords: int
 
     def setup(self):
         self.window_layers = [nn.Dense(width) for width in self.config.hidden]
         self.guess_layers = [nn.Dense(width // 4) for width in self.config.hidden]
-        self.head_hidden = nn.Dense(self.num_params * self.config.head)
-        self.head_out = self.param("head_out", nn.initializers.lecun_normal(), (self.config.head, self.num_params))
+        self.head_hidden = nn.Dense(self.num_coords * self.config.head)
+        self.head_out = self.param("head_out", nn.initializers.lecun_normal(), (self.config.head, self.num_coords))
 
     def __call__(self, features, guesses):
-        """Logits [batch, guesses, params] for moments [batch, moments] and guesses [batch, guesses, params]."""
+        """Logits [batch, guesses, coords] for moments [batch, moments] and guesses [batch, guesses, coords]."""
         for layer in self.window_layers:
             features = nn.elu(layer(features))
         for layer in self.guess_layers:
             guesses = nn.elu(layer(guesses))
         features = jnp.broadcast_to(features[:, None], (*guesses.shape[:2], features.shape[-1]))
         hidden = nn.elu(self.head_hidden(jnp.concatenate([features, guesses], axis=-1)))
-        hidden = hidden.reshape(*hidden.shape[:-1], self.num_params, self.config.head)
+        hidden = hidden.reshape(*hidden.shape[:-1], self.num_coords, self.config.head)
         return jnp.einsum("...ph,hp->...p", hidden, self.head_out)
 
 
 @chex.dataclass(frozen=True)
 class SPM:
-    """A trained search-parameter model and the distribution it was trained on."""
+    """A trained search-parameter model, as `train` returns it.
+
+    It answers only within the distribution that it was trained on, in that distribution's radii. Hand it to `logits`,
+    `vote` or `estimate` with the config that it was trained with.
+    """
 
     variables: dict
-    steps: windows.Scaler  # of channels
-    moments: windows.Scaler  # of a window's moments
-    dist: ParamDist
+    steps: windows.Scaler  # scales the channels of each step
+    moments: windows.Scaler  # scales the moments of each window
+    dist: ParamDist  # the distribution it was trained on
 
 
 def _read(steps: windows.Scaler, moments: windows.Scaler, window: Float[Array, "batch time channels"]):
-    """What the network sees of a window [batch, moments]."""
+    """Computes the network's input: the standardised moments of each window, clipped."""
     return jnp.clip(moments(_moments(steps(window))), -_FAR, _FAR)
 
 
 def _moments(window: Float[Array, "batch time channels"]) -> Float[Array, "batch moments"]:
-    """Mean of every channel, spread of its first and second differences, covariances at lag zero and one.
+    """Computes a window's moments: each channel's mean and spread of first and second differences, and covariances.
 
-    The gait clock is among the channels, so covariances tell phases.
+    Covariances are taken between all channels, within a step and between the deviation at one step and the change to
+    the next. The gait clock is among the channels of a walking robot, so these covariances hold phases.
     """
     batch, time, channels = window.shape
     mean = window.mean(axis=1)
@@ -105,23 +126,27 @@ def _moments(window: Float[Array, "batch time channels"]) -> Float[Array, "batch
 
 
 def train(
-    key: jax.Array, config: SPMConfig, trajectory: Trajectory, params: Named, dist: ParamDist
+    key: jax.Array, config: SPMConfig, trajectory: Trajectory, coords: Coords, dist: ParamDist
 ) -> tuple[SPM, jax.Array]:
-    """Trains on simulated episodes.
+    """Trains a search-parameter model on simulated episodes of known coordinates.
+
+    Each gradient step draws windows, and for each window the centre and `guesses - 1` uniform guesses from the query
+    box. Steps, moments and coordinates are standardised first. An update calls this once per tuning.
 
     Args:
       key: random key.
       config: sizes.
-      trajectory: [episodes, time].
-      params: the true parameters of every episode, [episodes] by name.
-      dist: the distribution they were drawn from; its support is the query box.
+      trajectory: the episodes (D_q), [episodes, time].
+      coords: true coordinates of every episode, [episodes] by name.
+      dist: the distribution that they were drawn from; its support is the query box.
 
     Returns:
-      The model, and its logistic loss per parameter in nats, the mean over the last tenth of the steps. Ignorance costs
-      log 2 at the centre and 1/2, on average over the box, elsewhere.
+      The model, and its logistic loss per coordinate in nats, as the mean over the last tenth of the steps. A model
+      that learned nothing has a loss of log 2 = 0.69 at the centre and, on average, 0.5 elsewhere in the box; a loss
+      near that says that the episodes do not show the coordinates.
     """
     key_init, key_moments, key_train = jax.random.split(key, 3)
-    truth = dists.normalise(dist, params)
+    truth = dists.normalise(dist, coords)
     low, high = dists.normalised_box(dist)
     steps = windows.fit_scaler(trajectory)
     window, _ = windows.draw(key_moments, trajectory, _SCALED, config.window)
@@ -154,16 +179,25 @@ def train(
 
 
 def logits(
-    config: SPMConfig, spm: SPM, trajectory: Trajectory, guesses: Float[Array, "guesses params"]
-) -> Float[Array, "guesses params"]:
-    """Evidence of a set of episodes, for each guess: the mean logit over the set's windows.
+    config: SPMConfig, spm: SPM, trajectory: Trajectory, guesses: Float[Array, "guesses coords"]
+) -> Float[Array, "guesses coords"]:
+    """Computes how strongly a set of episodes says that the truth lies above each guess.
+
+    This is the mean logit over the set's valid windows: the evidence of one typical window. The windows of a set are
+    not independent, so a sum would be far too certain; updates calibrate their intervals per set instead.
 
     Args:
-      trajectory: [episodes, time], one set.
-      guesses: in units of the radius around the centre.
+      config: the sizes that the model was trained with.
+      spm: the model.
+      trajectory: one set, [episodes, time].
+      guesses: guesses of all coordinates, in radii.
+
+    Returns:
+      Logits of p(truth > guess), each coordinate by itself. They are zero where the set has no valid window.
     """
     cut, valid = windows.grid(trajectory, config.window, config.stride)
     cut, valid = cut.reshape(-1, *cut.shape[2:]), valid.reshape(-1)
+    # A broken simulation may leave nan behind, which a weight of zero would not remove.
     cut = jnp.where(valid[:, None, None], cut, spm.steps.mean)
     network = _Network(config, guesses.shape[-1])
     moments = _read(spm.steps, spm.moments, cut)
@@ -171,24 +205,40 @@ def logits(
     return _masked_mean(answers, valid)
 
 
-def vote(config: SPMConfig, spm: SPM, trajectory: Trajectory) -> Float[Array, " params"]:
-    """Which way each parameter must move from the centre, in [-1, 1]; positive raises it."""
+def vote(config: SPMConfig, spm: SPM, trajectory: Trajectory) -> Float[Array, " coords"]:
+    """Says for each coordinate which way it must move from the centre, in [-1, 1]; positive means up.
+
+        vote = 2 sigmoid(logit at the centre) - 1 = 2 p(truth > centre) - 1
+
+    It is the signed form of the paper's q, zero where the set says nothing. `rules.vote_update` turns it into a step.
+    """
     centre = jnp.zeros((1, len(spm.dist.centre)))
     return 2.0 * jax.nn.sigmoid(logits(config, spm, trajectory, centre)[0]) - 1.0
 
 
-def estimate(config: SPMConfig, spm: SPM, trajectory: Trajectory) -> Float[Array, " params"]:
-    """Where the sweep's logit crosses zero, for each parameter, in units of the radius around the centre.
+def estimate(config: SPMConfig, spm: SPM, trajectory: Trajectory) -> Float[Array, " coords"]:
+    """Estimates each coordinate from a set of episodes, in radii.
 
-    Guesses of different parameters are independent in training, so one sweep along the box's diagonal serves them all.
-    The crossing is found as the length of the part of the box where the logit is positive, which is the same where the
-    curve falls and stays inside the box where it never crosses.
+    The estimate is the median of the posterior: the guess at which p(truth > guess) is one half, so that its logit
+    crosses zero. It is found by sweeping the guess across the box, as
+
+        low + (high - low) * (share of the box where the logit, interpolated linearly, is positive),
+
+    which is the crossing if the curve falls, and stays inside the box if it never crosses. Guesses of different
+    coordinates are independent in training, so one sweep along the box's diagonal serves them all. A truth outside the
+    box is estimated at its edge; a set that says nothing is answered with the middle of the box.
+
+    Args:
+      config: the sizes that the model was trained with.
+      spm: the model.
+      trajectory: one set, [episodes, time].
     """
     low, high = dists.normalised_box(spm.dist)
     share = jnp.linspace(0.0, 1.0, config.sweep)[:, None]
     curve = logits(config, spm, trajectory, low + share * (high - low))
     left, right = curve[:-1], curve[1:]
     rise = jnp.where(left == right, 1.0, left - right)
+    # Share of each part of the sweep, between two neighbouring guesses, in which the logit is positive.
     crossing = jnp.clip(left / rise, 0.0, 1.0)
     positive = jnp.where((left > 0) & (right > 0), 1.0, 0.0)
     positive = jnp.where((left > 0) & (right <= 0), crossing, positive)
@@ -199,5 +249,6 @@ def estimate(config: SPMConfig, spm: SPM, trajectory: Trajectory) -> Float[Array
 
 
 def _masked_mean(values: Float[Array, "windows ..."], valid: Bool[Array, " windows"]) -> Float[Array, "..."]:
+    """Averages over the valid windows; zero where there are none."""
     weight = valid / jnp.maximum(valid.sum(), 1)
     return jnp.tensordot(weight, values, axes=1)

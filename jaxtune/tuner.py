@@ -1,25 +1,72 @@
-"""Algorithm 1: measure, verify, widen or update, train the policy, again.
+"""The tuner: Algorithm 1 of *Safe and Efficient Auto-tuning to Cross Sim-to-real Gap for Bipedal Robot* ("the paper").
 
-    for each tuning
-      measured <- measure(policy)
-      do
-        D_q, held-out sets <- simulate(policy, draws of dist)
-        verdict <- verify(D_q, held-out sets, measured)
-        if the verdict is `widen`: radius <- radius * widen_factor
-      while the verdict is `widen`
-      if the verdict is `accept`: dist <- update(D_q, measured, dist)
-      policy <- train_policy(policy, dist)
+It tunes the distribution that a simulator's parameters are drawn from, until simulated episodes agree with measured
+ones, and trains a policy in it. One tuning is one `Tuner.step`:
 
-Departures from the paper: a tuning ends, not starts, with training the policy, so that the first one finds the policy
-that was trained in the first distribution, and the last one leaves a policy that knows the last; the radius grows
-only where the check fails (in print it grows before the test), is capped by the bounds, and the loop ends with a
-verdict; a set's novelty is the mean rank, not the mean, of Eq. 2 over its windows, and the threshold is not set by hand
-but is a quantile of the novelty of held-out simulated sets of as many episodes, which makes the gate a conformal test;
-the update is signed.
+    state: policy, dist, knobs
+      |
+      measure(policy)  ->  measured set                          the robot walks a few episodes
+      |
+      +-> simulate(policy, draws of dist)  ->  D_q, held-out sets  <----------------+
+      |   verify(D_q, held-out sets, measured set)  ->  novelty, threshold          |
+      |   verdict:                                                                  |
+      |     widen               radius <- min(radius * widen_factor, bounds) -------+
+      |     accept              dist <- update(D_q, held-out sets, measured set, dist)
+      |     unexplained         the centre stays where it is: the model lacks physics
+      |     radius_exhausted    the centre stays: no wider distribution is allowed
+      |     not_finite          the centre stays: there was nothing to score
+      |
+      train_policy(policy, dist)
+      |
+    state of the next tuning, and Info for plots and reports
 
-Everything here is pure. How a policy is trained, how episodes are simulated and measured, how a set is verified and
-how the distribution is updated are functions handed in; with a target in JAX, `Tuner.run` is one program that can be
-vmapped.
+D_q holds the simulated episodes that gate and update learn from; the held-out sets imitate the measured set and
+calibrate both. Novelty says how unlike them the measured set is. The verdict is the first of these that holds:
+`not_finite` if novelty or threshold is not a finite number; `accept` if novelty <= threshold; `unexplained` after
+`patience` calls in a row without progress; `radius_exhausted` if the distribution fills its bounds or was widened
+`max_widenings` times; else `widen`. However a tuning ends, the radius stays as wide as it became, unless the update
+narrows it.
+
+Departures from the paper:
+
+- A tuning ends with training the policy, where the paper's begins with it. So the first tuning finds the policy that
+  was trained in the first distribution, and the last one leaves a policy that knows the last distribution.
+- The radius grows only after a failed check (in print it grows before each), is capped by the bounds, and the loop ends
+  with a verdict instead of running for ever.
+- Gate and update depart as well, above all in a threshold that is calibrated instead of set by hand, and in an update
+  that has a sign or follows a posterior: see `jaxtune.rules`.
+
+Everything here is pure: a key and a state go in, a state and an info come out. A user hands in three functions; gate
+and update are functions as well and have defaults:
+
+    import jax
+    import jax.numpy as jnp
+    from jaxtune import dist
+    from jaxtune.tuner import Tuner, TunerConfig, knobs
+    from jaxtune.types import Trajectory
+
+    def train_policy(key, policy, dist):  # any learner, on draws of dist; here the policy is a constant push
+        return policy, {}
+
+    def simulate(key, policy, coords):  # one episode per draw; a cart whose friction is searched in log space
+        start = jax.random.normal(key, coords["friction"].shape)
+        move = lambda speed, _: (speed + 0.1 * (policy - jnp.exp(coords["friction"]) * speed), speed)
+        speed = jax.lax.scan(move, start, length=100)[1].T  # [episodes, time]
+        alive, no = jnp.ones(speed.shape, bool), jnp.zeros(start.shape, bool)
+        obs, action = speed[..., None], jnp.full((*speed.shape, 1), policy)
+        return Trajectory(obs=obs, action=action, alive=alive, score=speed, fell=no, not_finite=no)
+
+    def measure(key, policy):  # the robot; here another cart, whose friction the tuner does not know
+        return simulate(key, policy, {"friction": jnp.full(5, 0.8)})
+
+    tuner = Tuner(config=TunerConfig(), train_policy=train_policy, simulate=simulate, measure=measure)
+    first = dist.make({"friction": 0.0}, 0.2, {"friction": -2.0}, {"friction": 2.0})
+    state = tuner.init(1.0, first, knobs())
+
+`tuner.run(key, state, num_tunings)` then does the rest, and `state.dist.centre` holds what was found. With a target in
+JAX, `run` is one program that can be jitted and vmapped over seeds, starts and knobs. With any other target (another
+engine, a log on disk, a robot), leave `measure` out, loop over `tuner.train` and `tuner.tune`, and fetch the measured
+set between them.
 """
 
 from collections.abc import Callable
@@ -46,7 +93,7 @@ from jaxtune.rules import (
     posterior_update,
     vote_update,
 )
-from jaxtune.types import Named, ParamDist, Trajectory, Verdict
+from jaxtune.types import Coords, ParamDist, Trajectory, Verdict
 
 __all__ = [
     "Collected",
@@ -64,29 +111,41 @@ __all__ = [
 ]
 
 Policy = Any
+"""Whatever the user's functions take as a policy: any pytree; the tuner only passes it on."""
 TrainPolicy = Callable[[jax.Array, Policy, ParamDist], tuple[Policy, dict]]
-Simulate = Callable[[jax.Array, Policy, Named], Trajectory]
+"""`(key, policy, dist) -> (policy, metrics)`: trains the policy on robots drawn from the distribution."""
+Simulate = Callable[[jax.Array, Policy, Coords], Trajectory]
+"""`(key, policy, coords [episodes]) -> Trajectory [episodes, time]`: one episode for every draw."""
 Measure = Callable[[jax.Array, Policy], Trajectory]
+"""`(key, policy) -> Trajectory [set_episodes, time]`: episodes of the target, whose coordinates nobody knows."""
 
 
 @chex.dataclass(frozen=True)
 class Info:
-    """One tuning, for plots and reports; gate calls that were not made hold nan and -1."""
+    """What happened in one tuning: everything that a plot or a report needs and the next tuning does not.
 
-    train: dict  # what the policy's training reported
-    calls: jax.Array  # number of gate calls
-    verdicts: jax.Array  # [calls], -1 where none was made
-    radius: jax.Array  # [calls], the largest of the parameters' radii
+    Arrays marked [calls] have `max_widenings + 1` entries, one per possible gate call. Entries of calls that were not
+    made hold nan, or -1 as a verdict; the tuning's outcome is `verdicts[calls - 1]`. `Tuner.run` stacks all fields to
+    [num_tunings, ...].
+    """
+
+    train: dict  # metrics that `train_policy` reported; empty after `Tuner.tune`
+    calls: jax.Array  # number of gate calls made
+    verdicts: jax.Array  # [calls], see `jaxtune.types.Verdict`
+    radius: jax.Array  # [calls], the largest radius of the distribution that was tested, in coordinates
     gate: GateInfo  # [calls]
-    update: UpdateInfo
-    dist: ParamDist  # the distribution the last episodes were drawn from
-    measured_falls: jax.Array  # measured episodes that ended early
-    not_finite: jax.Array  # episodes, simulated or measured, that broke
+    update: UpdateInfo  # steps of zero where no update was made
+    dist: ParamDist  # the distribution that the last episodes were drawn from, before the update
+    measured_falls: jax.Array  # number of measured episodes that ended early
+    not_finite: jax.Array  # number of episodes, simulated or measured, whose simulation broke
 
 
 @chex.dataclass(frozen=True)
 class TunerState:
-    """What the next tuning needs."""
+    """What the next tuning needs, and nothing else: save it to resume a run, stack it to vmap over runs.
+
+    Everything is traced, so a tuner compiled once accepts any policy, distribution and knobs of the same shapes.
+    """
 
     policy: Any
     dist: ParamDist
@@ -95,16 +154,19 @@ class TunerState:
 
 @dataclass(frozen=True, kw_only=True)
 class Tuner:
-    """Algorithm 1 over the functions it is given.
+    """Algorithm 1 over the functions that it is given; the module's docstring draws the schedule.
+
+    A tuner is a frozen record without state of its own. To make a variant, such as a baseline, swap a function with
+    `dataclasses.replace`.
 
     Attributes:
       config: sizes.
-      train_policy: `(key, policy, dist) -> (policy, metrics)`.
-      simulate: `(key, policy, params [episodes]) -> Trajectory [episodes, time]`.
-      measure: `(key, policy) -> Trajectory [set_episodes, time]`, of the same length, policy and commands; None where
-        the target is not JAX, and the measured set is handed to `tune`.
-      verify: scores a measured set.
-      update: moves the distribution after an accepted set.
+      train_policy: `(key, policy, dist) -> (policy, metrics)`; metrics are scalars or arrays by name.
+      simulate: `(key, policy, coords [episodes]) -> Trajectory [episodes, time]`; it must be traceable by JAX.
+      measure: `(key, policy) -> Trajectory [set_episodes, time]`, with the same episode length, policy, commands and
+        observation noise as `simulate`. None where the target is not JAX; hand the measured set to `tune` then.
+      verify: scores a measured set against simulated ones; `rules.calibrated_gate` unless given.
+      update: moves the distribution after an accepted set; `rules.posterior_update` unless given.
     """
 
     config: TunerConfig
@@ -115,27 +177,54 @@ class Tuner:
     update: Update = posterior_update
 
     def init(self, policy: Policy, dist: ParamDist, knobs: Knobs) -> TunerState:
-        """The state before the first tuning."""
+        """Makes the state before the first tuning.
+
+        `policy` should have been trained in `dist` already (`train` does that), since a tuning measures before it
+        trains.
+        """
         return TunerState(policy=policy, dist=dist, knobs=knobs)
 
     def step(self, key: jax.Array, state: TunerState) -> tuple[TunerState, Info]:
-        """One tuning: measure, tune, train."""
+        """Does one tuning: measures a set, tunes the distribution with it, and trains the policy in the result.
+
+        Use it where the target is in JAX, so that `measure` can be traced. It is pure: the same key and state give the
+        same result, jitted or not.
+        """
         key_measure, key_tune, key_train = jax.random.split(key, 3)
         state, info = self.tune(key_tune, state, self.measure(key_measure, state.policy))
         state, metrics = self.train(key_train, state)
         return state, info.replace(train=metrics)
 
     def run(self, key: jax.Array, state: TunerState, num_tunings: int) -> tuple[TunerState, Info]:
-        """All tunings; every field of the info is stacked, [num_tunings, ...]."""
+        """Does `num_tunings` tunings (the paper's K) in one `jax.lax.scan`.
+
+        Returns the last state, and the infos of all tunings with every field stacked, [num_tunings, ...]. Jit it with
+        `num_tunings` static.
+        """
         return jax.lax.scan(lambda state, key: self.step(key, state), state, jax.random.split(key, num_tunings))
 
     def train(self, key: jax.Array, state: TunerState) -> tuple[TunerState, dict]:
-        """Trains the policy in the current distribution."""
+        """Trains the policy in the state's distribution by the user's `train_policy`; returns state and metrics.
+
+        Call it before the first tuning, and after every `tune` in a loop over a target that is not JAX.
+        """
         policy, metrics = self.train_policy(key, state.policy, state.dist)
         return state.replace(policy=policy), metrics
 
     def tune(self, key: jax.Array, state: TunerState, measured: Trajectory) -> tuple[TunerState, Info]:
-        """Verifies a measured set, widens until it is covered, and updates the distribution if it is."""
+        """Verifies a measured set, widens the distribution until it covers the set, and then updates it.
+
+        This is a tuning without measuring and training, for targets that are not JAX. The distribution is updated only
+        if the last verdict is `accept`; otherwise its centre stays.
+
+        Args:
+          key: random key.
+          state: the state whose policy produced the measured set.
+          measured: the measured set, [set_episodes, time].
+
+        Returns:
+          The state with the new distribution, and the `Info`, with an empty `train`.
+        """
         key_gate, key_update = jax.random.split(key)
         carry = self._gate_loop(key_gate, state, measured)
         moved, update = jax.lax.cond(
@@ -157,7 +246,7 @@ class Tuner:
         return state.replace(dist=moved), info
 
     def _gate_loop(self, key, state, measured):
-        """The do-while of Algorithm 1."""
+        """Simulates, verifies and widens while the verdict is `widen`: the do-while of Algorithm 1."""
 
         def body(carry):
             calls = carry["calls"]
@@ -167,7 +256,7 @@ class Tuner:
             gate = self.verify(key_verify, self.config, collected, measured, state.knobs)
             closer = gate.novelty < carry["closest"] - self.config.least_fall
             stalled = jnp.where(closer, 0, carry["stalled"] + 1)
-            verdict = self._judge(gate, dist, calls, stalled)
+            verdict = self._verdict(gate, dist, calls, stalled)
             broken = collected.trajectory.not_finite.sum() + collected.held_out.not_finite.sum()
             wider = dists.widen(dist, state.knobs.widen_factor)
             return {
@@ -175,7 +264,7 @@ class Tuner:
                 "dist": jax.tree.map(lambda new, old: jnp.where(verdict == Verdict.WIDEN, new, old), wider, dist),
                 "collected": collected,
                 "verdict": verdict,
-                # Many small falls may add up to one that counts.
+                # Several small decreases may add up to one that counts as progress.
                 "closest": jnp.where(closer, gate.novelty, carry["closest"]),
                 "stalled": stalled,
                 "verdicts": carry["verdicts"].at[calls].set(verdict),
@@ -187,6 +276,7 @@ class Tuner:
         return jax.lax.while_loop(lambda carry: carry["verdict"] == Verdict.WIDEN, body, self._before_gate(key, state))
 
     def _before_gate(self, key, state):
+        """Makes the loop's carry before the first call; the verdict `widen` lets the loop begin."""
         shapes = jax.eval_shape(self.collect, key, state.policy, state.dist)
         return {
             "calls": jnp.zeros((), int),
@@ -199,24 +289,34 @@ class Tuner:
             **no_gate_log(self.config),
         }
 
-    def collect(self, key, policy, dist) -> Collected:
-        """Episodes for training and held-out sets, simulated in one batch."""
+    def collect(self, key: jax.Array, policy: Policy, dist: ParamDist) -> Collected:
+        """Simulates D_q and the held-out sets under one policy, with coordinates drawn from one distribution.
+
+        Every episode of D_q is a robot of its own; a held-out set is one robot in `set_episodes` episodes, like a
+        measured set. All `episodes + held_out_sets * set_episodes` episodes are simulated in one batch. `tune` calls
+        this before every gate call; call it yourself to study gate or update alone.
+        """
         key_train, key_held_out, key_simulate = jax.random.split(key, 3)
         sets, each = self.config.held_out_sets, self.config.set_episodes
-        params = dists.sample(key_train, dist, self.config.episodes)
-        held_out_params = dists.sample(key_held_out, dist, sets)
-        every = jax.tree.map(lambda a, b: jnp.concatenate([a, jnp.repeat(b, each)]), params, held_out_params)
+        coords = dists.sample(key_train, dist, self.config.episodes)
+        held_out_coords = dists.sample(key_held_out, dist, sets)
+        # One call of the simulator for both, so that it is compiled once and the device is full.
+        every = jax.tree.map(lambda a, b: jnp.concatenate([a, jnp.repeat(b, each)]), coords, held_out_coords)
         trajectory = self.simulate(key_simulate, policy, every)
         return Collected(
             trajectory=jax.tree.map(lambda leaf: leaf[: self.config.episodes], trajectory),
-            params=params,
+            coords=coords,
             held_out=jax.tree.map(
                 lambda leaf: leaf[self.config.episodes :].reshape(sets, each, *leaf.shape[1:]), trajectory
             ),
-            held_out_params=held_out_params,
+            held_out_coords=held_out_coords,
         )
 
-    def _judge(self, gate: GateInfo, dist: ParamDist, calls: jax.Array, stalled: jax.Array) -> jax.Array:
+    def _verdict(self, gate: GateInfo, dist: ParamDist, calls: jax.Array, stalled: jax.Array) -> jax.Array:
+        """Chooses the verdict of one gate call; the first condition that holds wins.
+
+        `calls` counts earlier calls of this tuning. `stalled` counts calls in a row without progress, with this one.
+        """
         exhausted = dists.at_bounds(dist) | (calls >= self.config.max_widenings)
         return jnp.select(
             [

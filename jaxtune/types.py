@@ -1,4 +1,12 @@
-"""What the parts of jaxtune, and everything built on it, hand to each other."""
+"""Records that the parts of jaxtune, and the code built on it, pass to each other.
+
+`Trajectory`, `Coords`, `ParamDist` and `Verdict` belong to the tuner. `Parameter` and `Effect` describe what the
+discovery workflow may add to a model. This module imports nothing from the rest of the package.
+
+Two kinds of value have two names. A *parameter* is physical: a multiplier of the nominal model's value (0.8 of a mass)
+or an offset (0.004 s of delay). A *coordinate* is the number that is searched in its stead: the logarithm of a
+multiplier, so that halving and doubling are equally far, or an offset as it is. The tuner sees coordinates alone.
+"""
 
 import enum
 import math
@@ -10,20 +18,27 @@ import chex
 import jax
 import jax.numpy as jnp
 
-Named = Mapping[str, jax.Array]
-"""Parameters by name, in the coordinates that are searched (the logarithm of a multiplier, say)."""
+Coords = Mapping[str, jax.Array]
+"""Searched values by name: the logarithm of a multiplier, or an offset. All arrays have one shape, often [episodes].
+
+Physical values, by contrast, are called `params`.
+"""
 
 
 @chex.dataclass(frozen=True)
 class Trajectory:
-    """Episodes of equal length, simulated or measured; what follows an early end is masked, not cut.
+    """A set of episodes of equal length, simulated or measured.
 
-    Leading dimensions may be stacked in front of `episodes`.
+    This is what a user's `simulate` and `measure` return, and all that the tuner ever sees of a robot. Simulated and
+    measured episodes must come from the same policy, commands, resets and observation noise; otherwise their comparison
+    measures those instead of the physics. An episode that ends early keeps its length: later steps are masked by
+    `alive` and may hold anything, nan included. Units of observations, actions and scores are the user's. Leading
+    dimensions may be stacked in front of `episodes`, such as [sets, episodes, time].
     """
 
-    obs: jax.Array  # [episodes, time, obs]
-    action: jax.Array  # [episodes, time, act]
-    alive: jax.Array  # [episodes, time], True where the step began in a living, finite robot
+    obs: jax.Array  # [episodes, time, obs], what the policy saw at the beginning of each step
+    action: jax.Array  # [episodes, time, act], what it answered
+    alive: jax.Array  # [episodes, time], True where the episode had not ended and the robot's state was finite
     score: jax.Array  # [episodes, time], reward of each step, zero where not alive
     fell: jax.Array  # [episodes], True where the episode ended early
     not_finite: jax.Array  # [episodes], True where it ended because the simulation broke
@@ -31,9 +46,16 @@ class Trajectory:
 
 @chex.dataclass(frozen=True)
 class ParamDist:
-    """A uniform distribution over named parameters, `U(centre - radius, centre + radius)` cut to the bounds.
+    """A uniform distribution over named coordinates: what the tuner tunes.
 
-    Every field maps the same names to scalars in search coordinates. The paper's Xi ~ U(mu, r).
+    Every coordinate is drawn independently from
+
+        U(max(centre - radius, lower), min(centre + radius, upper)).
+
+    Policy, gate and search-parameter model are all trained on draws of it. An update moves `centre` and may narrow
+    `radius`; widening multiplies `radius`; `lower` and `upper` are fixed physical bounds. All four fields map the same
+    names to scalars in coordinates (log space for multipliers). This is the paper's Xi ~ U(mu, r), with a radius for
+    every coordinate. Make one with `jaxtune.dist.make`, which checks it.
     """
 
     centre: dict
@@ -43,47 +65,72 @@ class ParamDist:
 
 
 class Verdict(enum.IntEnum):
-    """What the gate says of a measured set."""
+    """What the gate concludes about a measured set.
+
+    `WIDEN` keeps the tuning going; the other four end it. Only `ACCEPT` is followed by an update. `Info.verdicts` holds
+    the verdicts of one tuning in order, with -1 for gate calls that were not made.
+    """
 
     ACCEPT = 0
-    """The simulated episodes cover the measured ones."""
+    """The simulated episodes cover the measured ones, so an update can be trusted."""
     WIDEN = 1
-    """They do not; a wider distribution may."""
+    """The simulated episodes do not cover the measured ones, but a wider distribution may."""
     UNEXPLAINED = 2
-    """They do not, and widening did not bring them closer: physics is missing."""
+    """The measured set is not covered, and widening brought it no closer. The model lacks physics: use discovery."""
     RADIUS_EXHAUSTED = 3
-    """They do not, and the distribution has reached its bounds or its last permitted widening."""
+    """The measured set is not covered, and the distribution fills its bounds or was widened as often as allowed."""
     NOT_FINITE = 4
-    """No score could be computed: no usable window, or a number that is not finite."""
+    """No score could be computed: no episode held a whole window, or a number was not finite."""
 
 
 Scale = Literal["one", "torque", "damping", "stiffness", "inertia", "mass", "drag", "speed", "slow", "motor"]
-"""What one unit of a coordinate stands for, where that depends on the robot and on how it was moved."""
+"""Quantity that one unit of a discovery coordinate stands for.
+
+Except for `one`, its size depends on the robot and on how it moved in the log, such as the rms torque of a joint.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Parameter:
-    """A number that an effect has, searched in a coordinate that is zero where the effect is not there."""
+    """One number of an effect, with the rule that turns its coordinate into a physical value.
+
+    Discovery fits coordinates, since they are of order one for every effect and zero where an effect is absent. For a
+    coordinate c at a place of scale s (see `Scale`):
+
+        form                `inner`: the physics reads    `value`: a report prints
+        added               c s                           c s
+        ratio               c                             exp(c)
+        ratio, `shape`      exp(c) s                      exp(c) s
+        reciprocal          c / s                         s / c
+
+    The three methods also take arrays, and broadcast coordinate against scale.
+    """
 
     name: str
     """Ends in its unit, unless it is a ratio."""
     bounds: tuple[float, float]
-    """Least and largest coordinate."""
+    """Smallest and largest coordinate."""
     form: Literal["added", "ratio", "reciprocal"] = "added"
-    """What the coordinate is: what is added to the nominal model, the logarithm of a ratio, or the reciprocal of a
-    limit or a stiffness that the nominal model has not."""
+    """What the coordinate is: an addition to the nominal model, the logarithm of a ratio to it, or the reciprocal of a
+    limit or stiffness that the nominal model does not have (infinite there, so its reciprocal is zero)."""
     scale: Scale = "one"
+    """What one unit of the coordinate stands for."""
     prior: float = 1.0
-    """Standard deviation of the coordinate, before anything was measured."""
+    """Standard deviation of the coordinate before anything is measured."""
     shape: bool = False
-    """Means nothing where the other parameters are zero; its coordinate starts at zero all the same."""
+    """True for a parameter that only shapes its effect, such as the speed at which friction falls off. It has no
+    influence while the effect's other parameters are zero, and its coordinate starts at zero like theirs."""
     fields: tuple[str, ...] = ()
-    """Fields of the model that it enters, where it is one of the model's."""
+    """Fields of the MuJoCo model that it changes, if it changes any."""
     column: int | None = None
-    """Which column of them; every one where None."""
+    """Column of these fields that it changes; all columns where None."""
 
     def inner(self, coordinate, scale):
-        """What the physics reads of a coordinate at places of this scale; zero where the effect is not there."""
+        """Converts a coordinate at a place of this scale into the number that the physics reads.
+
+        That number is zero where the effect is absent (except for a `shape`), so limits and stiffnesses enter as
+        reciprocals and ratios as logarithms.
+        """
         if self.form == "reciprocal":
             return coordinate / scale
         if self.form == "ratio":
@@ -91,14 +138,20 @@ class Parameter:
         return coordinate * scale
 
     def value(self, coordinate, scale):
-        """Physical value, in the unit of the name; infinite where there is no limit."""
+        """Converts a coordinate into the physical value that a report shows, in the unit that `name` ends in.
+
+        A limit or a stiffness is infinite where its coordinate is zero.
+        """
         inner = self.inner(coordinate, scale)
         if self.form == "reciprocal":
             return 1.0 / inner
         return jnp.exp(inner) if self.form == "ratio" and not self.shape else inner
 
     def coordinate(self, value: float, scale: float) -> float:
-        """The inverse of `value`."""
+        """Converts a physical value back into its coordinate; the inverse of `value`.
+
+        It is for values that are read from files, so it takes plain numbers.
+        """
         if self.form == "reciprocal":
             return scale / value
         if self.form == "ratio":
@@ -108,28 +161,40 @@ class Parameter:
 
 @dataclass(frozen=True, kw_only=True)
 class Effect:
-    """Something that a model may lack: one row of the library.
+    """A physical effect that a model may lack, such as friction, delay or play: one row of the discovery library.
 
-    `act(values, signal, now, memory) -> (signal, memory)` is what it does to the signal of the stage that it enters,
-    `values` its parameters by name, [places] each. An effect of the model has none: its parameters name the fields.
+    An effect either changes fields of the model (`enters="model"`; its parameters name the fields) or acts on a signal
+    on its way between controller and joint. In that case
+
+        act(values, signal, now, memory) -> (signal, memory)
+
+    transforms the signal of the stage that it enters, at every step. `values` maps parameter names to what
+    `Parameter.inner` gives, [places] each; `now` holds the joints' state at this step; `memory` is what the effect kept
+    from the step before, None where it has no `start`.
     """
 
     name: str
     family: str
+    """Group of related effects, such as those of the actuator."""
     enters: Literal["model", "command", "error", "torque", "transmission", "friction", "wrench", "sensor", "gravity"]
+    """Stage at which it acts: the model, or a signal from the commanded target to the sensor."""
     on: Literal["joint", "body", "foot", "robot"]
+    """Kind of place that has values of its own."""
     parameters: tuple[Parameter, ...]
     sizes: tuple[float, ...]
-    """Coordinates at which it is looked for, the smallest size of interest first; effects without a derivative at zero
-    have larger ones beside it."""
+    """Coordinates at which the search first tries the effect, the smallest of interest first. An effect without a
+    derivative at zero lists larger ones too."""
     sentence: str
-    """What a person should picture."""
+    """What happens in the robot, for a report."""
     excited_by: str
-    """The experiment that shows it, and tells it from its like."""
+    """Experiment in which the effect shows and is distinguishable from similar ones."""
     act: Callable[..., Any] | None = None
+    """Transforms the stage's signal; None for an effect that changes fields of the model."""
     start: Callable[..., Any] | None = None
-    """`start(values, signal, dt) -> memory` of a robot that has been like this for ever, where it remembers."""
+    """`start(values, signal, dt) -> memory`: the memory after a constant signal has lasted for ever. None where nothing
+    is remembered."""
     undo: Callable[..., Any] | None = None
-    """Of a sensor: `undo(values, readings, dt) -> truth`, [time, 2, joints] of positions and velocities."""
+    """For a sensor effect, `undo(values, readings, dt) -> truth`: recovers true positions and velocities from recorded
+    ones, [time, 2, joints]."""
     needs: Literal["", "free", "gravity"] = ""
-    """A free base, or a signal that must have been recorded."""
+    """What the log must offer: a robot with a free base, or a recorded gravity vector."""

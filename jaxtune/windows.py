@@ -1,7 +1,11 @@
-"""Windows of consecutive (observation, action) tuples, cut from episodes when they are drawn.
+"""Cuts windows of consecutive (observation, action) tuples from episodes, and scales them.
 
-All windows of 600 episodes would fill gigabytes, so none is kept. A window that reaches past a fall is dropped, not
-padded: it would tell the networks when the robot fell instead of how it moves.
+Both models of the tuner read windows, of 50 steps by default as in the paper (section IV-A.3). Windows are cut when
+they are drawn and never stored: all windows of 600 episodes would take gigabytes. A window that reaches past an
+episode's end is dropped, not padded, because padding would show the networks when the robot fell instead of how it
+moves.
+
+`draw` gives random windows for training; `grid` gives evenly spaced ones for scoring a measured set.
 """
 
 import chex
@@ -11,16 +15,23 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxtune.types import Trajectory
 
-_MIN_STD = 1e-3
+_MIN_STD = 1e-3  # a channel that is constant in training would otherwise be divided by zero
 
 
 def steps(trajectory: Trajectory) -> Float[Array, "... time channels"]:
-    """Observation and action of every step side by side."""
+    """Puts observation and action of every step side by side, observation first.
+
+    These `obs + act` numbers are the channels of every window.
+    """
     return jnp.concatenate([trajectory.obs, trajectory.action], axis=-1)
 
 
 def valid_starts(alive: Bool[Array, "*episodes time"], length: int) -> Bool[Array, "*episodes starts"]:
-    """True where a window of `length` steps from here lies within the episode."""
+    """Marks the steps at which a window of `length` steps lies wholly within its episode.
+
+    There are `time - length + 1` possible starts. A start is valid if all steps up to the window's last one are alive,
+    so nothing after an end counts even if the mask were to come back.
+    """
     ended = jnp.cumsum(~alive, axis=-1)
     return ended[..., length - 1 :] == 0
 
@@ -28,12 +39,22 @@ def valid_starts(alive: Bool[Array, "*episodes time"], length: int) -> Bool[Arra
 def draw(
     key: jax.Array, trajectory: Trajectory, count: int, length: int
 ) -> tuple[Float[Array, "count length channels"], Int[Array, " count"]]:
-    """Draws windows, all valid ones being equally likely, with replacement.
+    """Draws random windows for training, with replacement and all valid ones equally likely.
+
+    An episode that ended early has fewer valid windows and is drawn less often. The set must hold at least one valid
+    window: without one, an invalid window is returned, since nothing can be raised inside a jitted program.
+
+    Args:
+      key: random key.
+      trajectory: the episodes, [episodes, time].
+      count: number of windows.
+      length: steps in a window.
 
     Returns:
       The windows, and the index of the episode that each was cut from.
     """
     valid = valid_starts(trajectory.alive, length)
+    # The n-th valid start is where the running count first exceeds n.
     cumulative = jnp.cumsum(valid.reshape(-1))
     rank = jax.random.randint(key, (count,), 0, jnp.maximum(cumulative[-1], 1))
     flat = jnp.searchsorted(cumulative, rank, side="right")
@@ -45,7 +66,14 @@ def draw(
 def grid(
     trajectory: Trajectory, length: int, stride: int
 ) -> tuple[Float[Array, "*episodes starts length channels"], Bool[Array, "*episodes starts"]]:
-    """Windows at every `stride`-th step of every episode, and which of them are valid."""
+    """Cuts a window of `length` steps at every `stride`-th step of every episode.
+
+    Use it to score a set of episodes: the same set always gives the same windows. Windows overlap where `stride` is
+    below `length`.
+
+    Returns:
+      The windows, and which of them are valid. The others hold steps after an end and must be masked.
+    """
     starts = jnp.arange(0, trajectory.alive.shape[-1] - length + 1, stride)
     within = starts[:, None] + jnp.arange(length)
     return steps(trajectory)[..., within, :], valid_starts(trajectory.alive, length)[..., starts]
@@ -53,17 +81,27 @@ def grid(
 
 @chex.dataclass(frozen=True)
 class Scaler:
-    """Mean and standard deviation of every channel."""
+    """Mean and standard deviation of every channel, used to standardise what a network reads.
+
+    Fit it on simulated episodes with `fit_scaler`, or on any values with `scaler`, and call it on arrays whose last
+    axis is the channel. Measured episodes are scaled by the simulation's scaler, so that a shift between the two stays
+    visible.
+    """
 
     mean: jax.Array  # [channels]
-    std: jax.Array  # [channels]
+    std: jax.Array  # [channels], never zero
 
     def __call__(self, windows: Float[Array, "... channels"]) -> Float[Array, "... channels"]:
+        """Standardises values channel by channel: `(windows - mean) / std`, of any leading shape."""
         return (windows - self.mean) / self.std
 
 
 def scaler(values: Float[Array, "... channels"], weight: Float[Array, "... 1"] | None = None) -> Scaler:
-    """The scaler of values, weighted where a weight that sums to one is given."""
+    """Fits a scaler to values, over all axes but the last.
+
+    `weight` counts some values more than others, or not at all; it broadcasts against the values and must sum to one
+    over a channel. All values count alike where it is None. Values of weight zero must still be finite.
+    """
     axes = tuple(range(values.ndim - 1))
     weight = values.shape[-1] / values.size if weight is None else weight
     mean = jnp.sum(weight * values, axis=axes)
@@ -72,7 +110,10 @@ def scaler(values: Float[Array, "... channels"], weight: Float[Array, "... 1"] |
 
 
 def fit_scaler(trajectory: Trajectory) -> Scaler:
-    """The scaler of the steps that belong to an episode."""
+    """Fits a scaler to observations and actions of all steps that are alive.
+
+    Steps after an episode's end count for nothing, whatever they hold.
+    """
     # What follows an end may be anything, and zero times nan is nan.
     channels = jnp.where(trajectory.alive[..., None], steps(trajectory), 0.0)
     return scaler(channels, trajectory.alive[..., None] / jnp.maximum(trajectory.alive.sum(), 1))

@@ -3,8 +3,8 @@
 import mujoco
 import numpy as np
 
-from envs import domain
 from envs.biteno import constants
+from jaxtune.mjx import parameters
 
 # Compared at a relative 1e-5: what `mj_setConst` derives, and what it derives it from.
 FIELDS = (
@@ -29,7 +29,7 @@ FIELDS = (
 
 def params(**values):
     """Every parameter of the table, nominal but for those named; one structure, so one trace."""
-    return {name: np.float32(value) for name, value in {**domain.nominal(constants.ENTRIES), **values}.items()}
+    return {name: np.float32(value) for name, value in {**parameters.nominal(constants.ENTRIES), **values}.items()}
 
 
 def draw(rng, names, share=1.0):
@@ -44,7 +44,7 @@ def draw(rng, names, share=1.0):
 
 
 def recompiled(values):
-    """The MJCF with these parameters written into it and compiled, by no means that `envs.domain` uses."""
+    """The MJCF with these parameters written into it and compiled, by no means that `jaxtune.mjx` uses."""
     spec = mujoco.MjSpec.from_file(str(constants.MODEL_PATH))
     for side in constants.SIDES:
         for link in ("abductor", "thigh", "shank"):

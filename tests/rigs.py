@@ -1,4 +1,4 @@
-"""Robots on the rig, the motion that they are asked for, and the same motion in MuJoCo C."""
+"""Robots on the rig, the motion that they are sent, and the same motion in MuJoCo C."""
 
 from pathlib import Path
 
@@ -121,8 +121,8 @@ def in_mujoco(rig, model, segment, command=None, sense=None, motor=None, outside
         seen = seen if sense is None else sense(seen)
         read.append(seen)
         if x["sample"]:
-            asked = x["stiffness"] * (x["target"] - seen[0]) - x["damping"] * seen[1]
-            held = np.clip(asked, -x["limit"], x["limit"]) + x["feed"]
+            wanted = x["stiffness"] * (x["target"] - seen[0]) - x["damping"] * seen[1]
+            held = np.clip(wanted, -x["limit"], x["limit"]) + x["feed"]
         torque = held if motor is None else motor(held)
         data.qfrc_applied[rig.dof] = torque - x["emf"] * data.qvel[rig.dof]
         if outside is not None:

@@ -54,7 +54,7 @@ train_dvm = long_jit(dvm.train, static_argnums=1)
 class Slider:
     """A mass on a spring, pushed by a force of two tones: `mass v' = force - friction v - stiffness x + wind`.
 
-    Parameters are `mass` and `friction`, logarithms of multipliers of 1 kg and 1 Ns/m, and where it is named a steady
+    Coordinates are `mass` and `friction`, logarithms of multipliers of 1 kg and 1 Ns/m, and where it is named a steady
     `wind` in N: no mass and no friction moves the point of rest, so they cannot stand in for it. Other names enter
     nowhere. Observed are position and velocity, with noise. The tones surround the resonance of the nominal slider
     (2 rad/s), so mass and friction show within any 2.5 s.
@@ -69,21 +69,21 @@ class Slider:
     tones = (1.5, 4.0)
 
     @functools.partial(jax.jit, static_argnames="self")
-    def simulate(self, key: jax.Array, policy: Mapping, params: Mapping) -> Trajectory:
-        """One episode for every draw of the parameters, [episodes] by name."""
-        count = params["mass"].shape[0]
-        return jax.vmap(lambda key, params: self._episode(key, policy, params))(jax.random.split(key, count), params)
+    def simulate(self, key: jax.Array, policy: Mapping, coords: Mapping) -> Trajectory:
+        """One episode for every draw of the coordinates, [episodes] by name."""
+        count = coords["mass"].shape[0]
+        return jax.vmap(lambda key, coords: self._episode(key, policy, coords))(jax.random.split(key, count), coords)
 
     def measure(self, truth: Mapping, count: int):
         """The function that measures `count` episodes of a slider with these parameters."""
-        params = {name: jnp.full(count, value, jnp.float32) for name, value in truth.items()}
-        return lambda key, policy: self.simulate(key, policy, params)
+        coords = {name: jnp.full(count, value, jnp.float32) for name, value in truth.items()}
+        return lambda key, policy: self.simulate(key, policy, coords)
 
-    def _episode(self, key, policy, params):
+    def _episode(self, key, policy, coords):
         key_start, key_noise = jax.random.split(key)
         time = self.dt * jnp.arange(self.steps)
         force = policy["amplitude"] * jnp.sin(jnp.outer(time, jnp.array(self.tones))).sum(axis=-1)
-        mass, friction, wind = jnp.exp(params["mass"]), jnp.exp(params["friction"]), params.get("wind", 0.0)
+        mass, friction, wind = jnp.exp(coords["mass"]), jnp.exp(coords["friction"]), coords.get("wind", 0.0)
 
         def step(state, force):
             position, velocity = state
@@ -109,7 +109,7 @@ def policy() -> dict:
 
 
 def train_policy(key, policy, dist):
-    """Counts how often it was asked; the force stays what it is, so that episodes of all tunings compare."""
+    """Counts its calls; the force stays what it is, so that episodes of all tunings compare."""
     rounds = policy["rounds"] + 1
     return {**policy, "rounds": rounds}, {"rounds": rounds}
 
@@ -126,15 +126,15 @@ def uniform(centre: Mapping, radius: float = 0.4, bound: float = 1.2) -> ParamDi
 
 def collect(key: jax.Array, dist: ParamDist, config: TunerConfig = TUNER) -> Collected:
     """Simulated episodes of one distribution, as the gate and an update see them."""
-    key_params, key_held_out, key_simulate = jax.random.split(key, 3)
-    params = dists.sample(key_params, dist, config.episodes)
+    key_coords, key_held_out, key_simulate = jax.random.split(key, 3)
+    coords = dists.sample(key_coords, dist, config.episodes)
     truths = dists.sample(key_held_out, dist, config.held_out_sets)
     each = {name: jnp.repeat(value, config.set_episodes) for name, value in truths.items()}
     held_out = Slider().simulate(jax.random.fold_in(key_simulate, 1), policy(), each)
     shape = config.held_out_sets, config.set_episodes
     return Collected(
-        trajectory=Slider().simulate(key_simulate, policy(), params),
-        params=params,
+        trajectory=Slider().simulate(key_simulate, policy(), coords),
+        coords=coords,
         held_out=jax.tree.map(lambda leaf: leaf.reshape(*shape, *leaf.shape[1:]), held_out),
-        held_out_params=truths,
+        held_out_coords=truths,
     )

@@ -5,9 +5,9 @@ import jax.numpy as jnp
 from brax.envs.base import Env as BraxEnv
 from brax.envs.base import State as BraxState
 
-from envs import domain
 from envs.biteno import constants
 from envs.biteno.env import Biteno, State
+from jaxtune.mjx import parameters
 
 
 class BraxBiteno(BraxEnv):
@@ -24,17 +24,17 @@ class BraxBiteno(BraxEnv):
         """Resets a batch of nominal robots, one for each key in `rng` [batch, ...]."""
         count = rng.shape[0]
         params = {
-            name: jnp.full(count, value, jnp.float32) for name, value in domain.nominal(self._robot.entries).items()
+            name: jnp.full(count, value, jnp.float32) for name, value in parameters.nominal(self._robot.entries).items()
         }
         return self.start(params, rng)
 
-    def start(self, params: domain.Params, keys: jax.Array) -> BraxState:
+    def start(self, params: parameters.Params, keys: jax.Array) -> BraxState:
         """Resets a batch of robots with the given parameters, each value [batch]."""
         robots = jax.vmap(self._robot.reset)(params, keys)
         return self._as_brax(params, robots, robots, jnp.zeros_like(robots.done))
 
     @staticmethod
-    def with_params(state: BraxState, params: domain.Params) -> BraxState:
+    def with_params(state: BraxState, params: parameters.Params) -> BraxState:
         """The same robots, wherever they are, with other parameters [batch]."""
         # A weakly typed value would have the next step compiled anew.
         params = {name: jnp.asarray(value, jnp.float32) for name, value in params.items()}

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from envs.domain import Entry
+from jaxtune.mjx import Entry
 
 MODEL_PATH = Path(__file__).parent / "model.xml"
 

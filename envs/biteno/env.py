@@ -19,9 +19,10 @@ import mujoco
 import numpy as np
 from mujoco import mjx
 
-from envs import domain, sensing
+from envs import sensing
 from envs.biteno import constants, gait, rewards
 from envs.chain import MIN_FRICTION_NM
+from jaxtune.mjx import parameters
 
 ACTION_LIMIT = 10.0
 _MIN_HEIGHT_M = 0.35
@@ -124,7 +125,7 @@ class Biteno:
     def __init__(
         self,
         config: TaskConfig,
-        entries: Mapping[str, domain.Entry] = constants.ENTRIES,
+        entries: Mapping[str, parameters.Entry] = constants.ENTRIES,
         path: Path = constants.MODEL_PATH,
     ):
         if set(config.weights) != set(constants.TABLE_ONE):
@@ -160,15 +161,15 @@ class Biteno:
             model.opt.iterations *= 2
             model.opt.ls_iterations *= 2
 
-    def model(self, params: domain.Params) -> mjx.Model:
+    def model(self, params: parameters.Params) -> mjx.Model:
         """The robot with these parameters."""
-        return domain.apply(self._model, params, self.entries)
+        return parameters.apply(self._model, params, self.entries)
 
-    def reset(self, params: domain.Params, key: jax.Array) -> State:
+    def reset(self, params: parameters.Params, key: jax.Array) -> State:
         """Starts an episode near the standing pose, at a random phase, under a random command.
 
         Args:
-          params: physical values by name (`envs.domain`); a reset does not depend on them, a step does.
+          params: physical values by name (`jaxtune.mjx`); a reset does not depend on them, a step does.
           key: random key.
         """
         del params
@@ -195,17 +196,17 @@ class Biteno:
         )
         return state.replace(obs=self._observe(state, key_noise))
 
-    def step(self, params: domain.Params, state: State, action: jax.Array) -> State:
+    def step(self, params: parameters.Params, state: State, action: jax.Array) -> State:
         """Moves the robot on by one policy step of 10 ms under an action [6]."""
         return self.move(params, state, action)[0]
 
-    def move(self, params: domain.Params, state: State, action: jax.Array) -> tuple[State, Motion]:
+    def move(self, params: parameters.Params, state: State, action: jax.Array) -> tuple[State, Motion]:
         """A step, and the motion behind it."""
         drive = self.drive(params, state, action)
         motion = self.simulate(params, state, drive)
         return self.settle(state, drive, motion), motion
 
-    def drive(self, params: domain.Params, state: State, action: jax.Array) -> Drive:
+    def drive(self, params: parameters.Params, state: State, action: jax.Array) -> Drive:
         """What an action [6] asks of the joints."""
         action = jnp.clip(action, -ACTION_LIMIT, ACTION_LIMIT)
         reference = gait.joint_reference(state.phase, state.command)
@@ -218,7 +219,7 @@ class Biteno:
         targets = target + (1.0 - arrived[:, None]) * (held - target)
         return Drive(action=action, target=target, targets=targets, reference=reference)
 
-    def simulate(self, params: domain.Params, state: State, drive: Drive) -> Motion:
+    def simulate(self, params: parameters.Params, state: State, drive: Drive) -> Motion:
         """Physics in MJX; another engine may stand in for it."""
         model = self.model(params)
         data = self._data.replace(qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.qacc_warmstart)
@@ -236,7 +237,7 @@ class Biteno:
         return mjx.rne_postconstraint(model, data)._impl.cfrc_ext[self._shanks, 3:]
 
     def settle(self, state: State, drive: Drive, motion: Motion) -> State:
-        """What the robot perceives, earns and is asked for after it moved."""
+        """Observation, rewards, termination and the next command, after the robot moved."""
         finite = jnp.isfinite(motion.qpos).all() & jnp.isfinite(motion.qvel).all()
         zeros = jnp.zeros_like(state.qvel)
         qpos, qvel, warmstart, torque, action, target = jax.tree.map(
@@ -311,9 +312,9 @@ class Biteno:
         )
 
     @staticmethod
-    def ask(state: State, command: jax.Array, phase: jax.Array) -> State:
+    def with_command(state: State, command: jax.Array, phase: jax.Array) -> State:
         """The same robot under another command [3], its gait clock at another phase [2]."""
-        return state.replace(command=command, phase=phase, obs=sensing.with_request(state.obs, command, phase))
+        return state.replace(command=command, phase=phase, obs=sensing.with_command(state.obs, command, phase))
 
     def _push(self, key: jax.Array, qvel: jax.Array, steps: jax.Array) -> jax.Array:
         if not self.config.push_mps:

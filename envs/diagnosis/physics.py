@@ -17,7 +17,7 @@ _BETTER = 0.25  # by how much all parts together must agree better, in units of 
 _SHARE = 0.1  # and by which share of what they disagree
 _MOST_REPAIRS = 3
 _UNITS = ("degrees", "radians twice", "millinewtonmetres")
-_ROWS = 250  # that the model is asked about, at most
+_ROWS = 250  # that the model is evaluated at, at most
 _DELAYS_S = (0.004, 0.008, 0.012, 0.016, 0.024, 0.032, 0.045)
 _LEAST_OFFSET_RAD = 0.025
 _LEAST_DRIFT = 0.015
@@ -86,10 +86,10 @@ class _Disagreement:
     """How much a run disagrees with itself and with the model, [0, 2] for every part and joint, summed.
 
     Args:
-      run: as it was read; what is not in it is not asked about.
+      run: as it was read; what is not in it is not examined.
       joints: of the log.
       model: of the robot.
-      dynamics: whether torques are asked about.
+      dynamics: whether torques are examined.
     """
 
     def __init__(self, run: Run, joints: tuple[str, ...], model: mujoco.MjModel, dynamics: bool):
@@ -112,28 +112,25 @@ class _Disagreement:
         found = {}
         if "dq" in run.signals:
             found["velocity"] = _apart(run.signals["dq"], slope)
-        asked = self.asked(run)
-        if asked is not None and "tau" in run.signals:
-            found["torque"] = _apart(run.signals["tau"], asked)
+        commanded = self.commanded(run)
+        if commanded is not None and "tau" in run.signals:
+            found["torque"] = _apart(run.signals["tau"], commanded)
         if "target" in run.signals:
             found["target"] = 0.5 * _apart(run.signals["target"], position)
         low, high = self._range
         found["range"] = _MOST * ((position < low - 0.1) | (position > high + 0.1)).mean(axis=0)
-        given = asked if asked is not None else run.signals.get("tau")
+        given = commanded if commanded is not None else run.signals.get("tau")
         if self.dynamics and given is not None:
             needed, rows = self.needed(run, position, slope)
             found["dynamics"] = _apart(_together(given)[rows], needed)
         return found
 
-    def asked(self, run: Run) -> np.ndarray | None:
+    def commanded(self, run: Run) -> np.ndarray | None:
         """Torque of the controller, [rows, joints]; None where it has none that is known."""
         if not self._driven:
             return None
-        gains = run.controller.gains
         speed = run.signals["dq"] if "dq" in run.signals else smoothed(run)[:, 1]
-        torque = gains["kp"] * (run.signals["target"] - run.signals["q"]) - gains["kd"] * speed
-        on = run.signals.get("enabled", np.ones(len(run.time)))[:, None]
-        return on * np.clip(torque, -gains["torque_limit_nm"], gains["torque_limit_nm"])
+        return run.impedance().torque(run.signals["target"], run.signals["q"], speed)
 
     def needed(self, run: Run, position: np.ndarray, slope: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Torque that the model needs for the motion [some rows, joints], and which rows."""
@@ -209,14 +206,14 @@ def _earlier(names: tuple[str, ...], rows: int, run: Run) -> Run:
 
 def _offsets(run: Run, disagreement: _Disagreement) -> list[_Repair]:
     """Positions moved by what the controller's torque lacks in the mean."""
-    asked = disagreement.asked(run)
-    if asked is None or not disagreement.dynamics:
+    commanded = disagreement.commanded(run)
+    if commanded is None or not disagreement.dynamics:
         return []
     position, slope = np.moveaxis(smoothed(replace(run, signals={"q": run.signals["q"]})), 1, 0)
     needed, rows = disagreement.needed(run, position, slope)
-    free = np.abs(asked[rows]) < 0.98 * run.controller.gains["torque_limit_nm"]
+    free = np.abs(commanded[rows]) < 0.98 * run.controller.gains["torque_limit_nm"]
     on = run.signals.get("enabled", np.ones(len(run.time)))[rows, None] > 0
-    lacks = np.where(free & on, asked[rows] - needed, np.nan)
+    lacks = np.where(free & on, commanded[rows] - needed, np.nan)
     found = []
     for joint, column in enumerate(lacks.T):
         if np.isnan(column).all():

@@ -6,8 +6,9 @@ joint positions, velocities and targets in rad, torques in Nm, all about the mod
 nothing else. Nothing is dropped, reordered or filled.
 """
 
+from envs.logs.controller import Controller, Impedance
 from envs.logs.files import read, write
-from envs.logs.format import Controller, Log, Run, splits
+from envs.logs.format import Log, Run, splits
 from envs.logs.xl330 import read_xl330
 
-__all__ = ["Controller", "Log", "Run", "read", "read_xl330", "splits", "write"]
+__all__ = ["Controller", "Impedance", "Log", "Run", "read", "read_xl330", "splits", "write"]

@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from envs.logs.controller import Controller, Impedance
+
 JOINT_SIGNALS = ("q", "dq", "target", "tau", "action")
 """Signals with a column for every joint."""
 
@@ -25,19 +27,6 @@ VECTOR_SIGNALS = {
 SCALAR_SIGNALS = ("enabled", "volts")
 SPLITS = ("train", "select", "sealed")
 _SHARES = dict(zip(SPLITS, (2, 1, 1), strict=True))
-GAINS = {"pd": ("kp", "kd", "torque_limit_nm"), "servo": ("gain", "kt", "resistance_ohm")}
-"""Numbers of a controller by type, each one for all joints or one per joint."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Controller:
-    """What turns targets into torques."""
-
-    kind: str
-    """pd: torque = kp (target - q) - kd dq, limited. servo: duty = gain (target - q), limited to +-1, feeds a motor."""
-    rate_hz: float
-    gains: Mapping[str, np.ndarray]
-    """[joints] by name, the names of `GAINS`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,6 +45,17 @@ class Run:
     """[rows], [rows, joints] or [rows, components] by the name of the signal; those that were recorded."""
     other: Mapping[str, np.ndarray] = field(default_factory=dict)
     """Columns that the format does not know, [rows] by name, as they are."""
+
+    def impedance(self) -> Impedance:
+        """The controller at every row, [rows, joints], switched off where the motors were.
+
+        A run without targets, whose torques were sent directly, has no stiffness, no damping and no limit.
+        """
+        if "target" not in self.signals:
+            none = np.zeros(self.signals["q"].shape)
+            return Impedance(stiffness=none, damping=none, limit=none + np.inf, back_emf=none)
+        on = self.signals.get("enabled", np.ones(len(self.time)))
+        return self.controller.impedance(on, self.signals.get("volts"))
 
 
 @dataclass(frozen=True, kw_only=True)

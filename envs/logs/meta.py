@@ -10,13 +10,12 @@ import mujoco
 import numpy as np
 import yaml
 
+from envs.logs.controller import GAINS, Controller
 from envs.logs.format import (
-    GAINS,
     JOINT_SIGNALS,
     SCALAR_SIGNALS,
     SPLITS,
     VECTOR_SIGNALS,
-    Controller,
     column_names,
 )
 

@@ -5,7 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from envs.logs.format import JOINT_SIGNALS, Controller, Log, Run
+from envs.logs.controller import Controller
+from envs.logs.format import JOINT_SIGNALS, Log, Run
 from envs.logs.tables import check_time, check_values
 
 KT, RESISTANCE_OHM = 0.38, 3.6  # Nm/A, Ohm: the published Coulomb-viscous fit

@@ -13,9 +13,9 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from envs import domain
 from envs.biteno import Biteno, Drive, Motion, State, constants
 from envs.targets.host import HostTarget
+from jaxtune.mjx import parameters
 
 try:
     import pybullet
@@ -82,7 +82,7 @@ class Bullet:
         for name in _MISSING:
             if params.get(name, 1.0) != 1.0:
                 raise ValueError(f"params['{name}']: got {params[name]}, but PyBullet has no such thing")
-        model = domain.apply_mujoco(robot.mj_model, params, robot.entries)
+        model = parameters.apply_mujoco(robot.mj_model, params, robot.entries)
         self._model = model
         self._dt = model.opt.timestep
         self._com = model.body("trunk").ipos.copy()

@@ -7,8 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.biteno import Biteno, CorrectedBiteno, Drive, Motion, State
-from envs.targets.protocol import Act, Asked, Recording, watch
+from envs.biteno import Biteno, Drive, Motion, State
+from envs.corrected import CorrectedBiteno
+from envs.targets.protocol import Act, Commands, Recording, watch
 from jaxtune.types import Trajectory
 
 
@@ -40,7 +41,7 @@ class HostTarget:
         self.params = params
         self._engine = engine
         self._reset = jax.jit(jax.vmap(lambda key: robot.reset({}, key)))
-        self._ask = jax.jit(jax.vmap(robot.ask))
+        self._with_command = jax.jit(jax.vmap(robot.with_command))
         self._drive = jax.jit(jax.vmap(lambda state, action: robot.drive(params, state, action)))
         self._choose = jax.jit(lambda act, obs, keys: jax.vmap(lambda *one: act(*one)[0])(obs, keys))
         self._settle = jax.jit(jax.vmap(robot.settle))
@@ -50,21 +51,21 @@ class HostTarget:
         return self.record(key, act, count, steps)[0]
 
     def record(
-        self, key: jax.Array, act: Act, count: int, steps: int, asked: Asked | None = None
+        self, key: jax.Array, act: Act, count: int, steps: int, commands: Commands | None = None
     ) -> tuple[Trajectory, Recording]:
         """The same with the motion behind it."""
         act = act if isinstance(act, jax.tree_util.Partial) else jax.tree_util.Partial(act)
         keys = jax.vmap(jax.random.split)(jax.random.split(key, count))
         step_keys = np.asarray(jax.vmap(lambda key: jax.random.split(key, steps))(keys[:, 1]))
         state = self._reset(keys[:, 0])
-        if asked is not None and asked.phase is not None:
-            state = self._ask(state, asked.command[:, 0], asked.phase)
+        if commands is not None and commands.phase is not None:
+            state = self._with_command(state, commands.command[:, 0], commands.phase)
         self._engine.start(state)
         alive = np.ones(count, bool)
         not_finite = np.zeros(count, bool)
         records = []
         for index in range(steps):
-            state = state if asked is None else self._ask(state, asked.command[:, index], state.phase)
+            state = state if commands is None else self._with_command(state, commands.command[:, index], state.phase)
             action = self._choose(act, state.obs, step_keys[:, index])
             drive = self._drive(state, action)
             motion = self._engine.move(state, drive)

@@ -7,10 +7,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from envs import domain
 from envs.biteno import Biteno
-from envs.targets.protocol import Act, Asked, Recording, watch
-from jaxtune.types import Named, Trajectory
+from envs.targets.protocol import Act, Commands, Recording, watch
+from jaxtune.mjx import parameters
+from jaxtune.types import Coords, Trajectory
 
 _CHUNK = 256  # small batches are fastest on a CPU; larger ones are worked off in turn
 
@@ -19,9 +19,9 @@ def rollout(
     robot: Biteno,
     key: jax.Array,
     act: Act,
-    params: domain.Params,
+    params: parameters.Params,
     steps: int,
-    asked: Asked | None = None,
+    commands: Commands | None = None,
     watch: Callable[..., Any] = lambda before, after, motion: (),
 ) -> tuple[Trajectory, Any]:
     """Plays one episode for every parameter draw.
@@ -34,7 +34,7 @@ def rollout(
       act: the policy.
       params: physical values by name, each [episodes].
       steps: length of an episode.
-      asked: commands, and starts of the gait clock, in the stead of those that are drawn.
+      commands: commands, and starts of the gait clock, in the stead of those that are drawn.
       watch: what is recorded of a step, `(state before, state after, motion) -> pytree`.
 
     Returns:
@@ -44,7 +44,7 @@ def rollout(
     params = jax.lax.optimization_barrier(dict(params))
     count = next(iter(params.values())).shape[0]
     episode = jax.vmap(lambda *drawn: _episode(robot, act, steps, watch, *drawn))
-    inputs = (jax.random.split(key, count), params) + (() if asked is None else (asked,))
+    inputs = (jax.random.split(key, count), params) + (() if commands is None else (commands,))
     if count <= _CHUNK:
         return episode(*inputs)
     # Chunks of equal size; the last one is filled up with repetitions.
@@ -56,15 +56,15 @@ def rollout(
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:count], stacked)
 
 
-def _episode(robot, act, steps, watch, key, params, asked=None) -> tuple[Trajectory, Any]:
+def _episode(robot, act, steps, watch, key, params, commands=None) -> tuple[Trajectory, Any]:
     key_reset, key_act = jax.random.split(key)
     state = robot.reset(params, key_reset)
-    if asked is not None and asked.phase is not None:
-        state = robot.ask(state, asked.command[0], asked.phase)
+    if commands is not None and commands.phase is not None:
+        state = robot.with_command(state, commands.command[0], commands.phase)
 
     def step(carry, now):
         (state, alive), (key, command) = carry, now
-        state = state if command is None else robot.ask(state, command, state.phase)
+        state = state if command is None else robot.with_command(state, command, state.phase)
         action, _ = act(state.obs, key)
         following, motion = robot.move(params, state, action)
         broke = alive & (following.not_finite > 0)
@@ -72,7 +72,7 @@ def _episode(robot, act, steps, watch, key, params, asked=None) -> tuple[Traject
         record = (state.obs, action, alive & ~broke, score, broke), watch(state, following, motion)
         return (following, alive & (following.done == 0)), record
 
-    during = (jax.random.split(key_act, steps), None if asked is None else asked.command)
+    during = (jax.random.split(key_act, steps), None if commands is None else commands.command)
     (_, alive), (record, watched) = jax.lax.scan(step, (state, jnp.asarray(True)), during)
     obs, action, valid, score, broke = record
     trajectory = Trajectory(obs=obs, action=action, alive=valid, score=score, fell=~alive, not_finite=broke.any())
@@ -92,17 +92,17 @@ class MjxTarget:
         return rollout(self.robot, key, act, self._params(count), steps)[0]
 
     def record(
-        self, key: jax.Array, act: Act, count: int, steps: int, asked: Asked | None = None
+        self, key: jax.Array, act: Act, count: int, steps: int, commands: Commands | None = None
     ) -> tuple[Trajectory, Recording]:
         """The same with the motion behind it."""
-        return rollout(self.robot, key, act, self._params(count), steps, asked, watch)
+        return rollout(self.robot, key, act, self._params(count), steps, commands, watch)
 
     def _params(self, count: int) -> dict:
         return {name: jnp.full(count, value, jnp.float32) for name, value in self.params.items()}
 
 
 def simulate(
-    robot: Biteno, key: jax.Array, act: Act, coordinates: Named, steps: int, asked: Asked | None = None
+    robot: Biteno, key: jax.Array, act: Act, coords: Coords, steps: int, commands: Commands | None = None
 ) -> Trajectory:
     """Plays one episode for every draw of the tuner's distribution, [episodes] by name in search coordinates."""
-    return rollout(robot, key, act, domain.from_coordinates(robot.entries, coordinates), steps, asked)[0]
+    return rollout(robot, key, act, parameters.from_coords(robot.entries, coords), steps, commands)[0]

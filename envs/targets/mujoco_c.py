@@ -8,9 +8,9 @@ import mujoco
 import numpy as np
 from mujoco import rollout
 
-from envs import domain
 from envs.biteno import Biteno, Drive, Motion, State, constants
 from envs.targets.host import HostTarget
+from jaxtune.mjx import parameters
 
 _NET_FORCE = 3  # the sensor's way to reduce contacts to one
 _ITERATIONS = 100  # until it has converged, as MuJoCo does on its own
@@ -38,7 +38,7 @@ class MujocoC:
         self._repeats = round(ratio)
         if self._repeats < 1 or abs(ratio - self._repeats) > 1e-6:
             raise ValueError(f"timestep: got {model.opt.timestep}, which does not divide {robot.mj_model.opt.timestep}")
-        self._model = domain.apply_mujoco(model, params, robot.entries)
+        self._model = parameters.apply_mujoco(model, params, robot.entries)
         threads = os.cpu_count() if threads is None else threads
         self._data = [mujoco.MjData(self._model) for _ in range(threads)]
         self._pool = rollout.Rollout(nthread=threads)

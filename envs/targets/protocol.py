@@ -14,8 +14,8 @@ Act = Callable[[jax.Array, jax.Array], tuple[jax.Array, dict]]
 
 
 @chex.dataclass(frozen=True)
-class Asked:
-    """What episodes are asked for, in the stead of what would be drawn."""
+class Commands:
+    """Velocity commands and gait clocks of episodes, in place of those that the task would draw."""
 
     command: jax.Array  # [episodes, time, 3] m/s, m/s, rad/s
     phase: jax.Array | None = None  # [episodes, 2] cycles, where the gait clock starts; drawn where None
@@ -29,7 +29,7 @@ class Recording:
     qvel: jax.Array  # [12]
     torque: jax.Array  # [6] Nm
     foot_force: jax.Array  # [2, 3] N
-    command: jax.Array  # [3], that the step was asked for
+    command: jax.Array  # [3], under which the step was taken
     phase: jax.Array  # [2] cycles, at the step's end
 
 
@@ -54,6 +54,6 @@ class Target(Protocol):
         """Measures `count` episodes of `steps` policy steps."""
 
     def record(
-        self, key: jax.Array, act: Act, count: int, steps: int, asked: Asked | None = None
+        self, key: jax.Array, act: Act, count: int, steps: int, commands: Commands | None = None
     ) -> tuple[Trajectory, Recording]:
         """The same with the motion behind it."""

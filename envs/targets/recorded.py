@@ -18,7 +18,7 @@ from envs.biteno import constants, env, gait, rewards
 from envs.logs import Log, Run
 from envs.logs.format import JOINT_SIGNALS
 from envs.logs.sampling import HELD, sampled
-from envs.targets.protocol import Asked
+from envs.targets.protocol import Commands
 from jaxtune.types import Trajectory
 
 _NEEDED = ("q", "dq", "target", "action", "phase", "cmd", "gyro", "gravity", "vel")
@@ -36,7 +36,7 @@ class Recorded:
     """Measured episodes, and what a simulation needs to repeat them."""
 
     trajectory: Trajectory
-    asked: Asked  # from the run's first step on, a few before the trajectory's
+    commands: Commands  # from the run's first step on, a few before the trajectory's
     power: jax.Array  # [episodes, time] W, mechanical, braking not regained
     run: jax.Array  # [episodes] of the log, from 0; in order, and every run has one episode or more
     begin: jax.Array  # [episodes] policy steps between the first one of the run and that of the episode
@@ -82,14 +82,14 @@ def beginning(recorded: Recorded, steps: int) -> Recorded:
     """The first `steps` of every run's first episode."""
     first = np.unique(np.asarray(recorded.run), return_index=True)[1]
     one = jax.tree.map(lambda leaf: leaf[first], recorded)
-    trajectory, asked = one.trajectory, one.asked
-    lead = asked.command.shape[1] - trajectory.alive.shape[1]
+    trajectory, commands = one.trajectory, one.commands
+    lead = commands.command.shape[1] - trajectory.alive.shape[1]
     # Who still stands when the cut comes has not fallen before it.
     fell = trajectory.fell & ~trajectory.alive[:, steps:].any(axis=1)
     cut = {name: trajectory[name][:, :steps] for name in ("obs", "action", "alive", "score")}
     return one.replace(
         trajectory=trajectory.replace(fell=fell, **cut),
-        asked=asked.replace(command=asked.command[:, : lead + steps]),
+        commands=commands.replace(command=commands.command[:, : lead + steps]),
         power=one.power[:, :steps],
     )
 
@@ -182,10 +182,9 @@ def _wanted_torque(run: Run, seen: dict[str, np.ndarray], order: list[int]) -> n
     """What the joints' controller has asked for, [ticks, joints] Nm, where nobody measured what came of it."""
     if run.controller.kind != "pd":
         raise ValueError(f"{run.name}: there is no 'tau', expected it beside a controller of type servo")
-    kp, kd, limit = (run.controller.gains[name][order] for name in ("kp", "kd", "torque_limit_nm"))
     # Until now the target was that of the tick before.
     target = np.concatenate([seen["target"][:1], seen["target"][:-1]])
-    return np.clip(kp * (target - seen["q"]) - kd * seen["dq"], -limit, limit)
+    return run.controller.impedance()[order].torque(target, seen["q"], seen["dq"])
 
 
 def _pieces(ticks: dict[str, np.ndarray]) -> list[tuple[np.ndarray, bool]]:
@@ -261,7 +260,7 @@ def _as_simulated(steps: dict, lead: int) -> Recorded:
             fell=fell,
             not_finite=jnp.zeros_like(fell),
         ),
-        asked=Asked(
+        commands=Commands(
             command=jnp.take_along_axis(now["cmd"], held[..., None], axis=1),
             phase=gait.advance(now["phase"][:, 0], -lead),
         ),

@@ -1,4 +1,5 @@
-"""What every command shares: reading its arguments, printing, showing progress, and ending with one line on an error."""
+"""What every command shares: reading its arguments, printing, showing progress, and ending with one line on an
+error."""
 
 import threading
 import time

@@ -1,7 +1,7 @@
 """Sizes of the experiments: every number that decides how long a run takes and how good it can get, by preset.
 
-`smoke` runs every command in seconds to minutes and shows that it works, not that it tunes; `cpu` is for two cores, `gpu`
-for one data-centre GPU.
+`smoke` runs every command in seconds to minutes and shows that it works, not that it tunes; `cpu` is for two cores,
+`gpu` for one data-centre GPU.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,7 +19,8 @@ WALK = Path(__file__).parents[1] / "policies" / "walk"
 """The policy that ships with the package."""
 
 QUICK_COMPILATION = "--xla_backend_optimization_level=0 --xla_backend_extra_options=xla_cpu_disable_new_fusion_emitters"
-"""XLA flags of the preset `smoke` and of the tests: programs that run for seconds are not worth minutes of compiling."""
+"""XLA flags of the preset `smoke` and of the tests: programs that run for seconds are not worth minutes of
+compiling."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,4 +1,4 @@
-"""Pictures of the robot, rendered off screen by MuJoCo."""
+"""Pictures of the walking robot, rendered off screen by MuJoCo: a strip for a page, a film for the eye."""
 
 import os
 from pathlib import Path
@@ -15,11 +15,12 @@ _EVERY_STRIP, _EVERY_GIF = 6, 4  # policy steps between two pictures
 
 
 class NoPicture(RuntimeError):
-    """There is nothing to draw with."""
+    """MuJoCo cannot render here: no OpenGL off screen. A command that meets it prints why and goes on without
+    pictures."""
 
 
 def strip(path: Path, model: mujoco.MjModel, qpos: np.ndarray) -> None:
-    """Pictures side by side, 60 ms apart.
+    """Writes pictures of the second half of an episode side by side, 60 ms apart, so that a stride can be seen.
 
     Args:
       path: a PNG.
@@ -36,7 +37,16 @@ def strip(path: Path, model: mujoco.MjModel, qpos: np.ndarray) -> None:
 
 
 def gif(path: Path, model: mujoco.MjModel, qpos: np.ndarray) -> None:
-    """The episode in real time; arguments and errors as in `strip`."""
+    """Writes the whole episode as a GIF in real time.
+
+    Args:
+      path: a GIF.
+      model: the robot.
+      qpos: [time, 13] of one episode.
+
+    Raises:
+      NoPicture: no OpenGL for rendering off screen.
+    """
     first, *rest = map(Image.fromarray, _render(model, qpos[::_EVERY_GIF]))
     milliseconds = round(1000 * _EVERY_GIF * constants.POLICY_DT_S)
     first.save(path, save_all=True, append_images=rest, duration=milliseconds, loop=0)
@@ -49,7 +59,7 @@ def _render(model: mujoco.MjModel, qpos: np.ndarray) -> list[np.ndarray]:
     camera.distance, camera.azimuth, camera.elevation = 1.8, 90.0, -10.0
     try:
         renderer = mujoco.Renderer(model, height=_SIZE[1], width=_SIZE[0])
-    except Exception as error:  # every backend fails in a way of its own
+    except Exception as error:  # every OpenGL backend raises an exception of its own
         raise NoPicture(
             f"MuJoCo cannot render off screen ({error}); with MUJOCO_GL={os.environ.get('MUJOCO_GL', '')!r}. "
             "Set MUJOCO_GL to egl on a GPU, or to osmesa with OSMesa installed."

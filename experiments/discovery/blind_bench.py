@@ -1,7 +1,7 @@
 """The blind benchmark: writes the log of a robot that hides something, has discovery answer, and scores the answer.
 
-The truth goes into a folder of its own, `sealed`, which `Bench.scored` alone opens. Every case is a file, so a benchmark
-that is stopped goes on where it was, and several processes may share its cases.
+The truth goes into a folder of its own, `sealed`, which `Bench.scored` alone opens. Every case is a file, so a
+benchmark that is stopped goes on where it was, and several processes may share its cases.
 """
 
 import json
@@ -32,7 +32,7 @@ from jaxtune.discovery.problem import Residuals
 from jaxtune.discovery.result import Calibration
 from jaxtune.discovery.workflow import Discovery
 
-_HALVINGS = 6
+_HALVINGS = 6  # of the interval in which a size is searched: the severity is then right to a tenth
 
 
 class Bench:
@@ -59,25 +59,25 @@ class Bench:
 
     @property
     def cases(self) -> list[Case]:
-        """All of them, the harmless ones mixed in."""
+        """All cases, in an order that the seed draws, so that a case's number says nothing about what it hides."""
         listed = [*self.size.hidden, *self.size.outside, *[(None, 0.0)] * self.size.empty]
         order = np.random.default_rng(self._seed).permutation(len(listed))
         return [Case(number, *listed[index]) for number, index in enumerate(order)]
 
     def record(self, truth: Truth, seed: int, noise: bool = True) -> Log:
-        """Plays the motions on a robot with something in it."""
+        """Records the log of a robot that hides something (or nothing), with its own wrong nominal parameters."""
         log = record(
             self.spec, self.size.joints, self.motions, self.controller, truth, self._nominal_error, seed, noise
         )
         return replace(log, robot=self.size.model)
 
     def ask(self, log: Log, horizons: Sequence[float] = HORIZONS_S, healthy_logs: int = 0) -> Question:
-        """The question to discovery, about the nominal model."""
+        """Sets up the question that discovery is asked: this log, and the nominal model."""
         return ask(log, self.spec, horizons, healthy_logs, plain=self.rig)
 
     @cached_property
     def calibration(self) -> Calibration:
-        """What healthy logs of this robot and motion say: found once, and kept."""
+        """Noise floor and thresholds of this robot and motion, from simulated null logs; computed once and kept."""
         path = self._out / "calibration.npz"
         if not path.exists():
             question = self.ask(self.record(Truth(None), 10_000), healthy_logs=self.size.healthy)
@@ -105,7 +105,7 @@ class Bench:
             return Calibration(floors, float(saved["gain"]), float(saved["penalty"]))
 
     def truth(self, case: Case) -> tuple[Truth, float]:
-        """Where it hides and how large it is, and its severity in floor units."""
+        """Draws where a case's effect hides and searches its size; returns both, and the severity that was reached."""
         if case.effect is None:
             return Truth(None), 0.0
         rng = np.random.default_rng((self._seed, case.number))
@@ -126,9 +126,10 @@ class Bench:
         return Truth(case.effect, chosen, size), severity(size)
 
     def severity_of(self, case: Case, places: tuple[str, ...]) -> Callable[[float], float]:
-        """How far an effect of a size moves the worst joint's positions, in floor units, noise apart.
+        """Makes the function from an effect's size to its severity at these places.
 
-        What nominal parameters can make up for within their priors does not count: nobody could see it.
+        Severity is how far the effect moves the worst joint's positions, in floor units, without noise and after the
+        nominal parameters were fitted again: what they make up for within their priors cannot be seen by anyone.
         """
         main = sorted(self.calibration.floors)[len(self.calibration.floors) // 2]
         (floors, weight), seed = self.calibration.floors[main], self.seed(case)
@@ -151,11 +152,11 @@ class Bench:
         return severity
 
     def seed(self, case: Case) -> int:
-        """Of the robot."""
+        """Returns the seed of a case's robot."""
         return 1000 * (self._seed + 1) + case.number
 
     def write(self, case: Case) -> Path:
-        """Writes a case's log, and its truth where only the scorer looks."""
+        """Writes a case's log, and its truth into the folder that only `scored` reads; returns the log's folder."""
         folder, sealed = self._out / "logs" / f"case_{case.number:03d}", self._sealed(case)
         if not sealed.exists():
             truth, severity = self.truth(case)
@@ -174,7 +175,7 @@ class Bench:
         return self._out / "sealed" / f"case_{case.number:03d}.json"
 
     def answer(self, case: Case) -> dict:
-        """What discovery says of a case's log; it sees the log, the nominal model and the calibration."""
+        """Has discovery answer a case, or reads its answer; it sees the log, the nominal model and the calibration."""
         path = self._out / "answers" / f"case_{case.number:03d}.json"
         if not path.exists():
             folder = self.write(case)
@@ -188,7 +189,7 @@ class Bench:
         return json.loads(path.read_text())
 
     def scored(self) -> list[dict]:
-        """Truth and answer of every case that is done; the one place that opens the truth."""
+        """Scores every case that is answered; the one place that opens the truth."""
         rows = []
         for case in self.cases:
             path = self._out / "answers" / f"case_{case.number:03d}.json"
@@ -198,7 +199,11 @@ class Bench:
         return rows
 
     def report(self, identity: Mapping[str, object]) -> list[dict]:
-        """Writes down how the cases that are done were answered; the table of rates."""
+        """Writes scores, confusion matrix and page of the cases that are answered; returns the table of rates.
+
+        Args:
+          identity: options of the benchmark, for the page.
+        """
         rows, out = self.scored(), self._out
         lines = tally(rows)
         write_json(out / "scores.json", {"cases": rows, "table": lines, "versions": checkpoint.versions()})

@@ -40,12 +40,12 @@ SIZE_BOUNDS = {
     "cable_stiffness": (0.1, 500.0),
     "loose_foot": (0.01, 1.5),
 }
-"""Sizes between which a severity is looked for, the harmless one first."""
+"""Sizes, in the unit of the effect's first parameter, between which a severity is searched; the harmless one first."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """One robot."""
+    """One robot of the benchmark and what it hides."""
 
     number: int
     effect: str | None
@@ -55,7 +55,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Size:
-    """How much is tried, on which robot."""
+    """Which robot, how long its logs are, and what is hidden how often."""
 
     model: str
     """Name or path."""
@@ -72,7 +72,7 @@ class Size:
 
 
 def _spread(names: Sequence[str], count: int) -> tuple[tuple[str, float], ...]:
-    """Effects in turn, severities in turn."""
+    """Pairs effects in turn with severities in turn."""
     return tuple((names[i % len(names)], SEVERITIES[i % len(SEVERITIES)]) for i in range(count))
 
 

@@ -1,8 +1,9 @@
-"""Robots with something hidden in them, for the blind benchmark.
+"""Robots that hide something, for the blind benchmark.
 
-Nothing of what discovery fits is used here: MuJoCo C moves the robot with a step, an integrator and cones of its own;
-the controller ticks at its rate, late by a jitter, and holds; friction is a bristle model (LuGre); motors saturate
-smoothly; lags are of second order; play and springs are joints of their own. What is read has noise and is rounded.
+Nothing here uses what discovery fits. MuJoCo C moves the robot with a step, an integrator and friction cones of its
+own. The controller ticks at its rate, late by a jitter, and holds its torque. Friction is a bristle model (LuGre),
+motors saturate smoothly, lags are of second order, play and springs are joints of their own. Readings are noisy and
+rounded.
 """
 
 from collections.abc import Sequence
@@ -21,12 +22,12 @@ _ENCODER_RAD = 2 * np.pi / 2**14
 _SPEED_NOISE, _SPEED_QUANTUM = 0.01, 0.005
 
 OUTSIDE = ("cogging", "temperature_fade", "cable_stiffness", "loose_foot")
-"""Effects that the library does not have."""
+"""Effects that the library does not have, so that the right verdict is `unnamed`."""
 
 
 @dataclass(frozen=True)
 class Truth:
-    """What is hidden."""
+    """What is hidden in a robot; only the scorer reads it."""
 
     effect: str | None
     places: tuple[str, ...] = ()
@@ -44,7 +45,18 @@ def record(
     seed: int,
     noise: bool = True,
 ) -> Log:
-    """Plays motions on a robot in which something is hidden, its nominal parameters wrong by up to `nominal_error`."""
+    """Plays target runs on a robot that hides something, and returns the log that a user would have recorded.
+
+    Args:
+      spec: the nominal model.
+      joints: names, in the log's order.
+      motions: target runs.
+      controller: of the joints; runs have shares of its gains.
+      truth: what is hidden.
+      nominal_error: by how much masses, armatures, dampings, frictions and gains are wrong, as a share.
+      seed: of everything random.
+      noise: whether readings are noisy and rounded; without, the effect alone can be measured.
+    """
     rng = np.random.default_rng(seed)
     robot = _Robot(spec, joints, truth, nominal_error, rng)
     runs = []
@@ -71,7 +83,7 @@ def record(
 
 
 class _Robot:
-    """One robot and what is wrong with it."""
+    """One robot, its wrong parameters and what it hides."""
 
     def __init__(self, spec, joints, truth: Truth, nominal_error: float, rng: np.random.Generator):
         self._truth, self._joints = truth, tuple(joints)
@@ -160,7 +172,7 @@ class _Robot:
     def play(
         self, motion: TargetRun, controller: Controller, rng: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Positions and speeds [rows, joints] as the encoders have them."""
+        """Plays a target run; returns positions in rad and speeds in rad/s, [rows, joints], before noise."""
         truth, model, at = self._truth, self._model, self._at
         effect, size = truth.effect, truth.size
         data = mujoco.MjData(model)
@@ -257,7 +269,7 @@ class _Robot:
         return torque
 
     def _rub(self, bristle, speed, torque) -> tuple[np.ndarray, np.ndarray]:
-        """Bristles that bend and slip."""
+        """LuGre friction: returns the bristles' deflection and the torque of friction, [joints]."""
         effect, size, at = self._truth.effect, self._truth.size, self._at
         slides = self._friction.copy()
         if effect == "coulomb":

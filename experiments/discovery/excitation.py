@@ -20,7 +20,7 @@ _SHARES = {"triangle": 0.35, "chirp": 0.3, "steps": 0.2, "swing": 0.15}
 
 @dataclass(frozen=True)
 class TargetRun:
-    """What one run asks of the robot."""
+    """What the robot is asked to do in one run of an excitation."""
 
     name: str
     condition: str
@@ -38,7 +38,18 @@ class TargetRun:
 def excitation(
     spec: mujoco.MjSpec, joints: Sequence[str], runs: int, seconds: float, rate_hz: float, seed: int = 0
 ) -> list[TargetRun]:
-    """Motions for `runs` runs of `seconds` each.
+    """Makes the target runs of a log in which effects are distinguishable.
+
+    Args:
+      spec: the robot; postures are drawn within its joint ranges.
+      joints: names, in the order of the targets' columns.
+      runs: number of runs, 4 or more.
+      seconds: length of a run.
+      rate_hz: rows a second.
+      seed: of postures, paces and steps.
+
+    Returns:
+      Runs, split into train, select and sealed so that every split has both controller gains.
 
     Raises:
       ValueError: fewer runs than can be split.
@@ -72,7 +83,7 @@ def excitation(
 
 
 def _ranges(model: mujoco.MjModel, joints: Sequence[str]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Least, largest and middle position; a joint without limits may turn by a right angle each way."""
+    """Returns least, largest and middle positions; a joint without limits turns by a right angle each way."""
     found = [model.joint(name) for name in joints]
     limited = np.array([bool(model.jnt_limited[joint.id]) for joint in found])
     span = np.array([joint.range for joint in found])
@@ -85,7 +96,7 @@ def _medley(posture, room, seconds, rate_hz, rng) -> tuple[np.ndarray, np.ndarra
     rows = {name: round(share * seconds * rate_hz) for name, share in _SHARES.items()}
     count = len(posture)
     pieces = []
-    # Joints move at different paces, so that what one does to another shows.
+    # Joints move at different paces, so that coupling between them shows.
     time = np.arange(rows["triangle"]) / rate_hz
     pace = rng.uniform(0.8, 1.6, count) / (rows["triangle"] / rate_hz) * 1.5
     phase = (time[:, None] * pace + rng.uniform(0, 1, count)) % 1.0
@@ -107,6 +118,6 @@ def _medley(posture, room, seconds, rate_hz, rng) -> tuple[np.ndarray, np.ndarra
 
 
 def scaled(controller: Controller, gain: float) -> Controller:
-    """A controller with a share of its gains."""
+    """Returns a controller with a share of its proportional and damping gains; limits stay."""
     gains = {name: values * (gain if name in ("kp", "kd") else 1.0) for name, values in controller.gains.items()}
     return Controller(kind=controller.kind, rate_hz=controller.rate_hz, gains=gains)

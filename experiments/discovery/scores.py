@@ -1,4 +1,4 @@
-"""What the blind benchmark makes of its answers: hits and misses, rates with intervals, a page."""
+"""Scores of the blind benchmark: what was right in a case, rates with intervals over cases, and a page."""
 
 from collections.abc import Mapping, Sequence
 
@@ -8,11 +8,19 @@ from envs.effects import LIBRARY
 from experiments.discovery.blind_robots import OUTSIDE
 
 SEVERITIES = (2.0, 5.0, 15.0)
-"""Floor units."""
+"""Severities at which effects are hidden, in floor units."""
 
 
 def score(truth: dict, answer: dict) -> dict:
-    """One case."""
+    """Compares the answer of one case with its truth.
+
+    Args:
+      truth: what was hidden, and how severe it came out.
+      answer: what discovery said, as `summary.json` has it.
+
+    Returns:
+      What was hidden and named; whether name, family, place and reported set are right; gaps in floor units.
+    """
     named = [*answer["effects"], *answer["parameter_changes"]]
     first = named[0] if named else None
     reported = {first["name"], *first["confusable_with"]} if first else set()
@@ -41,7 +49,13 @@ def score(truth: dict, answer: dict) -> dict:
 
 
 def wilson(hits: int, count: int, z: float = 1.96) -> tuple[float, float]:
-    """95 % interval of a rate (Wilson, 1927)."""
+    """Returns the 95 % score interval of a rate (Wilson, 1927), which stays within [0, 1] and works at 0 and 1.
+
+    Args:
+      hits: number of successes.
+      count: number of cases; without any the interval is all of [0, 1].
+      z: quantile of the normal distribution.
+    """
     if not count:
         return 0.0, 1.0
     rate, z2 = hits / count, z * z
@@ -51,7 +65,7 @@ def wilson(hits: int, count: int, z: float = 1.96) -> tuple[float, float]:
 
 
 def tally(rows: Sequence[dict]) -> list[dict]:
-    """The table of rates."""
+    """Computes the table of rates and means over scored cases, each with its interval and the value to reach."""
     # Some effects cannot be made as severe as asked.
     hidden = [row for row in rows if row["effect"] in LIBRARY and row["severity"] > 0.7 * row["asked"]]
     outside = [row for row in rows if row["effect"] in OUTSIDE]
@@ -97,7 +111,7 @@ def _mean(label: str, values: Sequence[float], goal: str) -> dict:
 
 
 def shown(lines: Sequence[dict]) -> list[tuple[str, ...]]:
-    """Measure, value, interval, number of cases and goal as text."""
+    """Formats the table of `tally` as text: measure, value, interval, number of cases and goal."""
     return [
         (
             line["measure"],
@@ -111,7 +125,14 @@ def shown(lines: Sequence[dict]) -> list[tuple[str, ...]]:
 
 
 def page(identity: Mapping[str, object], done: int, count: int, lines: Sequence[dict]) -> str:
-    """The results as a page."""
+    """Writes the results as a Markdown page.
+
+    Args:
+      identity: options of the benchmark.
+      done: number of cases that are answered.
+      count: number of cases in all.
+      lines: table of `tally`.
+    """
     table = "\n".join(f"| {' | '.join(cells)} |" for cells in shown(lines))
     options = " ".join(f"--{name.replace('_', '-')} {value}" for name, value in identity.items())
     return f"""# Blind benchmark of discovery, size `{identity["size"]}`

@@ -1,4 +1,5 @@
-"""What a discovery found, in the form of `summary.json` and `details.json`, and whole runs simulated before and after."""
+"""What a discovery found, in the form of `summary.json` and `details.json`, and whole runs simulated before and
+after."""
 
 import jax
 import numpy as np

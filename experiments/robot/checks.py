@@ -12,7 +12,8 @@ from envs.logs import Log
 from jaxtune.types import Trajectory
 
 _STRANGE = 0.25
-"""Largest difference between recorded actions and the policy's, rms over rms, that sensor noise and late targets cause."""
+"""Largest difference between recorded actions and the policy's, rms over rms, that sensor noise and late targets
+cause."""
 
 
 def check_runs(place: Path, log: Log, episodes: int) -> None:

@@ -63,7 +63,8 @@ class Moved:
     before: float
     after: float
     low: float | None
-    """Lower end of the calibrated interval; None where no set was accepted, or the interval leaves the simulated box."""
+    """Lower end of the calibrated interval; None where no set was accepted, or the interval leaves the simulated
+    box."""
     high: float | None
     """Upper end of the interval."""
 

@@ -1,7 +1,7 @@
-"""The body of the stand-in robot, which `experiments.robot_stub` plays: what the learner's simulator lacks.
+"""The body of the stand-in robot: what a real robot has and the learner's simulator lacks.
 
-MuJoCo C moves it. Targets arrive late, motors lag and give less the faster they turn, encoders are rounded, the IMU is
-noisy and biased, the estimate of its velocity drifts, its floor is another.
+MuJoCo C moves it. Targets arrive late, motors lag and give less torque the faster they turn, encoders round, the IMU is
+noisy and biased, the velocity estimate drifts, and the floor has another friction. `experiments.robot_stub` plays it.
 """
 
 from collections import deque
@@ -12,19 +12,19 @@ import numpy as np
 
 from envs.biteno import TaskConfig, constants, env
 from envs.logs import Controller, Run
-from envs.rig import hung
+from envs.rig import suspended as fixed_base
 from experiments.robot.player import Player
 
 _STEP_S = 0.0005
-_TICK_S = 0.001  # of the joints' controllers
+_TICK_S = 0.001  # period of the joint controllers
 ROW_S = 0.002
-"""Between the rows of its logs."""
-_TASK = TaskConfig()  # what it is asked to do
+"""Time between the rows of its logs."""
+_TASK = TaskConfig()  # the commands that it draws
 
 
 @dataclass(frozen=True, kw_only=True)
 class Body:
-    """What the robot is; multipliers of the nominal model where no unit says otherwise."""
+    """Properties of the robot, each as a multiplier of the nominal model unless its name has a unit."""
 
     trunk_mass: float = 1.0
     """Mass of the trunk."""
@@ -41,13 +41,13 @@ class Body:
     torque_scale: float = 1.0
     """Torque for the same current."""
     encoder_rad: float = 2 * np.pi / 2**14
-    """Step of the encoders."""
+    """Resolution of the encoders."""
     velocity_noise_rad_s: float = 0.05
-    """Of the joints' velocities."""
+    """Standard deviation of the noise of joint velocities."""
     gyro_noise_rad_s: float = 0.02
-    """Of the gyro."""
+    """Standard deviation of the gyro's noise."""
     gyro_bias_rad_s: float = 0.01
-    """Standard deviation of what it says at rest, drawn for every run."""
+    """Standard deviation of the gyro's bias, drawn for every run."""
     tilt_bias_rad: float = 0.01
     """Standard deviation of the error of the estimated direction of gravity, drawn for every run."""
     drift_mps: float = 0.05
@@ -55,14 +55,14 @@ class Body:
 
 
 class Robot:
-    """The body, one run at a time.
+    """The robot, one run at a time.
 
     Args:
-      body: what it is.
-      hangs: whether it hangs, to `play`; or it stands, to `walk`.
+      body: its properties.
+      suspended: whether it hangs in the air, to `play` targets; else it stands on the ground, to `walk`.
     """
 
-    def __init__(self, body: Body, hangs: bool = False):
+    def __init__(self, body: Body, suspended: bool = False):
         self.body = body
         spec = mujoco.MjSpec.from_file(str(constants.MODEL_PATH))
         for link in spec.bodies[1:]:
@@ -72,7 +72,7 @@ class Robot:
             friction = spec.geom(foot).friction
             spec.geom(foot).friction = [friction[0] * body.foot_friction, *friction[1:]]
         model = spec.compile()
-        # What it walks with; whoever hangs it says with what.
+        # The controller of its walks; targets that are played while it is suspended bring their own.
         self.controller = Controller(
             kind="pd",
             rate_hz=1.0 / _TICK_S,
@@ -82,7 +82,7 @@ class Robot:
                 "torque_limit_nm": model.actuator_forcerange[:, 1].copy(),
             },
         )
-        model = hung(spec) if hangs else model
+        model = fixed_base(spec) if suspended else model
         model.opt.timestep = _STEP_S
         model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         model.opt.iterations, model.opt.ls_iterations = 100, 50
@@ -95,6 +95,12 @@ class Robot:
 
     def walk(self, name: str, player: Player, seconds: float, rng: np.random.Generator) -> tuple[Run, bool]:
         """Walks from standing until the time is over or the robot has fallen.
+
+        Args:
+          name: of the run.
+          player: the exported policy.
+          seconds: length of the walk.
+          rng: of commands, start and noise.
 
         Returns:
           The run, and whether it fell.
@@ -122,11 +128,11 @@ class Robot:
                 )
             if step % per_tick == 0:
                 self._line.append(target)
-                asked = self._asked(self._line[0], seen, self.controller)
+                wanted = self._wanted_torque(self._line[0], seen, self.controller)
             if step % per_row == 0:
-                said = {"target": target, "action": player.action, "phase": player.phase, "cmd": command}
-                rows.append({"tau": self._torque.copy(), "enabled": 1.0, "contact": self._contact()} | seen | said)
-            self._push(asked)
+                sent = {"target": target, "action": player.action, "phase": player.phase, "cmd": command}
+                rows.append({"tau": self._torque.copy(), "enabled": 1.0, "contact": self._contact()} | seen | sent)
+            self._push(wanted)
             mujoco.mj_step(self.model, self.data)
             if self._fallen():
                 fell = True
@@ -143,38 +149,47 @@ class Robot:
         )
         return walked, fell
 
-    def play(self, asked: Run, rng: np.random.Generator) -> Run:
-        """Plays a run's targets while it hangs, from rest at the first of them.
+    def play(self, targets: Run, rng: np.random.Generator) -> Run:
+        """Plays a run's targets while it is suspended, from rest at the first of them.
+
+        Args:
+          targets: a run without measurements.
+          rng: of noise.
+
+        Returns:
+          The run with what its encoders measured.
 
         Raises:
-          ValueError: the run's controller is none that it can have.
+          ValueError: the run's controller is of another kind, or its ticks are no multiple of the physics' step.
         """
-        tick_s = 1.0 / asked.controller.rate_hz
+        tick_s = 1.0 / targets.controller.rate_hz
         per_tick = round(tick_s / _STEP_S)
-        if asked.controller.kind != "pd" or not np.isclose(per_tick * _STEP_S, tick_s):
+        if targets.controller.kind != "pd" or not np.isclose(per_tick * _STEP_S, tick_s):
             raise ValueError(
-                f"{asked.name}: controller: got {asked.controller.kind} at {asked.controller.rate_hz:g} Hz, expected "
+                f"{targets.name}: controller: got {targets.controller.kind} at {targets.controller.rate_hz:g} Hz, expected "
                 f"pd with ticks that are multiples of {_STEP_S} s"
             )
         self.data = mujoco.MjData(self.model)
-        self.data.qpos[self._qpos] = asked.signals["target"][0]
+        self.data.qpos[self._qpos] = targets.signals["target"][0]
         self._begin(tick_s)
-        grid = np.arange(asked.time[0], asked.time[-1] + _STEP_S, _STEP_S)
-        enabled = asked.signals.get("enabled", np.ones(len(asked.time)))
+        grid = np.arange(targets.time[0], targets.time[-1] + _STEP_S, _STEP_S)
+        enabled = targets.signals.get("enabled", np.ones(len(targets.time)))
         moved = []
-        for step, row in enumerate(np.searchsorted(asked.time, grid + 1e-9, side="right") - 1):
+        for step, row in enumerate(np.searchsorted(targets.time, grid + 1e-9, side="right") - 1):
             moved.append(np.stack([self.data.qpos[self._qpos], self.data.qvel[self._dof]]))
             if step % per_tick == 0:
-                self._line.append(asked.signals["target"][row])
-                torque = enabled[row] * self._asked(self._line[0], self._joints(*moved[-1], rng), asked.controller)
+                self._line.append(targets.signals["target"][row])
+                torque = enabled[row] * self._wanted_torque(
+                    self._line[0], self._joints(*moved[-1], rng), targets.controller
+                )
             self._push(torque)
             mujoco.mj_step(self.model, self.data)
         moved = np.stack(moved, axis=1)  # [2, steps, joints]
-        position, speed = (np.stack([np.interp(asked.time, grid, joint) for joint in one.T], axis=1) for one in moved)
-        return replace(asked, signals=dict(asked.signals) | self._joints(position, speed, rng))
+        position, speed = (np.stack([np.interp(targets.time, grid, joint) for joint in one.T], axis=1) for one in moved)
+        return replace(targets, signals=dict(targets.signals) | self._joints(position, speed, rng))
 
     def _begin(self, tick_s: float) -> None:
-        """At rest where it is, the targets on their way those of where it is."""
+        """Starts at rest, as if the present position had been its target for long."""
         mujoco.mj_forward(self.model, self.data)
         late = round(self.body.transport_s / tick_s)
         self._torque = np.zeros(len(self._qpos))
@@ -193,7 +208,7 @@ class Robot:
         }
 
     def _look(self, rng: np.random.Generator) -> dict[str, np.ndarray]:
-        """What the sensors say."""
+        """Reads all sensors."""
         body, data = self.body, self.data
         turn = np.zeros(9)
         mujoco.mju_quat2Mat(turn, data.qpos[3:7])
@@ -218,15 +233,15 @@ class Robot:
         }
 
     @staticmethod
-    def _asked(target: np.ndarray, seen: dict[str, np.ndarray], controller: Controller) -> np.ndarray:
+    def _wanted_torque(target: np.ndarray, seen: dict[str, np.ndarray], controller: Controller) -> np.ndarray:
         gains = controller.gains
         torque = gains["kp"] * (target - seen["q"]) - gains["kd"] * seen["dq"]
         return np.clip(torque, -gains["torque_limit_nm"], gains["torque_limit_nm"])
 
-    def _push(self, asked: np.ndarray) -> None:
+    def _push(self, wanted: np.ndarray) -> None:
         body, speed = self.body, self.data.qvel[self._dof]
         share = 1.0 - np.exp(-_STEP_S / max(body.motor_lag_s, 1e-9))
-        self._torque += share * (body.torque_scale * asked - self._torque)
+        self._torque += share * (body.torque_scale * wanted - self._torque)
         limit = self.controller.gains["torque_limit_nm"]
         drop = limit / body.no_load_rad_s * speed
         self._torque = np.clip(self._torque, -limit - drop, limit - drop)
@@ -243,6 +258,6 @@ class Robot:
 
 
 def _command(rng: np.random.Generator) -> np.ndarray:
-    """Forward in m/s, sideways in m/s, turning in rad/s."""
+    """Draws a command as the task does: forward in m/s, sideways in m/s, turning in rad/s."""
     command = rng.uniform(-1, 1, 3) * _TASK.command_max
     return np.zeros(3) if rng.uniform() < _TASK.zero_command_share else command

@@ -45,8 +45,8 @@ class Policy:
 class Learner:
     """Trains, simulates and evaluates policies of one robot, as pure functions.
 
-    Use it where a command needs BITeno: hand `learner.tuner(target)` to the tuning loop, or jit single methods. Programs
-    that are compiled for one learner can be shared by all runs of the same preset and table.
+    Use it where a command needs BITeno: hand `learner.tuner(target)` to the tuning loop, or jit single methods.
+    Programs that are compiled for one learner can be shared by all runs of the same preset and table.
 
     Args:
       preset: sizes of everything.
@@ -139,8 +139,9 @@ class Learner:
     def simulate(self, key: jax.Array, policy: Policy, coords: Coords) -> Trajectory:
         """Simulates one episode for every draw: the tuner's `simulate`.
 
-        Where the policy carries `commands`, the episodes repeat them in turn, from the same phase of the gait clock, and
-        only the last `episode_steps` steps are returned: a log shows a robot from a few steps after it began to walk.
+        Where the policy carries `commands`, the episodes repeat them in turn, from the same phase of the gait clock,
+        and only the last `episode_steps` steps are returned: a log shows a robot from a few steps after it began to
+        walk.
 
         Args:
           key: random key.

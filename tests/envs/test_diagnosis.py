@@ -9,20 +9,20 @@ import pytest
 from envs import models
 from envs.diagnosis import diagnose
 from envs.logs import Controller
-from envs.rig import hung
+from envs.rig import suspended
+from experiments.discovery.blind_cases import ARM
 from experiments.discovery.blind_robots import Truth, record
-from experiments.discovery_bench import ARM
-from experiments.excite import excitation
+from experiments.discovery.excitation import excitation
 
 JOINTS = ("shoulder", "elbow")
 SPEC = models.spec(str(ARM))
-MODEL = hung(SPEC)
+MODEL = suspended(SPEC)
 NAMING = ("swapped joints", "flipped sign", "clipped", "offset")
 GAINS = {"kp": np.array([40.0, 20.0]), "kd": np.array([2.0, 0.8]), "torque_limit_nm": np.array([15.0, 15.0])}
 
 
 @cache
-def healthy(seed):
+def undamaged(seed):
     """A run of 3 s of an arm in another engine, its masses and gains off, its sensors noisy and rounded."""
     motion = excitation(SPEC, JOINTS, 4, 3.0, 500.0, seed)[:1]
     controller = Controller(kind="pd", rate_hz=1000.0, gains=GAINS)
@@ -132,7 +132,7 @@ def named(findings):
 
 def alone(count):
     rng = np.random.default_rng(0)
-    done = [ALONE[i % len(ALONE)](healthy(i // len(ALONE)), rng) for i in range(count)]
+    done = [ALONE[i % len(ALONE)](undamaged(i // len(ALONE)), rng) for i in range(count)]
     return [(run, {truth}) for run, truth in done]
 
 
@@ -142,7 +142,7 @@ def paired(count):
         one, two = np.sort(rng.choice(len(DAMAGE), 2, replace=False))
         if {DAMAGE[one], DAMAGE[two]} in TOGETHER:
             continue
-        run, first = DAMAGE[one](healthy(len(cases) % 20), rng)
+        run, first = DAMAGE[one](undamaged(len(cases) % 20), rng)
         run, second = DAMAGE[two](run, rng)
         cases.append((run, {first, second}))
     return cases
@@ -158,8 +158,8 @@ def test_two_at_a_time_are_found():
     assert share >= 0.87, wrong
 
 
-def test_nothing_is_said_of_healthy_logs():
-    share, wrong = share_right([(healthy(seed), set()) for seed in range(6)])
+def test_nothing_is_said_of_undamaged_logs():
+    share, wrong = share_right([(undamaged(seed), set()) for seed in range(6)])
     assert share == 1.0, wrong
 
 
@@ -171,13 +171,13 @@ def test_two_hundred_are_found(cases):
 
 
 @pytest.mark.slow
-def test_nothing_is_said_of_two_hundred_healthy_logs():
-    share, wrong = share_right([(healthy(seed), set()) for seed in range(200)])
+def test_nothing_is_said_of_two_hundred_undamaged_logs():
+    share, wrong = share_right([(undamaged(seed), set()) for seed in range(200)])
     assert share >= 0.95, wrong
 
 
 def test_a_log_in_pieces_is_named():
-    run = healthy(0)
+    run = undamaged(0)
     again = rows(run, np.repeat(np.arange(len(run.time)), 2))
     again = replace(again, time=0.002 * np.arange(len(again.time)))
     assert {"duplicated rows", "in pieces"} == {kind for kind, _ in said(again)}
@@ -186,14 +186,14 @@ def test_a_log_in_pieces_is_named():
 def test_sizes_are_what_was_done():
     rng = np.random.default_rng(3)
     for damage, kind in ((late, "late"), (offset, "offset"), (drift, "clock drift")):
-        run, _ = damage(healthy(1), rng)
+        run, _ = damage(undamaged(1), rng)
         (one,) = diagnose(run, JOINTS, MODEL)
         assert one.kind == kind
         if damage is late:
             # The first rows are those that are not there any more.
-            assert one.size == pytest.approx(2.0 * (len(healthy(1).time) - len(run.time)), abs=8.0)
+            assert one.size == pytest.approx(2.0 * (len(undamaged(1).time) - len(run.time)), abs=8.0)
         if damage is offset:
-            moved = np.median(run.signals["q"] - healthy(1).signals["q"], axis=0)
+            moved = np.median(run.signals["q"] - undamaged(1).signals["q"], axis=0)
             assert one.size == pytest.approx(moved[np.abs(moved).argmax()], abs=0.03)
         if damage is drift:
-            assert 1 + one.size == pytest.approx(run.time[-1] / healthy(1).time[-1], rel=0.01)
+            assert 1 + one.size == pytest.approx(run.time[-1] / undamaged(1).time[-1], rel=0.01)

@@ -9,7 +9,7 @@ import rigs
 from envs import models
 from envs.biteno import constants
 from envs.effects import LIBRARY
-from envs.rig import Axis, Rig, hung
+from envs.rig import Axis, Rig, suspended
 
 START = np.array([0.5, -0.7])
 
@@ -56,7 +56,7 @@ def test_a_hanging_biteno_moves_as_in_mujoco():
     start = np.array([0.0, -0.35, 0.7] * 2)
     target = start + np.array([0.2, 0.3, -0.4, -0.1, -0.2, 0.3])
     segment = rigs.segment(rig, start, target, kp=60.0, kd=2.0, limit=15.0)
-    model = hung(models.spec("biteno"))
+    model = suspended(models.spec("biteno"))
     model.opt.timestep = rig.dt
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION
     read = rigs.Player(rig).play(segment)
@@ -248,14 +248,14 @@ def test_nominal_parameters_are_those_that_the_model_has(pendulum):
         Axis("armature", "kg_m2", "hinge", 0): 0.00019,
         Axis("link_mass", "ratio", "arm", 0): 0.1,
     }
-    got = pendulum.nominal()
+    got = pendulum.prior_sd()
     assert got.keys() == expected.keys()
     for axis, share in expected.items():
         np.testing.assert_allclose(got[axis], share, rtol=1e-6)
 
 
 def test_nominal_parameters_are_spread_in_coordinates(arm):
-    got = {(axis.effect, axis.place): spread for axis, spread in arm.rig.nominal().items()}
+    got = {(axis.effect, axis.place): spread for axis, spread in arm.rig.prior_sd().items()}
     # A tenth of 0.01 kg m^2 and of 0.05 Nm s/rad, over what a coordinate stands for; the arm has no dry friction.
     np.testing.assert_allclose(got["armature", "shoulder"], 0.001 / 0.11, rtol=1e-6)
     np.testing.assert_allclose(got["armature", "elbow"], 0.001 / 0.03, rtol=1e-6)
@@ -293,7 +293,7 @@ def test_links_show_in_the_joints_that_carry_them(arm):
 
 
 def test_a_hung_robot_has_its_joints_and_no_base():
-    model = hung(models.spec("biteno"))
+    model = suspended(models.spec("biteno"))
     assert (model.nq, model.nv, model.nkey) == (6, 6, 0)
     assert model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT
     rig = Rig(models.spec("biteno"), constants.JOINTS, rigs.CONTROL_HZ)

@@ -15,8 +15,9 @@ import pytest
 from envs import logs, sensing
 from envs.biteno import constants, env, gait
 from envs.targets import recorded
-from experiments import export, robot_stub
+from experiments import robot_stub
 from experiments.common.config import preset
+from experiments.robot import policy_files
 from experiments.robot.player import Player
 from experiments.robot.surrogate import Body, Robot
 from experiments.walking.learner import Learner
@@ -34,7 +35,7 @@ def walk():
 def folder(walk, tmp_path_factory):
     learner, policy = walk
     out = tmp_path_factory.mktemp("export") / "policy"
-    export.export(out, policy.learner, learner.preset)
+    policy_files.export(out, policy.learner, learner.preset)
     return out
 
 
@@ -145,8 +146,8 @@ IDEAL = Body(
 )
 
 
-def asked(folder, place, body, episodes=2, seconds=4.0):
-    """What a robot answers to a request."""
+def answered(folder, place, body, episodes=2, seconds=4.0):
+    """Has a robot answer a request; returns its falls and its log."""
     place.mkdir()
     (place / "policy").symlink_to(folder)
     (place / "request.json").write_text(json.dumps({"episodes": episodes, "seconds": seconds, "seed": 0}))
@@ -155,7 +156,7 @@ def asked(folder, place, body, episodes=2, seconds=4.0):
 
 
 def test_the_ideal_robot_walks_as_well_as_the_simulator(folder, tmp_path):
-    falls, log = asked(folder, tmp_path / "round_000", IDEAL)
+    falls, log = answered(folder, tmp_path / "round_000", IDEAL)
     assert falls == [False, False]
     assert [len(run.time) for run in log.runs] == [2000, 2000]
     found = recorded.episodes(log, 400)
@@ -169,7 +170,7 @@ def test_the_ideal_robot_walks_as_well_as_the_simulator(folder, tmp_path):
 
 
 def test_a_robot_that_falls_says_so(folder, tmp_path):
-    falls, log = asked(folder, tmp_path / "round_000", replace(IDEAL, torque_scale=0.2), episodes=1)
+    falls, log = answered(folder, tmp_path / "round_000", replace(IDEAL, torque_scale=0.2), episodes=1)
     assert falls == [True]
     (run,) = log.runs
     assert run.time[-1] < 3.9
@@ -181,7 +182,7 @@ def test_what_the_robot_lacks_is_in_its_log(folder, tmp_path):
     def second(body):
         (tmp_path / str(len(list(tmp_path.iterdir())))).mkdir()
         place = tmp_path / str(len(list(tmp_path.iterdir())) - 1) / "round_000"
-        return asked(folder, place, body, episodes=1, seconds=1.0)[1].runs[0].signals
+        return answered(folder, place, body, episodes=1, seconds=1.0)[1].runs[0].signals
 
     plain = second(IDEAL)
     coarse = second(replace(IDEAL, encoder_rad=0.01))["q"]

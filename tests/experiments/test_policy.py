@@ -7,11 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from envs import domain
 from experiments.common import checkpoint
 from experiments.common.config import PRESETS, WALK, chosen
 from experiments.walking.learner import Learner
 from experiments.walking.policies import policy_config
+from jaxtune.mjx import parameters
 
 
 @pytest.fixture(scope="module")
@@ -21,7 +21,7 @@ def learner():
 
 @pytest.fixture(scope="module")
 def train(learner):
-    dist = learner.dist(domain.nominal(learner.entries), 0.3)
+    dist = learner.dist(parameters.nominal(learner.entries), 0.3)
     return jax.jit(lambda key, policy: learner.train(key, policy, dist, 1))
 
 
@@ -55,12 +55,12 @@ def test_robots_train_within_the_policy_radius_and_with_hidden_parameters(learne
 
 
 def test_policy_of_another_config_is_refused(learner, tmp_path):
-    learner = learner.init(jax.random.PRNGKey(0)).learner
-    checkpoint.save(tmp_path, learner, policy_config(learner))
+    ppo = learner.init(jax.random.PRNGKey(0)).learner
+    checkpoint.save(tmp_path, ppo, policy_config(learner))
     task = dataclasses.replace(learner.preset.task, action_scale=0.5)
     other = Learner(dataclasses.replace(learner.preset, task=task), learner.entries)
     with pytest.raises(ValueError, match=r"config\.action_scale is 0\.25 there, expected 0\.5"):
-        checkpoint.load(tmp_path, learner, policy_config(other))
+        checkpoint.load(tmp_path, ppo, policy_config(other))
 
 
 def test_missing_policy_is_named(learner, tmp_path):

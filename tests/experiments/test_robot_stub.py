@@ -1,4 +1,4 @@
-"""The stand-in robot where it hangs; its walks are in test_export.py."""
+"""The stand-in robot while it is suspended; its walks are in test_export.py."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -24,76 +24,78 @@ def place(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def asked(place):
+def targets(place):
     return logs.read(place / "targets", measured=False).runs[0]
 
 
-def played(asked, body):
-    return Robot(body, hangs=True).play(asked, np.random.default_rng(0)).signals
+def played(targets, body):
+    return Robot(body, suspended=True).play(targets, np.random.default_rng(0)).signals
 
 
 def test_it_finds_targets_and_answers_with_a_log(place):
     robot_stub.main(robot_stub.Args(folder=place.parent, idle_s=1.0))
-    asked, log = logs.read(place / "targets", measured=False), logs.read(place / "log")
+    targets, log = logs.read(place / "targets", measured=False), logs.read(place / "log")
     assert log.base == "fixed"
-    assert [run.split for run in log.runs] == [run.split for run in asked.runs]
-    for index, (one, other) in enumerate(zip(asked.runs, log.runs, strict=True)):
-        # It is the same robot whenever it is asked, with noise of its own in every run.
-        again = Robot(Body(), hangs=True).play(one, np.random.default_rng((0, index)))
+    assert [run.split for run in log.runs] == [run.split for run in targets.runs]
+    for index, (one, other) in enumerate(zip(targets.runs, log.runs, strict=True)):
+        # It is the same robot at every call, with noise of its own in every run.
+        again = Robot(Body(), suspended=True).play(one, np.random.default_rng((0, index)))
         np.testing.assert_allclose(other.time, one.time)
         for signal in ("q", "dq", "target", "enabled"):
             np.testing.assert_allclose(other.signals[signal], again.signals[signal], atol=1e-9)
 
 
-def test_its_sensors_are_those_of_its_walks(asked):
+def test_its_sensors_are_those_of_its_walks(targets):
     body = Body()
-    signals = played(asked, body)
+    signals = played(targets, body)
     steps = signals["q"] / body.encoder_rad
     np.testing.assert_allclose(steps, np.round(steps), atol=1e-6)
-    quiet = played(asked, replace(body, velocity_noise_rad_s=0.0))
+    quiet = played(targets, replace(body, velocity_noise_rad_s=0.0))
     # Both come to the same joints, but for what noise does through the controller.
     assert 0.8 * body.velocity_noise_rad_s < np.std(signals["dq"] - quiet["dq"]) < 1.5 * body.velocity_noise_rad_s
 
 
-def test_its_motors_are_those_of_its_walks(asked):
-    exact = played(asked, EXACT)["q"]
-    assert np.abs(played(asked, replace(EXACT, motor_lag_s=0.02))["q"] - exact).max() > 0.02
-    assert np.abs(played(asked, replace(EXACT, no_load_rad_s=1.0))["q"] - exact).max() > 0.02
+def test_its_motors_are_those_of_its_walks(targets):
+    exact = played(targets, EXACT)["q"]
+    assert np.abs(played(targets, replace(EXACT, motor_lag_s=0.02))["q"] - exact).max() > 0.02
+    assert np.abs(played(targets, replace(EXACT, no_load_rad_s=1.0))["q"] - exact).max() > 0.02
 
 
-def test_joints_follow_and_speeds_are_theirs(asked):
-    signals = played(asked, EXACT)
+def test_joints_follow_and_speeds_are_theirs(targets):
+    signals = played(targets, EXACT)
     moved = np.abs(signals["target"] - signals["target"][0]).max(axis=1) > 0.05
-    on = asked.signals["enabled"] > 0
+    on = targets.signals["enabled"] > 0
     error = np.abs(signals["q"] - signals["target"])[moved & on]
     assert np.median(error) < 0.1
-    slope = np.gradient(signals["q"], asked.time, axis=0)[2:-2]
+    slope = np.gradient(signals["q"], targets.time, axis=0)[2:-2]
     # Targets jump, and so do accelerations: not everywhere is the slope over two rows the speed between them.
     assert np.abs(slope - signals["dq"][2:-2]).mean() < 0.05 * np.abs(slope).mean()
 
 
-def test_what_is_late_is_what_was_sent_later(asked):
+def test_a_late_target_acts_as_one_that_was_sent_later(targets):
     rows = round(0.01 * 500)
     # Whenever that is.
-    late = played(replace(asked, time=asked.time + 7.0), replace(EXACT, transport_s=0.01))["q"]
-    target = asked.signals["target"]
+    late = played(replace(targets, time=targets.time + 7.0), replace(EXACT, transport_s=0.01))["q"]
+    target = targets.signals["target"]
     sent = {"target": np.concatenate([np.repeat(target[:1], rows, axis=0), target[:-rows]])}
-    np.testing.assert_allclose(late, played(replace(asked, signals=dict(asked.signals) | sent), EXACT)["q"], atol=1e-6)
-    assert np.abs(late - played(asked, EXACT)["q"]).max() > 0.02
+    np.testing.assert_allclose(
+        late, played(replace(targets, signals=dict(targets.signals) | sent), EXACT)["q"], atol=1e-6
+    )
+    assert np.abs(late - played(targets, EXACT)["q"]).max() > 0.02
 
 
-def test_motors_that_are_off_hold_nothing(asked):
-    off = {"enabled": np.zeros(len(asked.time)), "target": np.tile(constants.STAND_RAD, (len(asked.time), 1))}
-    signals = played(replace(asked, signals=off), EXACT)
+def test_motors_that_are_off_hold_no_posture(targets):
+    off = {"enabled": np.zeros(len(targets.time)), "target": np.tile(constants.STAND_RAD, (len(targets.time), 1))}
+    signals = played(replace(targets, signals=off), EXACT)
     np.testing.assert_allclose(signals["q"][0], constants.STAND_RAD, atol=1e-6)
     assert np.abs(signals["q"][-1] - signals["q"][0]).max() > 0.1
 
 
-def test_it_has_no_other_controller(asked):
+def test_targets_for_another_controller_are_refused(targets):
     for kind, rate in (("servo", 1000.0), ("pd", 300.0)):
-        other = Controller(kind=kind, rate_hz=rate, gains=asked.controller.gains)
+        other = Controller(kind=kind, rate_hz=rate, gains=targets.controller.gains)
         with pytest.raises(ValueError, match=rf"run_000: controller: got {kind} at {rate:g} Hz, expected pd"):
-            played(replace(asked, controller=other), EXACT)
+            played(replace(targets, controller=other), EXACT)
 
 
 def test_it_refuses_other_robots_targets(tmp_path):

@@ -1,8 +1,10 @@
-"""A robot that answers through logs: what is asked of it, what is refused, and a run that is stopped at any point."""
+"""A robot that answers through logs: what it is asked for, what is refused, and a run that is stopped at any point."""
 
+import io
 import json
 import shutil
 import sys
+import time
 from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
@@ -14,13 +16,13 @@ import pytest
 from rich.console import Console
 
 from envs.diagnosis import Finding
-from experiments import doctor, robot_stub, sim2real, sim2real_bench, train
-from experiments.common import checkpoint
-from experiments.robot import exchange as robot_folder
-from experiments.robot import fall_risk as expected
-from experiments.robot import report as sim2real_report
-from experiments.robot import rounds
-from experiments.robot.rounds import Run, Terms
+from experiments import robot_stub, sim2real, sim2real_bench
+from experiments.common import checkpoint, cli
+from experiments.common.checkpoint import as_json, from_json
+from experiments.robot import exchange, report, rounds, transfer
+from experiments.robot.fall_risk import fall_risk, surprise
+from experiments.robot.records import Prediction, Round
+from experiments.robot.rounds import Rounds, Terms
 from experiments.robot.surrogate import Body, Robot
 from experiments.walking.policies import starting_policy
 
@@ -50,24 +52,24 @@ def test_bad_input_is_named(field, value, named, monkeypatch):
     own = field in ("walk_s", "max_fall_rate", "timeout_s")
     args = replace(ARGS, terms=replace(TERMS, **{field: value})) if own else replace(ARGS, **{field: value})
     with pytest.raises(ValueError, match=field) as error:
-        sim2real.check(args)
+        transfer.check(args)
     assert named in str(error.value)
 
 
 def test_masses_start_where_they_are_told_to():
-    _, entries, start = sim2real.check(replace(ARGS, start=("trunk_mass=0.5", "shank_mass=2")))
+    _, entries, start = transfer.check(replace(ARGS, start=("trunk_mass=0.5", "shank_mass=2")))
     assert start == {name: {"trunk_mass": 0.5, "shank_mass": 2.0}.get(name, 1.0) for name in entries}
 
 
 def test_no_log_is_told_in_time(tmp_path):
     with pytest.raises(ValueError, match=r"log: no log after 0 s, expected one as .*request\.json asks for"):
-        robot_folder.wait(tmp_path, 0.0)
+        exchange.wait(tmp_path, 0.0)
 
 
 def test_a_refusal_is_passed_on(tmp_path):
     (tmp_path / "refused.txt").write_text("battery is empty\n")
     with pytest.raises(ValueError, match=r"refused\.txt: battery is empty"):
-        robot_folder.wait(tmp_path, 60.0)
+        exchange.wait(tmp_path, 60.0)
 
 
 def test_a_log_counts_when_it_is_whole(tmp_path, monkeypatch):
@@ -83,10 +85,10 @@ def test_a_log_counts_when_it_is_whole(tmp_path, monkeypatch):
             (log / "meta.yaml").write_text("robot: biteno\n" * len(looks))
             (tmp_path / "refused.txt").write_text("another one was asked before")
 
-    monkeypatch.setattr(robot_folder.time, "sleep", sleep)
+    monkeypatch.setattr(exchange.time, "sleep", sleep)
     # A log that is there is waited for, however little time there is, and counts more than a refusal.
-    monkeypatch.setattr(robot_folder.time, "monotonic", count().__next__)
-    robot_folder.wait(tmp_path, 3.5)
+    monkeypatch.setattr(exchange.time, "monotonic", count().__next__)
+    exchange.wait(tmp_path, 3.5)
     # Last changed in the fourth pause; the fifth look has seen it so, and three more.
     assert len(looks) == 7
 
@@ -100,24 +102,34 @@ def test_a_log_that_never_rests_is_told(tmp_path, monkeypatch):
         (log / "meta.yaml").write_text("robot: biteno\n")
         (log / "run_000.csv").write_text("t\n" * len(looks))
 
-    monkeypatch.setattr(robot_folder.time, "sleep", sleep)
-    monkeypatch.setattr(robot_folder.time, "monotonic", lambda: float(len(looks)))
+    monkeypatch.setattr(exchange.time, "sleep", sleep)
+    monkeypatch.setattr(exchange.time, "monotonic", lambda: float(len(looks)))
     with pytest.raises(ValueError, match="log: still changes 60 s after the time that it had"):
-        robot_folder.wait(tmp_path, 5.0)
+        exchange.wait(tmp_path, 5.0)
     assert len(looks) == 66
 
 
-def line(verdicts, measured, predicted, explained=0.5, cut_short=0):
+def line(verdicts, measured, predicted, explained=0.5, cut_short=0, suspected=()):
+    """A round as `summary.json` has it, read back."""
     numbers = {"return": 4.0, "power_w": 12.0}
     moved = {"trunk_mass": {"before": 0.5, "after": 0.9, "low": 0.8, "high": 1.0}}
     moved["foot_friction"] = {"before": 1.0, "after": 1.0, "low": None, "high": None}
     calls = {name: [0.3] * len(verdicts) for name in ("radius", "threshold", "p_value", "uncovered")}
     # What could not be computed is null.
     calls["novelty"] = [None if verdict == "not_finite" else 0.3 for verdict in verdicts]
+    calls["elbo"] = [-30.0] * len(verdicts)
     known = {"trunk_mass": True, "foot_friction": False}
-    walks = {"fall_rate": measured, "episodes": 5, "seconds": 31.0, "suspected": [], "cut_short": cut_short, **numbers}
+    by_name = {"step": {}, "interval": {}, "training": {}, "spm_loss": 0.1, "measured_falls": 0, "not_finite": 0}
+    walks = {
+        "fall_rate": measured,
+        "episodes": 5,
+        "seconds": 31.0,
+        "suspected": list(suspected),
+        "cut_short": cut_short,
+        **numbers,
+    }
     simulated = {"episodes": 100, **numbers}
-    return {
+    found = {
         "round": 0,
         "predicted": {"fall_rate": 0.0, **simulated},
         "measured": walks,
@@ -128,15 +140,31 @@ def line(verdicts, measured, predicted, explained=0.5, cut_short=0):
             "compared_s": 2.5,
             "explained": {"fall_rate": explained, **simulated},
             **calls,
+            **by_name,
         },
         "next": {"fall_rate": predicted, **simulated},
         "expected_falls": 0.4,
     }
+    return from_json(Round, found)
 
 
 def falls(*args, **kwargs):
-    told = line(*args, **kwargs)
-    return expected.expected_falls(told["next"], [told])
+    one = line(*args, **kwargs)
+    return fall_risk(one.next_predicted, one.measured, one.tuning)
+
+
+def surprise_of(one):
+    return surprise(one.measured, one.tuning.explained)
+
+
+def test_records_are_read_back_as_they_were_written():
+    one = line(["widen", "not_finite"], 0.8, 0.1, suspected=[{"sentence": "q is late", "runs": ["run_000"]}])
+    written = json.loads(json.dumps(as_json(one)))
+    assert written["predicted"]["return"] == 4.0
+    assert written["tuning"]["moved"]["foot_friction"]["low"] is None
+    assert written["measured"]["suspected"] == [{"sentence": "q is late", "runs": ["run_000"]}]
+    assert written.keys() == {"round", "predicted", "measured", "tuning", "next", "expected_falls"}
+    assert from_json(Round, written) == one
 
 
 def test_what_simulation_does_not_cover_is_expected_again():
@@ -148,18 +176,19 @@ def test_what_simulation_does_not_cover_is_expected_again():
     # Nobody looked: no call, and the gate that is open.
     assert falls([], 0.8, 0.1) == 0.8
     unread = line(["accept"], 0.8, 0.1)
-    unread["tuning"]["p_value"] = [None]
-    assert expected.expected_falls(unread["next"], [unread]) == 0.8
+    unread = replace(unread, tuning=replace(unread.tuning, p_value=(None,)))
+    assert unread.tuning.verdict is None
+    assert fall_risk(unread.next_predicted, unread.measured, unread.tuning) == 0.8
     # Nothing has been measured.
-    assert expected.expected_falls({"fall_rate": 0.3}, []) == 0.3
+    assert fall_risk(unread.next_predicted) == 0.1
 
 
 def test_falls_that_the_tuned_simulator_does_not_know_are_expected_again():
     # Four of five fall, and of 100 simulated walks of the same policy ten: 5 * 0.108^4 * 0.892 + 0.108^5.
-    assert expected.surprise(line(["accept"], 0.8, 0.0, explained=0.1)) == pytest.approx(6.2e-4, rel=0.02)
+    assert surprise_of(line(["accept"], 0.8, 0.0, explained=0.1)) == pytest.approx(6.2e-4, rel=0.02)
     assert falls(["accept"], 0.8, 0.0, explained=0.1) == 0.8
     # Three of five where a fifth falls: few walks would allow it, and that is no reason to walk on.
-    assert expected.surprise(line(["accept"], 0.6, 0.0, explained=0.2)) == pytest.approx(0.063, rel=0.02)
+    assert surprise_of(line(["accept"], 0.6, 0.0, explained=0.2)) == pytest.approx(0.063, rel=0.02)
     assert falls(["accept"], 0.6, 0.0, explained=0.2) == 0.6
     # One of five is none where five of a hundred fall: 1 - (1 - 6 / 102)^5 = 0.26.
     assert falls(["accept"], 0.2, 0.0, explained=0.05) == 0.0
@@ -171,35 +200,35 @@ def test_falls_that_the_tuned_simulator_does_not_know_are_expected_again():
 
 
 def test_the_page_says_what_matters_and_runs_nothing_of_the_log(tmp_path):
-    told = line(["widen", "accept"], measured=0.4, predicted=0.1)
-    told["measured"]["suspected"] = [{"sentence": "q of <script>alert(1)</script> is cut off", "runs": ["<b>"]}]
+    suspected = [{"sentence": "q of <script>alert(1)</script> is cut off", "runs": ["<b>"]}]
+    one = line(["widen", "accept"], measured=0.4, predicted=0.1, suspected=suspected)
     page = tmp_path / "report.html"
-    sim2real_report.write(page, [told], TERMS)
+    report.write(page, [one], TERMS)
     text = page.read_text()
     assert "<script>" not in text
     assert "&lt;script&gt;alert(1)&lt;/script&gt; is cut off (&lt;b&gt;)" in text
-    assert "Not identifiable from this log, and left alone: foot_friction." in text
+    assert "Not identifiable from this log, and left as they were: foot_friction." in text
     assert "0.800 to 1.000" in text
     assert "should not walk again" in text
     assert "experiments.discover" not in text
-    sim2real_report.write(page, [told, line(["unexplained"], 0.4, 0.1)], replace(TERMS, max_fall_rate=0.4))
+    report.write(page, [one, line(["unexplained"], 0.4, 0.1)], replace(TERMS, max_fall_rate=0.4))
     text = page.read_text()
     assert "experiments.excite" in text
     assert "experiments.discover" in text
     assert "may walk again" in text
-    assert "10 walks, of\nwhich 4 ended in a fall" in text
+    assert "So far it has walked 10 times,\nand 4 of these walks ended in a fall" in text
     assert "before their time" not in text
-    sim2real_report.write(page, [line(["not_finite"], 1.0, 0.1, cut_short=3)], TERMS)
+    report.write(page, [line(["not_finite"], 1.0, 0.1, cut_short=3)], TERMS)
     text = page.read_text()
-    assert "does not stand long enough" in text
+    assert "a policy that stands longer" in text
     assert "records of 3 walks end before their time" in text
-    sim2real_report.write(page, [line([], 0.4, 0.1)], TERMS)
-    assert "Nobody asked" in page.read_text()
+    report.write(page, [line([], 0.4, 0.1)], TERMS)
+    assert "This method does not ask" in page.read_text()
 
 
 @pytest.fixture(scope="module")
-def learner():
-    return sim2real.simulator(ARGS)
+def programs():
+    return transfer.compile_programs(ARGS)
 
 
 @pytest.fixture
@@ -214,11 +243,11 @@ def answered(monkeypatch):
     monkeypatch.setattr(rounds, "wait", wait)
 
 
-def states(out, learner, index):
+def states(out, programs, index):
     """The state that a round begins with."""
-    loop = learner.loop
-    like = learner.machines["ours"].init(
-        loop.init(jax.random.PRNGKey(0)), loop.dist(sim2real.check(ARGS)[2], 0.2), rounds.tuner.knobs()
+    learner = programs.learner
+    like = programs.machines["ours"].init(
+        learner.init(jax.random.PRNGKey(0)), learner.dist(transfer.check(ARGS)[2], 0.2), rounds.tuner.knobs()
     )
     return checkpoint.load(out / f"round_{index:03d}" / "start", like, {})
 
@@ -227,8 +256,8 @@ class Stopped(Exception):
     """The run was killed."""
 
 
-def test_a_run_stopped_after_every_file_is_the_same_run(learner, answered, tmp_path, monkeypatch):
-    whole = sim2real.play(replace(ARGS, out=tmp_path / "whole"), learner)
+def test_a_run_stopped_after_every_file_is_the_same_run(programs, answered, tmp_path, monkeypatch):
+    whole = transfer.play(replace(ARGS, out=tmp_path / "whole"), programs)
     args = replace(ARGS, out=tmp_path / "stopped")
     left = []
 
@@ -248,73 +277,68 @@ def test_a_run_stopped_after_every_file_is_the_same_run(learner, answered, tmp_p
             # Some files come two or three at a time, and are made again if the last one is not there.
             left[:] = [None] * (1 + stops % 3)
             try:
-                pieces = sim2real.play(args, learner)
+                pieces = transfer.play(args, programs)
                 break
             except Stopped:
                 continue
     # Of 17 files; two in a call, in the mean.
     assert 7 <= stops < 39
-    assert json.dumps(pieces) == json.dumps(whole)
+    assert json.dumps(as_json(pieces)) == json.dumps(as_json(whole))
     for index in range(3):
-        one, other = (states(tmp_path / name, learner, index) for name in ("whole", "stopped"))
+        one, other = (states(tmp_path / name, programs, index) for name in ("whole", "stopped"))
         jax.tree.map(np.testing.assert_array_equal, one, other)
     assert (args.out / "round_001" / "report.html").exists()
     # And more rounds may be asked for later.
-    assert sim2real.play(replace(args, rounds=3), learner)[:2] == pieces
+    assert transfer.play(replace(args, rounds=3), programs)[:2] == pieces
 
 
 @pytest.fixture
-def first(learner, tmp_path):
+def first(programs, tmp_path):
     """A run that has not begun, by its terms."""
-    policy, start = starting_policy("walk", learner.loop), sim2real.check(ARGS)[2]
-    return lambda terms: Run(tmp_path, terms, learner, "ours", policy, start, 0.2)
+    policy, start = starting_policy("walk", programs.learner), transfer.check(ARGS)[2]
+    return lambda terms: Rounds(tmp_path, terms, programs, "ours", policy, start, 0.2)
 
 
 def test_who_would_fall_is_not_asked_to_walk(first, answered, tmp_path, monkeypatch):
-    monkeypatch.setattr(Run, "_foreseen", lambda self, index, state: {"fall_rate": 0.25, "return": 0.0, "power_w": 1.0})
+    prediction = Prediction(mean_return=0.0, fall_rate=0.25, power_w=1.0, episodes=4)
+    monkeypatch.setattr(Rounds, "_predicted", lambda self, index, state: prediction)
     careful, place = replace(TERMS, force=False), tmp_path / "round_000"
     place.mkdir()
     # Asked for by an earlier call on other terms.
     (place / "request.json").write_text("{}")
     with pytest.raises(ValueError, match=r"round 0: the robot is not asked to walk: 25% .* and 20% may"):
-        first(careful).round(0, [])
+        first(careful).play(0, None)
     assert not (place / "request.json").exists()
-    assert first(TERMS).round(0, [])["expected_falls"] >= 0.25
+    assert first(TERMS).play(0, None).expected_falls >= 0.25
     # Who has walked already may be learnt from.
     (place / "tuning.json").unlink()
-    assert first(careful).round(0, [])["tuning"]["verdicts"]
+    assert first(careful).play(0, None).tuning.verdicts
 
 
 def test_every_walk_that_was_asked_for_is_counted(first, answered, tmp_path):
     """A run that nobody asked for, or that is not there, would change what the robot is said to have done."""
     run, place = first(TERMS), tmp_path / "round_000"
-    run._ask(0, run._start(0, lambda: run._first))
+    run._request(0, run._start(0, lambda: run._first))
     request = place / "request.json"
     asked = request.read_text()
     request.write_text(json.dumps(json.loads(asked) | {"episodes": 3}))
     robot_stub.answer(place, Robot(Body()), 0)
     with pytest.raises(ValueError, match=r"log: got 3 run\(s\), expected the 2 walks that .*request\.json asks for"):
-        run.round(0, [])
+        run.play(0, None)
     request.write_text(asked)
     shutil.rmtree(place / "log")
-    assert run.round(0, [])["measured"]["episodes"] == 2
+    assert run.play(0, None).measured.episodes == 2
 
 
-def test_a_run_goes_on_in_the_model_that_it_began_with(learner, answered, tmp_path):
+def test_a_run_goes_on_in_the_model_that_it_began_with(programs, answered, tmp_path):
     model = tmp_path / "model"
-    shutil.copytree(Path(rounds.__file__).parent / "results" / "stand_in" / "found" / "model", model)
+    shutil.copytree(Path(sim2real.__file__).parent / "results" / "stand_in" / "found" / "model", model)
     args = replace(ARGS, out=tmp_path / "run", rounds=1, model=model)
-    assert sim2real.play(args, learner) == sim2real.play(args, learner)
+    assert transfer.play(args, programs) == transfer.play(args, programs)
     text = (model / "model.xml").read_text()
     (model / "model.xml").write_text(text.replace("<mujoco", "<mujoco ", 1))
     with pytest.raises(ValueError, match="model_sha256"):
-        sim2real.play(args, learner)
-
-
-def test_a_suspicion_is_told_once_a_run():
-    hole = lambda row: Finding("missing rows", "t", (), 0.02, f"rows are missing behind row {row}")  # noqa: E731
-    found = {"run_000": [hole(3), hole(9), hole(12)], "run_001": [], "run_002": [hole(5)]}
-    assert doctor.summary(found) == [(hole(3), ["run_000 (3 times)", "run_002"])]
+        transfer.play(args, programs)
 
 
 def test_errors_are_printed_as_they_are(monkeypatch, capsys):
@@ -326,37 +350,55 @@ def test_errors_are_printed_as_they_are(monkeypatch, capsys):
         raise ValueError("got position[knee], expected `pip install 'jaxtune[onnx]'` [/x]")
 
     monkeypatch.setattr(sys, "argv", ["program"])
-    monkeypatch.setattr(train, "console", Console(width=200))
-    with pytest.raises(SystemExit):
-        train.run(main, NoArgs)
-    assert "error: got position[knee], expected `pip install 'jaxtune[onnx]'` [/x]" in capsys.readouterr().out
+    monkeypatch.setattr(cli, "_errors", Console(width=200, stderr=True))
+    with pytest.raises(SystemExit) as ended:
+        cli.run(main, NoArgs)
+    assert ended.value.code == 2
+    printed = capsys.readouterr()
+    assert "error: got position[knee], expected `pip install 'jaxtune[onnx]'` [/x]" in printed.err
+    assert not printed.out
+
+
+def test_progress_is_a_line_a_minute_where_there_is_no_terminal(monkeypatch):
+    output = io.StringIO()
+    monkeypatch.setattr(cli, "console", Console(file=output, width=100))
+    monkeypatch.setattr(cli, "_LINE_S", 0.05)
+    with cli.bars() as progress:
+        progress.add_task("done", total=1, completed=1)
+        task = progress.add_task("training", total=100)
+        progress.update(task, completed=20)
+        deadline = time.monotonic() + 10.0
+        while "min: training 20/100" not in output.getvalue() and time.monotonic() < deadline:
+            time.sleep(0.01)
+        assert "min: training 20/100" in output.getvalue()
+        assert "min: done" not in output.getvalue()
 
 
 def test_a_log_that_means_something_else_is_not_learnt_from(first, answered, tmp_path, monkeypatch):
     turned = Finding("flipped sign", "q", ("left_knee",), -1.0, "q: left_knee turns the other way")
     late = Finding("late", "dq", (), 10.0, "dq: what was measured is 10 ms late")
     found = {"run_000": [turned, late], "run_001": [late]}
-    monkeypatch.setattr(doctor, "examine", lambda log: found)
+    monkeypatch.setattr(rounds, "diagnose_log", lambda log: found)
     # In half of the runs is not in most.
-    assert first(TERMS).round(0, [])["measured"]["suspected"][0]["runs"] == ["run_000", "run_001"]
+    assert first(TERMS).play(0, None).measured.suspected[0].runs == ("run_000", "run_001")
     (tmp_path / "round_000" / "tuning.json").unlink()
     found["run_001"] = [turned]
     with pytest.raises(ValueError, match="left_knee turns the other way"):
-        first(TERMS).round(0, [])
+        first(TERMS).play(0, None)
     assert not (tmp_path / "round_000" / "tuning.json").exists()
-    assert first(replace(TERMS, trust_log=True)).round(0, [])["tuning"]["verdicts"]
+    assert first(replace(TERMS, trust_log=True)).play(0, None).tuning.verdicts
 
 
-def test_a_log_of_another_policy_is_not_learnt_from(first, answered, learner, tmp_path):
+def test_a_log_of_another_policy_is_not_learnt_from(first, answered, programs, tmp_path):
     run = first(TERMS)
     state = run._start(0, lambda: run._first)
-    other = learner.loop.init(jax.random.PRNGKey(3))
-    run._ask(0, state.replace(policy=state.policy.replace(learner=other.learner)))
+    other = programs.learner.init(jax.random.PRNGKey(3))
+    run._request(0, state.replace(policy=state.policy.replace(learner=other.learner)))
     with pytest.raises(ValueError, match=r"actions differ from what this round's policy does by \d+% of their size"):
-        run.round(0, [])
+        run.play(0, None)
 
 
-def test_simulated_episodes_repeat_what_the_log_says(first, answered, learner, monkeypatch):
+def test_simulated_episodes_repeat_what_the_log_says(first, answered, programs, monkeypatch):
     run, seen = first(TERMS), []
     tune = run._tune
 
@@ -365,11 +407,11 @@ def test_simulated_episodes_repeat_what_the_log_says(first, answered, learner, m
         return tune(key, state, measured)
 
     monkeypatch.setattr(run, "_tune", spy)
-    run.round(0, [])
-    (state, measured), steps = seen[0], learner.loop.preset.episode_steps
+    run.play(0, None)
+    (state, measured), steps = seen[0], programs.learner.preset.episode_steps
     assert measured.obs.shape == (2, steps, 40)
     params = {name: jnp.full(4, value) for name, value in state.dist.centre.items()}
-    found = jax.jit(learner.loop.simulate)(jax.random.PRNGKey(5), state.policy, params)
+    found = jax.jit(programs.learner.simulate)(jax.random.PRNGKey(5), state.policy, params)
     assert found.obs.shape == (4, steps, 40)
     for episode in range(4):
         told = measured.obs[episode % 2]
@@ -384,7 +426,7 @@ def test_simulated_episodes_repeat_what_the_log_says(first, answered, learner, m
 def test_the_stand_in_is_as_heavy_as_is_said(tmp_path):
     args = sim2real_bench.Args(out=tmp_path, preset="smoke", mass=0.5, walk_s=0.8)
     sim2real_bench.check(args)
-    start = {name: sim2real.check(sim2real_bench.asked(args, name, 1))[2] for name in sim2real_bench.METHODS}
+    start = {name: transfer.check(sim2real_bench.transfer_of(args, name, 1))[2] for name in sim2real_bench.METHODS}
     half = {"trunk_mass": 0.5, "abductor_mass": 0.5, "thigh_mass": 0.5, "shank_mass": 0.5, "foot_friction": 1.0}
     assert start["ours"] == start["spm"] == start["dr"] == half
     assert start["oracle"] == {**dict.fromkeys(half, 1.0), "foot_friction": 0.75}

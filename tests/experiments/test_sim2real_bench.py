@@ -8,34 +8,35 @@ from pathlib import Path
 import pytest
 
 import experiments
-from experiments import sim2real, sim2real_bench
+from experiments import sim2real_bench
 from experiments.common import checkpoint
-from experiments.sim2real_bench import Args, asked, evaluate, robot
+from experiments.robot import transfer
+from experiments.sim2real_bench import Args, evaluate, stand_in, transfer_of
 
 PACKAGE = Path(experiments.__file__).parent
 # What discovery wrote after the stand-in had hung.
 FOUND = PACKAGE / "results" / "stand_in" / "found" / "model"
 
 
-class Asked(Exception):
+class Enough(Exception):
     """Enough is known."""
 
 
 def test_every_method_learns_in_the_model_that_was_found_from_a_policy_of_the_nominal_one(tmp_path, monkeypatch):
     args = Args(out=tmp_path, preset="smoke", walk_s=0.8, model=FOUND)
-    assert {asked(args, name, 0).model for name in sim2real_bench.METHODS} == {FOUND}
+    assert {transfer_of(args, name, 0).model for name in sim2real_bench.METHODS} == {FOUND}
     prepared = []
 
-    def prepare(args, learner, seed):
-        prepared.append(learner)
-        raise Asked
+    def prepare(args, programs, seed):
+        prepared.append(programs)
+        raise Enough
 
     # Flags are for a process of its own.
     monkeypatch.setattr(checkpoint, "set_up_compiler", lambda flags: None)
-    monkeypatch.setattr(sim2real, "simulator", lambda args: args.model)
+    monkeypatch.setattr(transfer, "compile_programs", lambda args: args.model)
     monkeypatch.setattr(sim2real_bench, "prepare", prepare)
     for model in (FOUND, None):
-        with pytest.raises(Asked):
+        with pytest.raises(Enough):
             sim2real_bench.main(Args(out=tmp_path / str(model is None), preset="smoke", walk_s=0.8, model=model))
     assert prepared == [None, None]
 
@@ -46,7 +47,7 @@ def learnt(out, *options):
     command += ["--method", "dr", "--radius", "0.1", "--timeout-s", "120", *options]
     # Tests compile in haste, which is not worth it here.
     environment = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
-    with robot(out):
+    with stand_in(out):
         subprocess.run(command, cwd=PACKAGE.parent, env=environment, check=True)
     return out / "round_001" / "learner"
 
@@ -54,11 +55,11 @@ def learnt(out, *options):
 @pytest.mark.slow
 def test_a_policy_trained_in_the_model_that_was_found_walks_better(tmp_path):
     args = Args(out=tmp_path, evaluation=40)
-    learner = sim2real.simulator(asked(args, "ours", 0))
-    without = evaluate(args, learner, learnt(tmp_path / "without"))
-    with_it = evaluate(args, learner, learnt(tmp_path / "with", "--model", str(FOUND)))
+    programs = transfer.compile_programs(transfer_of(args, "ours", 0))
+    without = evaluate(args, programs, learnt(tmp_path / "without"))
+    with_it = evaluate(args, programs, learnt(tmp_path / "with", "--model", str(FOUND)))
     print(f"without: {without}\nwith: {with_it}")
-    falls, fewer = (round(args.evaluation * one["fall_rate"]) for one in (without, with_it))
+    falls, fewer = (round(args.evaluation * one.fall_rate) for one in (without, with_it))
     assert fewer <= 0.1 * args.evaluation
     assert falls >= fewer + 0.5 * args.evaluation
-    assert with_it["return"] > 2 * without["return"]
+    assert with_it.mean_return > 2 * without.mean_return

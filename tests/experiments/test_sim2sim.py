@@ -8,8 +8,11 @@ import numpy as np
 import pytest
 
 from experiments import sim2sim, sweep
-from experiments.common import checkpoint, plots, report
-from experiments.common.config import PRESETS
+from experiments.common import checkpoint, plots
+from experiments.common.cli import bars
+from experiments.common.config import PRESETS, chosen
+from experiments.walking import comparison
+from experiments.walking.cases import CASES
 
 
 @pytest.mark.parametrize(
@@ -54,15 +57,11 @@ def test_sweep_lanes_are_all_combinations():
 
 
 def test_target_is_nominal_over_start():
-    class Stub:
-        entries = sim2sim.chosen("legs6")
-
-    truth = sim2sim.true_params(sim2sim.Args(case="mass", start=0.5), Stub.entries)
+    entries = chosen("legs6")
+    truth = CASES["mass"].true_params(entries, start=0.5)
     assert truth["left_thigh_mass"] == 2.0
     assert truth["foot_friction"] == 1.0
-    assert sim2sim.true_params(sim2sim.Args(case="friction", start=1.5), Stub.entries)[
-        "foot_friction"
-    ] == pytest.approx(2 / 3)
+    assert CASES["friction"].true_params(entries, start=1.5)["foot_friction"] == pytest.approx(2 / 3)
 
 
 def test_folder_of_another_config_is_refused(tmp_path):
@@ -98,9 +97,9 @@ def _lines(name, seed):
 
 
 def test_summary_has_the_promised_keys(tmp_path):
-    args = sim2sim.Args(seeds=2)
+    settings = {"case": "mass", "start": 0.5, "preset": "cpu", "seeds": 2}
     results = {"ours": [{"lines": _lines("ours", seed), "measured_episodes": 5} for seed in range(2)]}
-    summary = report.sim2sim(args, results, ("left_thigh_mass",))
+    summary = comparison.summarise(settings, results, ("left_thigh_mass",))
     ours = summary["methods"]["ours"]
     assert summary["case"] == "mass"
     assert ours["return_start"] == [30.0, 30.0]
@@ -123,8 +122,8 @@ def test_summary_has_the_promised_keys(tmp_path):
 def test_finished_pairs_are_not_run_again(tmp_path, monkeypatch):
     runner = object.__new__(sim2sim.Runner)
     runner._args = sim2sim.Args(out=tmp_path)
-    runner._loop = type("Learner", (), {"preset": PRESETS["smoke"]})
-    runner._methods = {"ours": sim2sim.Method(None, None, None, 1)}
+    runner._learner = type("Learner", (), {"preset": PRESETS["smoke"]})
+    runner._contenders = {"ours": comparison.Contender(None, None, None, 1)}
     calls = []
 
     def tunings(self, name, seed):
@@ -132,7 +131,7 @@ def test_finished_pairs_are_not_run_again(tmp_path, monkeypatch):
         yield from _lines(name, seed)
 
     monkeypatch.setattr(sim2sim.Runner, "_tunings", tunings)
-    with sim2sim.bars() as progress:
+    with bars() as progress:
         first = runner("ours", 0, progress)
         again = runner("ours", 0, progress)
         runner("ours", 1, progress)

@@ -13,7 +13,10 @@ import toys
 import envs.targets
 from experiments import evaluate, sim2sim
 from experiments.common import film
+from experiments.common.config import chosen, preset
+from experiments.walking.cases import CASES
 from experiments.walking.learner import Learner
+from experiments.walking.targets import TARGETS
 from jaxtune import tuner as tuners
 from jaxtune.types import Verdict
 
@@ -45,7 +48,7 @@ def test_a_step_with_a_foreign_target_is_that_of_the_tuner():
         assert (count, steps) == (sizes.tuner.set_episodes, sizes.episode_steps)
         return machine.measure(key, policy)
 
-    sizes = sim2sim.preset("smoke")
+    sizes = preset("smoke")
     learner = types.SimpleNamespace(preset=sizes, _train=jax.jit(toys.train_policy))
     step = Learner.step(learner, machine, play)
     got, expected = step(jax.random.key(0), state), jax.jit(machine.step)(jax.random.key(0), state)
@@ -55,35 +58,38 @@ def test_a_step_with_a_foreign_target_is_that_of_the_tuner():
 
 def test_a_run_whose_every_measured_episode_fails_stops_with_the_reason():
     class Stub:
-        _loop = types.SimpleNamespace(preset=sim2sim.preset("cpu"))
+        _learner = types.SimpleNamespace(preset=preset("cpu"))
 
     def info(verdict, falls):
         return types.SimpleNamespace(calls=1, verdicts=[verdict], measured_falls=falls)
 
     with pytest.raises(ValueError, match="target: every measured episode fell or broke within 50 steps"):
-        sim2sim.Runner._must_have_walked(Stub, info(Verdict.NOT_FINITE, 5))
-    sim2sim.Runner._must_have_walked(Stub, info(Verdict.NOT_FINITE, 4))
-    sim2sim.Runner._must_have_walked(Stub, info(Verdict.ACCEPT, 5))
+        sim2sim.Runner._check_walked(Stub, info(Verdict.NOT_FINITE, 5))
+    sim2sim.Runner._check_walked(Stub, info(Verdict.NOT_FINITE, 4))
+    sim2sim.Runner._check_walked(Stub, info(Verdict.ACCEPT, 5))
 
 
 def test_cases_have_the_target_of_their_figure():
-    class Stub:
-        entries = sim2sim.chosen("whole_body")
-
-    weak = sim2sim.Args(case="weak_motor", parameters="whole_body")
-    truth = sim2sim.true_params(weak, Stub.entries)
+    truth = CASES["weak_motor"].true_params(chosen("whole_body"), start=0.5)
     assert truth["torque_scale"] == 0.75
     assert all(value == 1.0 for name, value in truth.items() if name != "torque_scale")
-    assert sim2sim.engine(weak) == "bullet"
-    assert sim2sim.engine(sim2sim.Args(case="weak_motor", target="mujoco_c")) == "mujoco_c"
-    assert sim2sim.engine(sim2sim.Args(case="mass")) == "mjx"
+    assert CASES["weak_motor"].target == CASES["bullet"].target == "bullet"
+    assert CASES["mass"].target == CASES["friction"].target == "mjx"
+
+
+def test_the_target_is_played_by_the_engine_that_is_asked_for(monkeypatch):
+    learner = types.SimpleNamespace(robot=None, entries=chosen("whole_body"))
+    for name in TARGETS:
+        monkeypatch.setitem(TARGETS, name, lambda robot, params, name=name: name)
+    assert sim2sim.make_target(sim2sim.Args(case="weak_motor"), learner) == "bullet"
+    assert sim2sim.make_target(sim2sim.Args(case="weak_motor", target="mujoco_c"), learner) == "mujoco_c"
 
 
 def test_a_hidden_parameter_that_is_tuned_is_off_and_hidden_no_more():
-    entries = sim2sim.chosen("foot_friction,torque_scale")
-    assert sim2sim.off(sim2sim.Args(case="weak_motor"), entries) == ("torque_scale",)
-    assert sim2sim.off(sim2sim.Args(case="mass"), entries) == ()
-    assert sim2sim.off(sim2sim.Args(case="friction"), entries) == ("foot_friction",)
+    entries = chosen("foot_friction,torque_scale")
+    assert CASES["weak_motor"].off(entries) == ("torque_scale",)
+    assert CASES["mass"].off(entries) == ()
+    assert CASES["friction"].off(entries) == ("foot_friction",)
     # In the same engine that makes a case of it.
     sim2sim.check(sim2sim.Args(case="weak_motor", target="mjx", parameters="foot_friction,torque_scale"))
 
@@ -103,7 +109,7 @@ def test_pybullet_that_is_missing_is_named_with_its_extra(monkeypatch):
     monkeypatch.delattr(envs.targets, "bullet", raising=False)
     monkeypatch.setitem(sys.modules, "pybullet", None)
     with pytest.raises(ValueError, match=r"pip install 'jaxtune\[bullet\]'"):
-        sim2sim.TARGETS["bullet"](None, {})
+        TARGETS["bullet"](None, {})
 
 
 @pytest.mark.parametrize(
@@ -116,7 +122,7 @@ def test_pybullet_that_is_missing_is_named_with_its_extra(monkeypatch):
         ("set", ("foot_friction",), "name=value"),
         ("set", ("foot_friction=slippery",), "name=value"),
         ("set", ("foot_friction=9",), "0.15 to 4"),
-        ("set", ("wind=1",), "'wind' is unknown"),
+        ("set", ("wind=1",), "got 'wind'"),
     ],
 )
 def test_bad_input_of_evaluate_is_named(field, value, named):

@@ -41,7 +41,7 @@ def unanimous(monkeypatch):
     monkeypatch.setattr(models, "vote", lambda *_: jnp.array([1.0, -1.0]))
 
 
-def test_spm_accepts_what_a_gate_would_ring_for_and_keeps_its_radius(spm, unanimous):
+def test_spm_accepts_what_a_gate_would_reject_and_keeps_its_radius(spm, unanimous):
     state = start(spm, threshold=1e-6)  # which no gate that looks at it lets pass
     step = jax.jit(spm.step)
     for seed in range(3):

@@ -105,7 +105,7 @@ def test_make_needs_the_same_names_everywhere(field):
 
 
 def test_make_needs_the_centre_within_the_bounds():
-    with pytest.raises(ValueError, match=r"centre\['a'\]: got 2.0, allowed -1.0 to 1.0"):
+    with pytest.raises(ValueError, match=r"centre\['a'\]: got 2.0, expected -1.0 to 1.0"):
         dists.make(scalars(a=2), 0.1, scalars(a=-1), scalars(a=1))
     with pytest.raises(ValueError, match=r"centre\['b'\]: got nan"):
         dists.make(scalars(a=0, b=jnp.nan), 0.1, scalars(a=-1, b=-1), scalars(a=1, b=1))

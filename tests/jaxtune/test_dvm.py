@@ -137,7 +137,7 @@ def test_novelty_is_the_mean_over_near_neighbours_less_its_own_elbo(reach, neigh
     np.testing.assert_allclose(novelty, expected - own, rtol=1e-4)
 
 
-def test_no_neighbour_within_reach_is_said_and_is_finite():
+def test_no_neighbour_within_reach_is_reported_and_finite():
     novelty, valid, covered = novelty_of(*placed(reach=0.05), measured())
     assert valid.all()
     assert not covered.any()

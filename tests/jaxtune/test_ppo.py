@@ -224,5 +224,5 @@ def test_exploration_has_the_first_deviation_it_was_given():
 
 
 def test_minibatches_must_divide_the_environments():
-    with pytest.raises(ValueError, match="minibatches: 3 does not divide num_envs 64"):
+    with pytest.raises(ValueError, match="minibatches: got 3, expected a divisor of num_envs, 64"):
         PPOConfig(num_envs=64, minibatches=3)

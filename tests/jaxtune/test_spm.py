@@ -17,8 +17,8 @@ COLOUR, FRICTION, MASS = range(3)
 @pytest.fixture(scope="module")
 def simulated():
     dist = toys.uniform(CENTRE)
-    params = dists.sample(jax.random.key(0), dist, 512)
-    return toys.Slider().simulate(jax.random.key(1), toys.policy(), params), params, dist
+    coords = dists.sample(jax.random.key(0), dist, 512)
+    return toys.Slider().simulate(jax.random.key(1), toys.policy(), coords), coords, dist
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +71,7 @@ def test_estimate_of_a_truth_outside_is_the_edge_of_the_box(estimate):
     assert 0.9 < estimate(measured(mass=2.0))[MASS] <= 1.0
 
 
-def test_what_does_not_show_is_answered_with_the_middle_of_the_box(vote, estimate):
+def test_a_coordinate_that_does_not_show_is_estimated_in_the_middle_of_the_box(vote, estimate):
     for colour in (-0.9, 0.9):
         assert abs(vote(measured(colour=colour))[COLOUR]) < 0.35
         assert abs(estimate(measured(colour=colour))[COLOUR]) < 0.35
@@ -96,7 +96,7 @@ def test_a_guess_of_one_parameter_does_not_turn_the_answer_for_another(logits):
     assert np.all(high < 0)
 
 
-def test_guesses_are_judged_one_by_one(logits):
+def test_guesses_are_answered_one_by_one(logits):
     guesses = jax.random.uniform(jax.random.key(5), (3, 3), minval=-1.0)
     alone = jnp.concatenate([logits(measured(), guesses[row : row + 1]) for row in range(3)])
     np.testing.assert_allclose(logits(measured(), guesses), alone, rtol=1e-3, atol=1e-4)
@@ -122,20 +122,20 @@ def test_what_a_broken_simulation_left_behind_is_no_evidence(estimate):
     np.testing.assert_allclose(estimate(broken), estimate(ended), rtol=1e-3)
 
 
-def test_no_evidence_says_nothing(vote, estimate):
+def test_a_set_without_a_valid_window_gives_no_vote_and_the_middle(vote, estimate):
     nothing = measured()
     nothing = nothing.replace(alive=jnp.zeros_like(nothing.alive))
     np.testing.assert_array_equal(vote(nothing), 0.0)
     np.testing.assert_allclose(estimate(nothing), 0.0, atol=1e-6)
 
 
-def test_ignorance_costs_what_the_calculation_says(simulated, trained):
-    trajectory, params, dist = simulated
+def test_loss_of_a_model_that_learns_nothing_is_the_entropy_of_the_labels(simulated, trained):
+    trajectory, coords, dist = simulated
     _, loss = trained
     # Labels that the episodes know nothing of. A uniform guess at place u of the box is right with probability u, so
     # its entropy is that of u, whose mean over u is 1/2 nat; the first of the four guesses is the centre, at log 2.
     all_alike = jax.tree.map(lambda leaf: leaf[:1].repeat(512, 0), trajectory)
-    _, ignorant = toys.train_spm(jax.random.key(2), CONFIG, all_alike, params, dist)
+    _, ignorant = toys.train_spm(jax.random.key(2), CONFIG, all_alike, coords, dist)
     expected = (np.log(2) + 3 * 0.5) / 4
     np.testing.assert_allclose(ignorant, expected, atol=0.02)
     # Two parameters of three show.
@@ -143,7 +143,7 @@ def test_ignorance_costs_what_the_calculation_says(simulated, trained):
 
 
 def with_logits(monkeypatch, curve):
-    """A model that answers a sweep of guesses [guesses, params] with a given curve."""
+    """A model that answers a sweep of guesses [guesses, coords] with a given curve."""
     monkeypatch.setattr(spm, "logits", lambda config, model, trajectory, guesses: curve(guesses))
     # Normalised, the second parameter's box ends at (1 - 0.75) / 0.5 = 0.5.
     bounds = {"a": jnp.float32(-1), "b": jnp.float32(-1)}, {"a": jnp.float32(1), "b": jnp.float32(1)}

@@ -1,5 +1,7 @@
 import dataclasses
 import functools
+import re
+import textwrap
 
 import jax
 import jax.numpy as jnp
@@ -62,7 +64,7 @@ def scripted_gate(key, config, collected, measured, knobs):
 
     Of 128 uniform draws the outermost is at more than 0.9 of the radius, so it tells how often the radius grew.
     """
-    outermost = jnp.abs(dists.ravel(collected.params)).max()
+    outermost = jnp.abs(dists.ravel(collected.coords)).max()
     widenings = jnp.round(jnp.log(outermost / FIRST_RADIUS) / jnp.log(1.5)).astype(int)
     nan = jnp.asarray(jnp.nan)
     threshold = jnp.where(jnp.isnan(knobs.threshold), 1.0, knobs.threshold)
@@ -143,7 +145,7 @@ def test_novelty_that_never_falls_is_unexplained(play):
     not_updated(state, info)
 
 
-def test_a_fall_that_may_be_chance_brings_a_set_no_closer(play):
+def test_a_novelty_decrease_that_may_be_chance_brings_a_set_no_closer(play):
     expect(play(5.0, 4.994, 4.992, 0.5)[2], Verdict.WIDEN, Verdict.WIDEN, Verdict.UNEXPLAINED)
     # What two calls bring together counts.
     expect(play(5.0, 4.994, 4.988, 4.98, 0.5)[2], *[Verdict.WIDEN] * 4, Verdict.ACCEPT)
@@ -193,10 +195,10 @@ def test_a_novelty_that_breaks_after_widening_ends_it_too(play):
     not_updated(state, info)
 
 
-def test_collected_episodes_keep_to_their_parameters():
-    def tell(key, policy, params):
-        """Episodes whose observation is their parameters."""
-        obs = jnp.broadcast_to(dists.ravel(params)[:, None], (params["mass"].shape[0], 60, 2))
+def test_collected_episodes_keep_to_their_coordinates():
+    def tell(key, policy, coords):
+        """Episodes whose observation is their coordinates."""
+        obs = jnp.broadcast_to(dists.ravel(coords)[:, None], (coords["mass"].shape[0], 60, 2))
         alive = jnp.ones(obs.shape[:2], bool)
         nothing = jnp.zeros(obs.shape[0], bool)
         return Trajectory(obs=obs, action=obs, alive=alive, score=alive * 1.0, fell=nothing, not_finite=nothing)
@@ -208,12 +210,20 @@ def test_collected_episodes_keep_to_their_parameters():
     assert collected.trajectory.obs.shape == (7, 60, 2)
     assert collected.held_out.obs.shape == (4, 3, 60, 2)
     assert collected.held_out.fell.shape == (4, 3)
-    np.testing.assert_array_equal(collected.trajectory.obs[:, 0], dists.ravel(collected.params))
+    np.testing.assert_array_equal(collected.trajectory.obs[:, 0], dists.ravel(collected.coords))
     for episode in range(3):
-        np.testing.assert_array_equal(collected.held_out.obs[:, episode, 0], dists.ravel(collected.held_out_params))
-    everything = np.concatenate([collected.params["mass"], collected.held_out_params["mass"]])
+        np.testing.assert_array_equal(collected.held_out.obs[:, episode, 0], dists.ravel(collected.held_out_coords))
+    everything = np.concatenate([collected.coords["mass"], collected.held_out_coords["mass"]])
     assert len(np.unique(everything)) == 11
     assert np.abs(everything).max() <= 0.2
+
+
+def test_the_example_in_the_documentation_traces():
+    (code,) = re.findall(r"\n(    import jax\n.*?)\n`tuner.run", tuners.__doc__, re.DOTALL)
+    scope = {}
+    exec(textwrap.dedent(code), scope)
+    _, info = jax.eval_shape(scope["tuner"].step, jax.random.key(0), scope["state"])
+    assert info.verdicts.shape == (tuners.TunerConfig().max_widenings + 1,)
 
 
 # Identities of pure functions --------------------------------------------------------------------------------------
@@ -227,7 +237,7 @@ def drawn_gate(key, config, collected, measured, knobs):
 
 
 def drawn_update(key, config, collected, measured, dist, knobs):
-    step = knobs.step_size * jax.random.normal(key, (len(dist.centre),)) + collected.params["mass"].mean()
+    step = knobs.step_size * jax.random.normal(key, (len(dist.centre),)) + collected.coords["mass"].mean()
     info = UpdateInfo(step=step, interval=step, identifiable=step > 0, loss=jnp.zeros(()))
     return dists.move(dist, step), info
 
@@ -377,7 +387,7 @@ def test_threshold_and_p_value_say_the_same(gate):
 @pytest.mark.parametrize(
     "shifted", [{"mass": 0.6}, {"mass": -0.6}, {"friction": -0.6, "mass": 0.5}, {"wind": 0.5}], ids=str
 )
-def test_gate_rings_for_another_world(gate, shifted):
+def test_gate_rejects_another_world(gate, shifted):
     score = gate(stacked(shifted))
     assert np.isfinite(score.novelty).all()
     assert (score.novelty > score.threshold).mean() > 0.9
@@ -401,7 +411,7 @@ def test_novelty_is_a_rank_among_the_windows_of_all_sets(monkeypatch):
     monkeypatch.setattr(dvm, "train", lambda key, config, trajectory: (None, jnp.zeros(())))
     monkeypatch.setattr(dvm, "novelty", lambda config, model, episodes: episodes)
     collected = tuners.Collected(
-        trajectory=None, params={}, held_out=(held_out, valid, jnp.ones((3, 3), bool)), held_out_params={}
+        trajectory=None, coords={}, held_out=(held_out, valid, jnp.ones((3, 3), bool)), held_out_coords={}
     )
     config = dataclasses.replace(toys.TINY, held_out_sets=3)
     score = tuners.calibrated_gate(jax.random.key(0), config, collected, measured, knobs(level=0.5))
@@ -427,7 +437,7 @@ def test_a_set_without_a_window_has_no_score(gate):
     assert np.isfinite(score.novelty[1:]).all()
 
 
-def test_episodes_that_ended_early_lend_their_whole_windows(gate):
+def test_episodes_that_ended_early_are_scored_by_their_whole_windows(gate):
     sets = stacked({})
     fallen = sets.replace(
         alive=sets.alive.at[:, 0, 52:].set(False),
@@ -495,7 +505,7 @@ def test_posterior_narrows_no_further_than_it_may():
 
 def test_an_interval_that_reaches_past_the_box_does_not_narrow_it():
     # The truth lies two radii out. The held-out sets all lie inside, so their errors say nothing of it, and a narrow
-    # box at the edge shuts it out for good where the gate is too weak to ring.
+    # box at the edge shuts it out for good where the gate is too weak to reject it.
     dist = toys.uniform(THREE, 0.2)
     moved, _ = apply(tuners.posterior_update, 2, dist, {"friction": 0.0, "mass": 0.4})
     assert moved.centre["mass"] > 0.15
@@ -529,7 +539,7 @@ def find():
 @pytest.mark.parametrize(("friction", "mass"), [(0.5, -0.5), (-0.5, 0.5)])
 def test_tuner_finds_a_truth_beyond_its_first_distribution(find, friction, mass):
     state, info = find(0, friction=friction, mass=mass)
-    # The first radius cannot contain the truth, so a faithful run rings the alarm first.
+    # The first radius cannot contain the truth, so a faithful run rejects and widens first.
     assert info.verdicts[0, 0] == Verdict.WIDEN
     last = np.take_along_axis(np.asarray(info.verdicts), np.asarray(info.calls)[:, None] - 1, axis=1)
     assert np.all(last == Verdict.ACCEPT)

@@ -1,4 +1,4 @@
-"""Pictures of logs, and of what is missing in a model."""
+"""Pictures of logs, of the gap between simulation and measurement, and of how often discovery is right."""
 
 import textwrap
 from collections.abc import Sequence
@@ -12,11 +12,18 @@ from experiments.common.plots.base import save
 
 
 def suspicions(path: Path, run: Run, joints: Sequence[str], titles: Sequence[str]) -> None:
-    """A run as it was recorded: the clock, and every joint's position and target with what is suspected above."""
+    """Draws a run as it was recorded: the clock's steps, and every joint's position and target.
+
+    Args:
+      path: of the PNG.
+      run: the run.
+      joints: names in the log's order.
+      titles: what the log doctor suspects, written above.
+    """
     figure, axes = plt.subplots(1 + len(joints), 1, figsize=(10, 1.6 * (2 + len(joints))), layout="constrained")
     steps = 1e3 * np.diff(run.time)
     axes[0].plot(run.time[1:], steps, lw=0.8)
-    # Rounding is no news.
+    # A logarithmic axis, on which a clock's rounding is no spectacle.
     axes[0].set(ylabel="row to row, ms", yscale="log", ylim=(0.3 * steps.min(), 3.0 * steps.max()))
     for index, (axis, joint) in enumerate(zip(axes[1:], joints, strict=True)):
         if "target" in run.signals:
@@ -30,7 +37,11 @@ def suspicions(path: Path, run: Run, joints: Sequence[str], titles: Sequence[str
 
 
 def heat_map(cells: Sequence[dict]) -> plt.Figure:
-    """Excess over the floor by joint and regime, one panel a signal."""
+    """Draws the excess over the noise floor by joint and regime, a panel for every signal.
+
+    Args:
+      cells: rows of `Result.where`: joint, signal, regime and excess in floor units.
+    """
     signals = list(dict.fromkeys(cell["signal"] for cell in cells))
     regimes = sorted({cell["regime"] for cell in cells})
     joints = sorted({cell["joint"] for cell in cells})
@@ -61,7 +72,13 @@ def heat_map(cells: Sequence[dict]) -> plt.Figure:
 
 
 def traces(runs: Sequence[dict], joints: Sequence[str], most: int = 6) -> plt.Figure:
-    """Measured and simulated positions of whole runs, sealed ones first and framed in red; the worst joint of each."""
+    """Draws measured and simulated positions of whole runs, for the joint with the largest error in each.
+
+    Args:
+      runs: rows of `free_runs`; sealed ones come first and have a red frame.
+      joints: names in the log's order.
+      most: runs that are drawn at most.
+    """
     shown = sorted(runs, key=lambda run: run["split"] != "sealed")[:most]
     columns = 2 if len(shown) > 1 else 1
     rows = -(-len(shown) // columns)
@@ -71,7 +88,7 @@ def traces(runs: Sequence[dict], joints: Sequence[str], most: int = 6) -> plt.Fi
     for axis, run in zip(axes.flat, shown, strict=False):
         joint = int(np.abs(run["null"] - run["measured"]).mean(axis=0).argmax())
         axis.plot(run["time"], run["measured"][:, joint], color="black", lw=1.5, label="measured")
-        axis.plot(run["time"], run["null"][:, joint], color="tab:orange", lw=1.0, label="parameters fitted again")
+        axis.plot(run["time"], run["null"][:, joint], color="tab:orange", lw=1.0, label="nominal parameters fitted")
         axis.plot(run["time"], run["after"][:, joint], color="tab:blue", lw=1.0, label="corrected model")
         error = run["error_rad"]
         axis.set_title(
@@ -105,7 +122,12 @@ def accepted_terms(terms: Sequence) -> plt.Figure:
 
 
 def confusion(path: Path, rows: Sequence[dict]) -> None:
-    """What was hidden against what was named, a panel for every severity."""
+    """Draws what was hidden against what was named, as counts, a panel for every severity.
+
+    Args:
+      path: of the PNG.
+      rows: of `experiments.discovery.scores.score`.
+    """
     severities = sorted({row["asked"] for row in rows})
     said = lambda row: row["named"] or row["verdict"].replace("_", " ")  # noqa: E731
     hidden = sorted({row["effect"] or "nothing" for row in rows})

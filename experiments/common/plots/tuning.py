@@ -13,7 +13,12 @@ _MARKS = {"accept": "o", "widen": "^", "unexplained": "X", "radius_exhausted": "
 
 
 def training(path: Path, curve: Sequence[dict]) -> None:
-    """Reward, Table I return and falls over the steps of a training run."""
+    """Draws a training run: reward and return under Table I, tracking, and episode ends, over the steps.
+
+    Args:
+      path: of the PNG.
+      curve: lines of metrics (`experiments.walking.policies.walk`).
+    """
     steps = np.array([line["steps"] for line in curve]) / 1e6
     panels = {
         "per second": {"trained reward": "reward", "Table I": "score"},
@@ -37,7 +42,14 @@ def training(path: Path, curve: Sequence[dict]) -> None:
 
 
 def sim2sim(out: Path, results: dict[str, list[dict]], off: Sequence[str], epochs: int) -> None:
-    """After the paper's Figs. 3 and 4: return, parameter error, and the gate over the tunings."""
+    """Draws return, parameter errors and the gate's calls over the tunings, after the paper's Figs. 3 and 4.
+
+    Args:
+      out: folder of `return.png`, `param_error.png`, `param_error_each.png` and `gate.png`.
+      results: what `experiments.sim2sim.Runner` returned, by method and seed.
+      off: parameters whose true value is not nominal; the mean error is over them, or over all where there is none.
+      epochs: PPO updates in a tuning.
+    """
     _returns(out / "return.png", results, epochs)
     _errors(out / "param_error.png", results, off or list(next(iter(results.values()))[0]["lines"][0]["param_error"]))
     _each_error(out / "param_error_each.png", results)
@@ -46,7 +58,15 @@ def sim2sim(out: Path, results: dict[str, list[dict]], off: Sequence[str], epoch
 
 
 def sweep(path: Path, grid: np.ndarray, rows: Sequence[str], columns: Sequence[str], titles: Sequence[str]) -> None:
-    """One heat map for each panel of `grid` [panels, rows, columns]; `titles` holds row, column and panel names."""
+    """Draws a sweep as heat maps with one colour scale.
+
+    Args:
+      path: of the PNG.
+      grid: [panels, rows, columns]
+      rows: labels of the rows.
+      columns: labels of the columns.
+      titles: name of the rows, name of the columns, then a title for every panel.
+    """
     row_label, column_label, *panels = titles
     figure, axes = plt.subplots(
         1, len(panels), figsize=(1.5 + 3.2 * len(panels), 3.4), layout="constrained", squeeze=False, sharey=True
@@ -67,7 +87,11 @@ def sweep(path: Path, grid: np.ndarray, rows: Sequence[str], columns: Sequence[s
 
 
 def rounds(history: Sequence[dict]) -> plt.Figure:
-    """Predicted and measured return, falls and power, and every parameter with its interval, over the rounds."""
+    """Draws a robot's rounds: predicted and measured return, falls and power, and every parameter with its interval.
+
+    Args:
+      history: rounds as `summary.json` has them.
+    """
     when = np.arange(len(history) + 1)
     names = list(history[0]["tuning"]["moved"])
     labels = {"return": "return", "fall_rate": "share of walks that fall", "power_w": "power, W"}
@@ -100,7 +124,12 @@ def rounds(history: Sequence[dict]) -> plt.Figure:
 
 
 def transfer(path: Path, results: dict[str, list[dict]]) -> None:
-    """After the paper's Fig. 6: return, falls and power of the robot's walks over the rounds, by method."""
+    """Draws return, falls and power of the robot's walks over the rounds, by method, after the paper's Fig. 6.
+
+    Args:
+      path: of the PNG.
+      results: runs by method, as `summary.json` has them: `rounds` and the evaluation at the `end`.
+    """
     labels = {"return": "return of a walk", "fall_rate": "share of walks that fall", "power_w": "mechanical power, W"}
     figure, axes = plt.subplots(1, len(labels), figsize=(12, 3.6), layout="constrained")
     for axis, (key, label) in zip(axes, labels.items(), strict=True):

@@ -11,7 +11,14 @@ from experiments.common.plots.base import save
 
 
 def gaps(path: Path, rows: Sequence[dict], shown: dict[str, str], nominal: dict[str, float]) -> None:
-    """One column of panels for every sweep, one row for every quantity of `shown`; a line where nothing is off."""
+    """Draws what gaps cost an untuned policy: a column of panels for every parameter, a row for every quantity.
+
+    Args:
+      path: of the PNG.
+      rows: one for every point: `sweep`, `value`, and the quantities.
+      shown: labels of the quantities by name.
+      nominal: value at which nothing is off, by sweep; drawn as a dashed line.
+    """
     figure, axes = plt.subplots(
         len(shown), len(nominal), figsize=(9, 8), layout="constrained", sharex="col", sharey="row", squeeze=False
     )
@@ -29,7 +36,7 @@ def gaps(path: Path, rows: Sequence[dict], shown: dict[str, str], nominal: dict[
 
 
 def gait(path: Path, force: np.ndarray, phase: np.ndarray) -> None:
-    """Contacts of one episode over time, above what the clock asks for.
+    """Draws the contacts of one episode over time, above what the gait clock asks for.
 
     Args:
       path: a PNG.
@@ -50,5 +57,5 @@ def gait(path: Path, force: np.ndarray, phase: np.ndarray) -> None:
 
 
 def _beside(axis):
-    """Across in shares of the axes, up in data."""
+    """Coordinates that are shares of the axes horizontally and data vertically."""
     return axis.get_yaxis_transform()

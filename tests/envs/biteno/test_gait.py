@@ -186,7 +186,7 @@ def test_quality_tells_a_buzz_a_slide_and_a_fall():
     slide["qvel"][..., 0] = 0.4
     slide["qvel"][..., 7] = 2.0
     values = gait.quality(**slide)
-    # Asked for 0.1 m/s and 0.3 rad/s, went 0.4 and 0.
+    # Commands for 0.1 m/s and 0.3 rad/s, went 0.4 and 0.
     np.testing.assert_allclose(values["speed_error_mps"], 0.3, rtol=1e-5)
     np.testing.assert_allclose(values["turn_error_radps"], 0.3, rtol=1e-5)
     # The left hip turns at 2 rad/s under 3 Nm.

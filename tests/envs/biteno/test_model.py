@@ -3,8 +3,8 @@ import numpy as np
 import pytest
 import reference
 
-from envs import domain
 from envs.biteno import constants
+from jaxtune.mjx import parameters
 
 # kg, and kg m^2 about the centre of mass along the trunk's axes, to the four digits the design gives.
 LINKS = {
@@ -126,7 +126,7 @@ def test_the_controller_is_a_pd_law_with_a_limit(model, home):
 
 
 def test_parameter_sets_are_rows_of_the_table():
-    sets = {name: domain.select(constants.ENTRIES, names) for name, names in constants.PARAMETER_SETS.items()}
+    sets = {name: parameters.select(constants.ENTRIES, names) for name, names in constants.PARAMETER_SETS.items()}
     assert {name: len(entries) for name, entries in sets.items()} == {"legs6": 7, "whole_body": 5}
     # Where every mass of a set doubles, friction and all that the set leaves out stay: 2 x the moving links, and
     # the trunk too in `whole_body`.
@@ -136,6 +136,6 @@ def test_parameter_sets_are_rows_of_the_table():
 
 
 def test_the_nominal_robot_lies_within_every_bound():
-    for name, value in domain.nominal(constants.ENTRIES).items():
+    for name, value in parameters.nominal(constants.ENTRIES).items():
         low, high = constants.ENTRIES[name].bounds
         assert low <= value < high, name

@@ -9,9 +9,9 @@ import pytest
 import reference
 
 from envs.biteno.constants import ENTRIES
-from envs.domain import Entry
 from envs.targets import mjx
 from envs.targets.mjx import MjxTarget
+from jaxtune.mjx import Entry
 
 NEVER = 99
 

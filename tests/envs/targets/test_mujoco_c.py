@@ -9,7 +9,7 @@ import reference
 from envs.biteno import Biteno, constants
 from envs.targets import mujoco_c
 from envs.targets.mjx import MjxTarget
-from envs.targets.protocol import Asked
+from envs.targets.protocol import Commands
 
 VALUES = reference.params(left_thigh_mass=1.5, torque_scale=0.8, foot_friction=0.7, action_delay_s=0.004)
 COUNT, STEPS = 3, 40
@@ -27,10 +27,10 @@ def recorded(robot):
     command = jnp.array([[0.5, 0.0, 0.0], [0.0, 0.2, 0.0], [0.0, 0.0, 0.6]])
     # Half way through each takes the next one's.
     command = jnp.repeat(jnp.stack([command, jnp.roll(command, 1, axis=0)], axis=1), STEPS // 2, axis=1)
-    asked = Asked(command=command, phase=jnp.array([[0.0, 0.5], [0.25, 0.75], [0.6, 0.1]]))
-    here = mujoco_c.target(robot, VALUES, threads=2).record(KEY, restless, COUNT, STEPS, asked)
+    commands = Commands(command=command, phase=jnp.array([[0.0, 0.5], [0.25, 0.75], [0.6, 0.1]]))
+    here = mujoco_c.target(robot, VALUES, threads=2).record(KEY, restless, COUNT, STEPS, commands)
     there = MjxTarget(robot=robot, params=VALUES)
-    return here, jax.jit(lambda key: there.record(key, restless, COUNT, STEPS, asked))(KEY)
+    return here, jax.jit(lambda key: there.record(key, restless, COUNT, STEPS, commands))(KEY)
 
 
 def test_episodes_are_those_of_mjx(recorded):
@@ -54,7 +54,7 @@ def test_forces_of_the_floor_push_up_alike(recorded):
     assert motion.foot_force[..., 2].max() > 50.0
 
 
-def test_what_is_asked_for_is_seen_and_paid_for(recorded):
+def test_given_commands_are_observed_and_rewarded(recorded):
     for trajectory, motion in recorded:
         np.testing.assert_allclose(trajectory.obs[..., 3:6], motion.command * jnp.array([2.0, 2.0, 0.25]), atol=1e-6)
         np.testing.assert_allclose(motion.command[0, [0, 19, 20]], [[0.5, 0, 0], [0.5, 0, 0], [0, 0, 0.6]], rtol=1e-6)
@@ -109,13 +109,15 @@ def test_a_time_step_that_does_not_fit_is_named(robot):
 
 def test_the_shipped_policy_walks_20_seconds():
     from experiments.common.config import chosen, preset
-    from experiments.walking.learner import Loop
+    from experiments.walking.learner import Learner
     from experiments.walking.policies import starting_policy
 
     sizes = preset("cpu")
-    loop = Loop(dataclasses.replace(sizes, task=dataclasses.replace(sizes.task, physics="exact")), chosen("legs6"))
-    assert isinstance(loop.robot, Biteno)
-    act = loop.act(starting_policy("walk", loop))
+    learner = Learner(
+        dataclasses.replace(sizes, task=dataclasses.replace(sizes.task, physics="exact")), chosen("legs6")
+    )
+    assert isinstance(learner.robot, Biteno)
+    act = learner.act(starting_policy("walk", learner))
     steps = round(20.0 / constants.POLICY_DT_S)
-    trajectory = mujoco_c.target(loop.robot, {"foot_friction": 1.0}).episodes(KEY, act, 4, steps)
+    trajectory = mujoco_c.target(learner.robot, {"foot_friction": 1.0}).episodes(KEY, act, 4, steps)
     assert not trajectory.fell.any()

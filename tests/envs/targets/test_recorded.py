@@ -14,7 +14,7 @@ from envs.logs import Controller, Log, Run
 from envs.logs.sampling import HELD
 from envs.targets import mujoco_c, recorded
 from experiments.common.config import preset
-from experiments.walking.learner import Loop
+from experiments.walking.learner import Learner
 from experiments.walking.policies import starting_policy
 from jaxtune import windows
 
@@ -24,10 +24,10 @@ STEPS, LENGTH = 200, 50
 @pytest.fixture(scope="module")
 def simulated():
     """Two episodes of a walk and two of a fall in MuJoCo C, as episodes and as a log of one row a policy step."""
-    loop = Loop(preset("smoke"), {})
-    walk = loop.act(starting_policy("walk", loop))
+    learner = Learner(preset("smoke"), {})
+    walk = learner.act(starting_policy("walk", learner))
     flail = lambda obs, key: (0.5 * jax.random.normal(key, (6,)), {})  # noqa: E731
-    target = mujoco_c.target(loop.robot, {})
+    target = mujoco_c.target(learner.robot, {})
     found = [target.record(jax.random.PRNGKey(3), act, 2, STEPS) for act in (walk, flail)]
     trajectory, recording = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *found)
     np.testing.assert_array_equal(trajectory.fell, [False, False, True, True])
@@ -211,7 +211,7 @@ def test_a_long_run_is_several_episodes(simulated):
     np.testing.assert_array_equal(parts.trajectory.alive.sum(axis=1), [80, 80, STEPS - 3 - 160])
     for one, other in (
         (parts.trajectory.obs, whole.trajectory.obs),
-        (parts.asked.command[:, 1:], whole.asked.command[:, 1:]),
+        (parts.commands.command[:, 1:], whole.commands.command[:, 1:]),
     ):
         np.testing.assert_allclose(one.reshape(240, -1)[: STEPS - 3], other[0, : STEPS - 3], atol=1e-6)
 
@@ -310,40 +310,40 @@ def test_a_trunk_that_sinks_has_fallen_whoever_measured_it(simulated):
     np.testing.assert_array_equal(same_fell.alive, recorded.episodes(without(log), STEPS).trajectory.alive)
 
 
-def test_who_repeats_an_episode_is_asked_for_the_same_until_its_end_and_on(simulated):
+def test_commands_to_repeat_an_episode_hold_until_its_end_and_beyond(simulated):
     _, log = simulated
     found = recorded.episodes(log, STEPS)
     for episode in (0, 2):
         obs, alive = found.trajectory.obs[episode], int(found.trajectory.alive[episode].sum())
         # The first row is the tick before the first step.
-        asked = found.asked.command[episode]
-        assert asked.shape == (STEPS + 1, 3)
-        np.testing.assert_array_equal(asked[0], asked[1])
-        command = asked[1:] * jnp.array([2.0, 2.0, 0.25])
-        np.testing.assert_allclose(command[:alive], obs[:alive, 3:6], atol=1e-6)
-        np.testing.assert_array_equal(command[alive:], jnp.broadcast_to(command[alive - 1], (STEPS - alive, 3)))
-        np.testing.assert_allclose(sensing.clock(found.asked.phase[episode] + 0.0175), obs[0, 36:], atol=1e-6)
+        command = found.commands.command[episode]
+        assert command.shape == (STEPS + 1, 3)
+        np.testing.assert_array_equal(command[0], command[1])
+        scaled = command[1:] * jnp.array([2.0, 2.0, 0.25])
+        np.testing.assert_allclose(scaled[:alive], obs[:alive, 3:6], atol=1e-6)
+        np.testing.assert_array_equal(scaled[alive:], jnp.broadcast_to(scaled[alive - 1], (STEPS - alive, 3)))
+        np.testing.assert_allclose(sensing.clock(found.commands.phase[episode] + 0.0175), obs[0, 36:], atol=1e-6)
 
 
 def test_a_first_action_that_cannot_be_heard_is_a_step_too(simulated):
     _, log = simulated
     fast = replace(log, rate_hz=500.0, runs=tuple(faster(run, 5) for run in log.runs))
     slow, found = recorded.episodes(log, STEPS), recorded.episodes(fast, STEPS)
-    assert found.asked.command.shape == (4, STEPS + 2, 3)
-    np.testing.assert_allclose(found.asked.phase, slow.asked.phase, atol=1e-6)
+    assert found.commands.command.shape == (4, STEPS + 2, 3)
+    np.testing.assert_allclose(found.commands.phase, slow.commands.phase, atol=1e-6)
 
 
-def test_torque_that_was_not_measured_is_what_was_asked_for(simulated):
+def test_torque_that_was_not_measured_is_what_the_controller_commanded(simulated):
     _, log = simulated
     run = log.runs[0]
     signals = {name: values for name, values in run.signals.items() if name != "tau"}
     found = recorded.episodes(replace(log, runs=(replace(run, signals=signals),)), STEPS)
     target = run.signals["target"]
     target = np.concatenate([target[:1], target[:-1]])
-    asked = np.clip(60 * (target - run.signals["q"]) - 2 * run.signals["dq"], -60, 60)
+    wanted = np.clip(60 * (target - run.signals["q"]) - 2 * run.signals["dq"], -60, 60)
     # Of the log's own torques, at the end of a step: MuJoCo's are those of its last millisecond.
-    assert np.corrcoef(asked[1:90].ravel(), run.signals["tau"][1:90].ravel())[0, 1] > 0.98
-    power = np.maximum(asked * run.signals["dq"], 0.0).sum(axis=1)
+    assert np.corrcoef(wanted[1:90].ravel(), run.signals["tau"][1:90].ravel())[0, 1] > 0.98
+    power = np.maximum(wanted * run.signals["dq"], 0.0).sum(axis=1)
     alive = np.flatnonzero(found.trajectory.alive[0])
     np.testing.assert_allclose(found.power[0, alive], power[1 + alive], rtol=1e-4)
 

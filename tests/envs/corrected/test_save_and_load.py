@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 import rigs
 
-from envs import corrected, domain, models
+from envs import corrected, models
 from envs.biteno import constants
 from envs.rig import Rig
+from jaxtune.mjx import parameters
 
 WRONG = {
     "link_mass": {"upper": {"ratio": 1.2}},
@@ -36,7 +37,7 @@ IN_THE_MODEL = {"link_mass", "com_offset", "payload", "armature", "viscous", "co
 def quick():
     """Op by op, derived fields would take longer than all the rest."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(domain, "set_const", jax.jit(domain.set_const))
+        patch.setattr(parameters, "set_const", jax.jit(parameters.set_const))
         yield
 
 

@@ -1,4 +1,4 @@
-"""BITeno as discovery left it: effects of the library between its targets, its joints and its readings."""
+"""A walking BITeno with discovered effects between its targets, its joints and its sensors' readings."""
 
 from collections.abc import Mapping
 
@@ -8,26 +8,28 @@ import mujoco
 import numpy as np
 from mujoco import mjx
 
-from envs import domain
-from envs.biteno import constants
-from envs.biteno.env import Biteno, Drive, Motion, State, TaskConfig
+from envs.biteno import Biteno, Drive, Motion, State, TaskConfig, constants
 from envs.chain import MIN_FRICTION_NM, Chain
-from envs.correction import Correction
+from envs.corrected.record import Correction
+from jaxtune.mjx import parameters
 
 
 class CorrectedBiteno(Biteno):
-    """One robot with the effects of a corrected model.
+    """BITeno with the effects of a corrected model: the same task, interface and observation, another body.
 
-    Torques come from the effects' own controller, at every sub-step, in the stead of MuJoCo's actuators, whose gains
-    and limits it takes.
+    MuJoCo's actuators are switched off. At every sub-step `envs.chain.Chain` computes the joint torques, with the
+    actuators' own gains and limits, and lets the effects act on targets, torques, joints and readings.
 
     Args:
       config: the task.
       entries: the parameters that a step may be given, relative to the corrected model.
-      correction: model and effects.
+      correction: the MJCF and the effects.
+
+    Raises:
+      ValueError: an effect is on a place, or has a parameter, that the robot does not have.
     """
 
-    def __init__(self, config: TaskConfig, entries: Mapping[str, domain.Entry], correction: Correction):
+    def __init__(self, config: TaskConfig, entries: Mapping[str, parameters.Entry], correction: Correction):
         self._rows = correction.rows
         super().__init__(config, entries, correction.path)
         model = self.mj_model
@@ -49,16 +51,18 @@ class CorrectedBiteno(Biteno):
             model.dof_frictionloss[dof] = np.maximum(model.dof_frictionloss[dof], MIN_FRICTION_NM)
         super()._prepare(model)
 
-    def reset(self, params: domain.Params, key: jax.Array) -> State:
-        """Starts an episode of a robot that has been standing."""
+    def reset(self, params: parameters.Params, key: jax.Array) -> State:
+        """Starts an episode of a robot that has stood still at its first target for as long as any effect remembers."""
         state = super().reset(params, key)
         joint = state.qpos[self.joint_qpos]
         still = jnp.stack([joint, jnp.zeros_like(joint)])
-        state = state.replace(memory=self._chain.start(self._values, still, self._asked(self._model, joint)))
+        state = state.replace(
+            memory=self._chain.start(self._values, still, self._controller_inputs(self._model, joint))
+        )
         return state.replace(obs=self._observe(state, jax.random.fold_in(key, 1)))
 
-    def simulate(self, params: domain.Params, state: State, drive: Drive) -> Motion:
-        """Physics in MJX, through the effects."""
+    def simulate(self, params: parameters.Params, state: State, drive: Drive) -> Motion:
+        """Simulates a policy step in MJX, through the effects; see `Biteno.simulate`."""
         model = self.model(params)
         data = self._data.replace(
             qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.qacc_warmstart, qacc=state.qacc_warmstart
@@ -67,7 +71,7 @@ class CorrectedBiteno(Biteno):
         data = mjx.fwd_velocity(model, mjx.fwd_position(model, data))
 
         def step(carry, target):
-            data, memory, read = self._chain.step(model, *carry, self._values, self._asked(model, target))
+            data, memory, read = self._chain.step(model, *carry, self._values, self._controller_inputs(model, target))
             return (data, memory), read["tau"]
 
         (data, memory), torque = jax.lax.scan(step, (data, state.memory), drive.targets)
@@ -82,18 +86,20 @@ class CorrectedBiteno(Biteno):
         )
 
     def perceive(self, state: State) -> dict[str, jax.Array]:
-        """What the sensors say, by signal."""
+        """Returns what the sensors read, by signal, with their errors (bias, delay, tilt); see `Biteno.perceive`."""
         readings = super().perceive(state)
         if not state.memory:
             return readings
         joint = jnp.stack([readings["joint"], readings["joint_velocity"]])
-        read = self._chain.read(self._values, state.memory, joint, self._asked(self._model, readings["joint"]))
+        read = self._chain.read(
+            self._values, state.memory, joint, self._controller_inputs(self._model, readings["joint"])
+        )
         gravity, _ = self._chain.stage("gravity", self._values, readings["gravity"], None, {})
         return readings | {"joint": read[0], "joint_velocity": read[1], "gravity": gravity}
 
     @staticmethod
-    def _asked(model: mjx.Model, target: jax.Array) -> dict[str, jax.Array]:
-        """What MuJoCo's actuators would be asked."""
+    def _controller_inputs(model: mjx.Model, target: jax.Array) -> dict[str, jax.Array]:
+        """What the chain's controller is given: the targets [6] in rad, and gains and limits of MuJoCo's actuators."""
         none = jnp.zeros_like(target)
         return {
             "target": target,
@@ -106,6 +112,15 @@ class CorrectedBiteno(Biteno):
         }
 
 
-def make(config: TaskConfig, entries: Mapping[str, domain.Entry], correction: Correction | None = None) -> Biteno:
-    """The nominal robot, or the one that a correction describes."""
+def make(config: TaskConfig, entries: Mapping[str, parameters.Entry], correction: Correction | None = None) -> Biteno:
+    """Makes the nominal robot, or the one that a correction describes.
+
+    Args:
+      config: the task.
+      entries: the parameters that a step may be given.
+      correction: what discovery found; None for the nominal robot.
+
+    Raises:
+      ValueError: an effect is on a place, or has a parameter, that the robot does not have.
+    """
     return Biteno(config, entries) if correction is None else CorrectedBiteno(config, entries, correction)

@@ -12,14 +12,14 @@ import numpy as np
 
 from envs import sensing
 from envs.logs import Log, Run
-from envs.rig import hung
+from envs.rig import suspended
 from envs.segments import noise, quantum_of, smoothed
 
 _STEP_S = 0.0005
 _SPREAD = 0.1
 
 
-def healthy(log: Log, spec: mujoco.MjSpec, seed: int) -> Log:
+def simulate_null_log(log: Log, spec: mujoco.MjSpec, seed: int) -> Log:
     """Draws a log without a missing effect, its targets and conditions those of a measured one."""
     rng = np.random.default_rng(seed)
     model = _drawn(spec, rng)
@@ -28,7 +28,7 @@ def healthy(log: Log, spec: mujoco.MjSpec, seed: int) -> Log:
 
 def _drawn(spec: mujoco.MjSpec, rng: np.random.Generator) -> mujoco.MjModel:
     """The nominal model, every parameter off as the prior has it."""
-    model = hung(spec)
+    model = suspended(spec)
     model.opt.timestep = _STEP_S
     model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     model.opt.iterations, model.opt.ls_iterations = 100, 50
@@ -53,8 +53,7 @@ def replay(run: Run, model: mujoco.MjModel, joints, rng: np.random.Generator) ->
     dof = np.array([model.joint(name).dofadr[0] for name in joints])
     damping = model.dof_damping[dof].copy()
     data.qpos[qpos], data.qvel[dof] = smoothed(run)[0]
-    gains, driven = run.controller.gains, "target" in run.signals
-    on = run.signals.get("enabled", np.ones(len(run.time)))
+    controller, driven = run.impedance(), "target" in run.signals
     steps = int(np.ceil(1.0 / run.controller.rate_hz / _STEP_S - 1e-9))
     model.opt.timestep = 1.0 / run.controller.rate_hz / steps
     count = int(np.ceil((run.time[-1] - run.time[0]) * run.controller.rate_hz)) + 2
@@ -67,16 +66,8 @@ def replay(run: Run, model: mujoco.MjModel, joints, rng: np.random.Generator) ->
         mujoco.mj_step(model, data, int(looks[0]))
     for look, row in enumerate(last):
         q, dq = data.qpos[qpos], data.qvel[dof]
-        if not driven:
-            torque = run.signals["tau"][row]
-        elif run.controller.kind == "servo":
-            stall = on[row] * run.signals["volts"][row] * gains["kt"] / gains["resistance_ohm"]
-            torque = stall * np.clip(gains["gain"] * (run.signals["target"][row] - q), -1, 1)
-            model.dof_damping[dof] = damping + on[row] * gains["kt"] ** 2 / gains["resistance_ohm"]
-        else:
-            limit = gains["torque_limit_nm"]
-            error = run.signals["target"][row] - q
-            torque = on[row] * np.clip(gains["kp"] * error - gains["kd"] * dq, -limit, limit)
+        torque = controller[row].torque(run.signals["target"][row], q, dq) if driven else run.signals["tau"][row]
+        model.dof_damping[dof] = damping + controller.back_emf[row]
         states[look, 0], states[look, 1], torques[look] = q, dq, torque
         data.qfrc_applied[dof] = torque
         if look + 1 < len(looks):
@@ -86,14 +77,14 @@ def replay(run: Run, model: mujoco.MjModel, joints, rng: np.random.Generator) ->
     for name, values in {"q": states[:, 0], "dq": states[:, 1], "tau": torques}.items():
         if name in signals and (driven or name != "tau"):
             read = np.stack([np.interp(run.time, times, column) for column in values.T], axis=1)
-            signals[name] = as_read(read, run.signals[name], rng)
+            signals[name] = _as_read(read, run.signals[name], rng)
     if "gravity" in signals:
         level = np.asarray(sensing.projected_gravity(model.body_quat[1]))
-        signals["gravity"] = as_read(np.tile(level, (len(run.time), 1)), run.signals["gravity"], rng)
+        signals["gravity"] = _as_read(np.tile(level, (len(run.time), 1)), run.signals["gravity"], rng)
     return replace(run, signals=signals)
 
 
-def as_read(values: np.ndarray, like: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def _as_read(values: np.ndarray, like: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Values with the noise and the rounding of others."""
     quantum = quantum_of(like)
     extra = max(noise(like) ** 2 - quantum**2 / 12.0, 0.0) ** 0.5

@@ -1,7 +1,6 @@
-"""A model as discovery leaves it: an MJCF where MuJoCo has the form, and a JSON of effects for the rest."""
+"""A corrected model on the test rig: saved as discovery leaves it, and loaded again with all its coordinates."""
 
 import json
-from collections.abc import Mapping
 from pathlib import Path
 
 import jax
@@ -9,19 +8,37 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from envs.correction import EFFECTS, MODEL
+from envs.corrected.record import EFFECTS, MODEL, Effects
 from envs.effects import EVERY
 from envs.rig import Rig
 
 
 def save(folder: Path, spec: mujoco.MjSpec, rig: Rig, vector: np.ndarray) -> None:
-    """Writes `model.xml`, with what the vector [axes] changes of the model's own fields, and `effects.json`."""
+    """Writes a corrected model to a folder.
+
+    What MuJoCo has a form for goes into `model.xml`; every other effect that the vector gives a value to goes into
+    `effects.json`, in physical units.
+
+    Args:
+      folder: to write to; it is created where it does not exist.
+      spec: of the nominal robot. Its base, geometries and keyframes stay as they are.
+      rig: the same robot on the test rig, on which the corrections were fitted.
+      vector: coordinates [axes] of the rig's effects; a zero means that nothing is corrected.
+    """
     folder.mkdir(parents=True, exist_ok=True)
+    (folder / MODEL).write_text(_corrected_spec(spec, rig, vector).to_xml())
+    content = {"joints": list(rig.joints), "control_hz": rig.control_hz, "effects": _physical(rig, vector)}
+    (folder / EFFECTS).write_text(json.dumps(content, indent=1) + "\n")
+
+
+def _corrected_spec(spec: mujoco.MjSpec, rig: Rig, vector: np.ndarray) -> mujoco.MjSpec:
+    """The nominal MJCF with the corrected inertias, armatures, dampings and friction losses, compiled."""
     values = rig.values(rig.tree(jnp.asarray(vector, jnp.float32)))
     model, device = rig.mj_model, jax.jit(rig.model)(values)
     spec = spec.copy()
     for name in rig.bodies:
         body, number = spec.body(name), model.body(name).id
+        # Else the compiler would take mass and inertia from the geometries again.
         body.explicitinertial = True
         body.mass = float(device.body_mass[number])
         for field in ("ipos", "iquat", "inertia"):
@@ -33,9 +50,13 @@ def save(folder: Path, spec: mujoco.MjSpec, rig: Rig, vector: np.ndarray) -> Non
         joint.damping = [float(device.dof_damping[dof]), *np.ravel(joint.damping)[1:]]
         joint.frictionloss = max(float(model.dof_frictionloss[dof] + values["coulomb"]["torque_nm"][number]), 0.0)
     spec.compile()
-    (folder / MODEL).write_text(spec.to_xml())
+    return spec
+
+
+def _physical(rig: Rig, vector: np.ndarray) -> dict[str, dict[str, dict[str, float]]]:
+    """Physical values of the effects that MuJoCo has no form for."""
     in_model = {name for name, row in rig.effects.items() if row.enters == "model"} | {"coulomb"}
-    # A parameter that is a shape means something at zero, where its effect is there.
+    # A parameter that is a shape has a meaning at coordinate zero, where its effect is there.
     there = {(axis.effect, axis.place) for axis, coordinate in zip(rig.axes, vector, strict=True) if coordinate}
     effects = {}
     for axis, coordinate in zip(rig.axes, vector, strict=True):
@@ -45,26 +66,39 @@ def save(folder: Path, spec: mujoco.MjSpec, rig: Rig, vector: np.ndarray) -> Non
         if axis.effect not in in_model and means:
             value = parameter.value(float(coordinate), float(rig.scale(row, parameter)[axis.index]))
             effects.setdefault(axis.effect, {}).setdefault(axis.place, {})[axis.parameter] = float(value)
-    said = {"joints": list(rig.joints), "control_hz": rig.control_hz, "effects": effects}
-    (folder / EFFECTS).write_text(json.dumps(said, indent=1) + "\n")
+    return effects
 
 
 def load(folder: Path) -> tuple[Rig, np.ndarray]:
-    """Reads what `save` wrote: the robot on the rig, and the coordinates [axes] of its effects.
+    """Reads a corrected model as a robot on the test rig.
+
+    Args:
+      folder: that `save` wrote.
+
+    Returns:
+      The rig of the corrected MJCF, and the coordinates [axes] of the effects that are not in it. Simulated with these,
+      it moves as the rig that was saved.
 
     Raises:
-      ValueError: an effect or a place is none of the rig's.
+      ValueError: the rig has no such effect, place or parameter.
     """
-    said = json.loads((folder / EFFECTS).read_text())
-    rig = Rig(mujoco.MjSpec.from_file(str(folder / MODEL)), said["joints"], said["control_hz"])
-    return rig, coordinates(rig, said["effects"])
+    content = json.loads((folder / EFFECTS).read_text())
+    rig = Rig(mujoco.MjSpec.from_file(str(folder / MODEL)), content["joints"], content["control_hz"])
+    return rig, coordinates(rig, content["effects"])
 
 
-def coordinates(rig: Rig, effects: Mapping[str, Mapping[str, Mapping[str, float]]]) -> np.ndarray:
-    """Coordinates [axes] of physical values by effect, place and parameter.
+def coordinates(rig: Rig, effects: Effects) -> np.ndarray:
+    """Translates physical values of effects into the rig's vector of coordinates.
+
+    Args:
+      rig: whose scales the coordinates are in.
+      effects: physical values by effect, place and parameter.
+
+    Returns:
+      Coordinates [axes]; zero where no value is given.
 
     Raises:
-      ValueError: an effect, a place or a parameter is none of the rig's.
+      ValueError: the rig has no such effect, place or parameter.
     """
     vector = np.zeros(len(rig.axes))
     index = {(axis.effect, axis.place, axis.parameter): number for number, axis in enumerate(rig.axes)}

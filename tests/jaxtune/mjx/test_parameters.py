@@ -8,9 +8,9 @@ import pytest
 import reference
 from mujoco import mjx
 
-from envs import domain
 from envs.biteno import constants
 from envs.biteno.constants import ENTRIES
+from jaxtune.mjx import derived_fields, parameters
 
 # Single precision reaches 2e-6 in inverse weights and 2e-7 in masses (double precision 4e-15 in either).
 RTOL = 1e-5
@@ -54,7 +54,7 @@ GENERAL = """
 
 @pytest.fixture(scope="module")
 def set_const():
-    return jax.jit(domain.set_const)
+    return jax.jit(derived_fields.set_const)
 
 
 def assert_fields(model, expected):
@@ -155,7 +155,7 @@ def test_derived_fields_of_every_kind_of_joint(set_const):
 
 def test_without_jit_and_without_the_rest_of_the_table_it_is_the_same(apply, robot, set_const, monkeypatch):
     # Op by op, this one function would take longer than all others; see the slow test of the environment.
-    monkeypatch.setattr(domain, "set_const", set_const)
+    monkeypatch.setattr(parameters, "set_const", set_const)
     values = {"foot_friction": 0.5, "left_thigh_mass": 1.5, "trunk_com_x_m": 0.03, "torque_scale": 0.8}
     # Each of them a number, as a report would write it; what is left out stays nominal.
     assert_models(robot.model(values), apply(reference.params(**values)))
@@ -186,44 +186,44 @@ def test_rows_are_found_by_name(robot):
 
 
 def test_applying_an_unknown_parameter_names_it(robot):
-    with pytest.raises(ValueError, match="'trunk_weight' is unknown"):
+    with pytest.raises(ValueError, match="parameters: got 'trunk_weight'"):
         robot.model({"trunk_weight": 1.0})
 
 
 def test_select_takes_rows_in_the_order_of_the_names():
     names = ("trunk_mass", "foot_friction")
-    assert tuple(domain.select(ENTRIES, names)) == names
+    assert tuple(parameters.select(ENTRIES, names)) == names
 
 
 def test_an_unknown_parameter_is_named():
-    with pytest.raises(ValueError, match="'trunk_weight' is unknown; allowed: foot_friction, "):
-        domain.select(ENTRIES, ["trunk_mass", "trunk_weight"])
+    with pytest.raises(ValueError, match="got 'trunk_weight', expected some of foot_friction, "):
+        parameters.select(ENTRIES, ["trunk_mass", "trunk_weight"])
 
 
 @pytest.mark.parametrize(("kind", "target"), [("body", "tail"), ("geom", "trunk_geom"), ("joint", "tail")])
 def test_an_entry_for_an_object_that_is_not_there_is_named(robot, kind, target):
-    entry = domain.Entry(name="tail_mass", kind=kind, targets=(target,), fields=(), bounds=(0.5, 2.0))
-    with pytest.raises(ValueError, match=f"'tail_mass': the model has no {kind} named '{target}'"):
+    entry = parameters.Entry(name="tail_mass", kind=kind, targets=(target,), fields=(), bounds=(0.5, 2.0))
+    with pytest.raises(ValueError, match=f"'tail_mass': got {kind} '{target}', which the model does not have"):
         entry.rows(robot.mj_model)
 
 
 def test_coordinates_are_logarithms_of_multipliers_and_offsets_as_they_are():
     params = {"trunk_mass": jnp.float32(2.0), "trunk_com_x_m": jnp.float32(-0.03)}
-    coordinates = domain.to_coordinates(ENTRIES, params)
+    coords = parameters.to_coords(ENTRIES, params)
     # log 2 = 0.693147
-    np.testing.assert_allclose(coordinates["trunk_mass"], 0.693147, rtol=1e-6)
-    np.testing.assert_array_equal(coordinates["trunk_com_x_m"], np.float32(-0.03))
+    np.testing.assert_allclose(coords["trunk_mass"], 0.693147, rtol=1e-6)
+    np.testing.assert_array_equal(coords["trunk_com_x_m"], np.float32(-0.03))
 
 
 def test_coordinates_and_back():
     params = reference.draw(np.random.default_rng(30), ENTRIES)
-    back = domain.from_coordinates(ENTRIES, domain.to_coordinates(ENTRIES, params))
+    back = parameters.from_coords(ENTRIES, parameters.to_coords(ENTRIES, params))
     assert back.keys() == params.keys()
     for name, value in params.items():
         np.testing.assert_allclose(back[name], value, rtol=1e-6, err_msg=name)
 
 
 def test_the_nominal_robot_is_the_origin():
-    coordinates = domain.to_coordinates(ENTRIES, reference.params())
-    assert len(coordinates) == len(ENTRIES)
-    assert all(value == 0.0 for value in coordinates.values())
+    coords = parameters.to_coords(ENTRIES, reference.params())
+    assert len(coords) == len(ENTRIES)
+    assert all(value == 0.0 for value in coords.values())

@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from envs import corrected, correction, models
-from envs.biteno import Biteno, BraxBiteno, CorrectedBiteno, TaskConfig, constants
-from envs.correction import Correction
-from envs.domain import select
+from envs import corrected, models
+from envs.biteno import Biteno, BraxBiteno, TaskConfig, constants
+from envs.corrected import CorrectedBiteno, Correction
+from jaxtune.mjx import select
 
 ENTRIES = select(constants.ENTRIES, ("torque_scale",))
 STEPS = 20
@@ -118,7 +118,7 @@ def test_what_discovery_wrote_is_read(tmp_path):
     rig = Rig(models.spec("biteno"), constants.JOINTS, 1000.0)
     effects = {"command_delay": {"right_hip": {"seconds": 0.004}}, "coulomb": {"left_knee": {"torque_nm": 0.7}}}
     corrected.save(tmp_path, models.spec("biteno"), rig, corrected.coordinates(rig, effects))
-    read = correction.read(tmp_path)
+    read = corrected.read(tmp_path)
     assert set(read.effects) == {"command_delay"}
     biteno = CorrectedBiteno(TaskConfig(), ENTRIES, read)
     knee = biteno.joint_dof[constants.JOINTS.index("left_knee")]
@@ -129,10 +129,10 @@ def test_an_unknown_effect_or_place_is_refused_by_name(tmp_path):
     (tmp_path / "model.xml").write_text("<mujoco/>")
     (tmp_path / "effects.json").write_text(json.dumps({"effects": {"gremlins": {}}}))
     with pytest.raises(ValueError, match="gremlins"):
-        correction.read(tmp_path)
+        corrected.read(tmp_path)
     with pytest.raises(ValueError, match="third_knee"):
         robot(encoder_bias={"third_knee": {"rad": 0.1}})
     with pytest.raises(ValueError, match="degrees"):
         robot(encoder_bias={"left_knee": {"degrees": 3.0}})
     with pytest.raises(ValueError, match="is missing"):
-        correction.read(tmp_path / "nowhere")
+        corrected.read(tmp_path / "nowhere")

@@ -1,0 +1,103 @@
+"""A corrected model as it lies in a folder: an MJCF, and a JSON of the effects that MuJoCo has no form for."""
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from envs.effects import EVERY
+from jaxtune.types import Effect, Parameter
+
+MODEL, EFFECTS = "model.xml", "effects.json"
+
+Effects = Mapping[str, Mapping[str, Mapping[str, float]]]
+"""Physical values by effect, place (a joint, body or foot) and parameter, in the unit of the parameter's name."""
+
+
+@dataclass(frozen=True)
+class Correction:
+    """A corrected model as it was read from its folder: the path of its MJCF, and its effects.
+
+    It is independent of what simulates it: `envs.corrected.make` builds a walking BITeno from it, and a run's identity
+    contains its digest.
+    """
+
+    path: Path
+    """Path of the MJCF."""
+    effects: Effects
+    """What MuJoCo has no form for; empty where the MJCF says all."""
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the content of both files, independent of where they lie.
+
+        Runs save it, so that one which is resumed with another model is refused.
+        """
+        content = self.path.read_bytes() + json.dumps(self.effects, sort_keys=True).encode()
+        return hashlib.sha256(content).hexdigest()
+
+    @property
+    def rows(self) -> tuple[Effect, ...]:
+        """Its effects as rows of the library, in the library's order, which is the order in which they act."""
+        return tuple(row for row in EVERY.values() if row.name in self.effects)
+
+    def values(self, places: Mapping[str, Sequence[str]]) -> dict[str, dict[str, np.ndarray]]:
+        """Translates the physical values into the arrays that the effects' functions read.
+
+        A place that has no value for an effect gets what leaves the robot as it is there.
+
+        Args:
+          places: names of the robot's places by what an effect may be on: `joint`, `body`, `foot` and `robot`.
+
+        Returns:
+          Arrays [places] by effect and parameter, for `envs.chain.Chain`.
+
+        Raises:
+          ValueError: an effect is on a place, or has a parameter, that does not exist.
+        """
+        return {row.name: self._values_of(row, places[row.on]) for row in self.rows}
+
+    def _values_of(self, row: Effect, places: Sequence[str]) -> dict[str, np.ndarray]:
+        given = self.effects[row.name]
+        known = [parameter.name for parameter in row.parameters]
+        for place, values in given.items():
+            for name in set(values) - set(known):
+                raise ValueError(f"effects: got parameter '{name}' of '{row.name}', expected one of {', '.join(known)}")
+            if place not in places:
+                raise ValueError(f"effects: got '{row.name}' on '{place}', expected one of {', '.join(places)}")
+        return {
+            parameter.name: np.array(
+                [_inner(parameter, given.get(place, {}).get(parameter.name)) for place in places], np.float32
+            )
+            for parameter in row.parameters
+        }
+
+
+def _inner(parameter: Parameter, value: float | None) -> float:
+    """What the physics reads of a value; where there is none, what leaves the robot as it is."""
+    return float(parameter.inner(0.0 if value is None else parameter.coordinate(value, 1.0), 1.0))
+
+
+def read(folder: Path) -> Correction:
+    """Reads a corrected model from the folder that `save` wrote.
+
+    Args:
+      folder: with `model.xml` and `effects.json`.
+
+    Returns:
+      The record of it; the MJCF is not compiled here.
+
+    Raises:
+      ValueError: a file is missing, or an effect is not in the library.
+    """
+    for name in (MODEL, EFFECTS):
+        if not (folder / name).exists():
+            raise ValueError(f"model: {folder / name} is missing")
+    effects = json.loads((folder / EFFECTS).read_text())["effects"]
+    for name in effects:
+        if name not in EVERY:
+            raise ValueError(f"{folder / EFFECTS}: got effect '{name}', expected one of {', '.join(EVERY)}")
+    return Correction(folder / MODEL, effects)

@@ -1,0 +1,103 @@
+"""The joint controllers that a log may come from, and the one place where their law stands."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+GAINS = {"pd": ("kp", "kd", "torque_limit_nm"), "servo": ("gain", "kt", "resistance_ohm")}
+"""Names of a controller's numbers by its type; each is given for all joints or one per joint."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Impedance:
+    """A joint controller as a limited spring and damper, with the braking of its motor beside it.
+
+    Both types of controller reduce to it, so whatever simulates or checks a controller needs no other form. The joint
+    feels `torque(...) - back_emf velocity`; the second term acts continuously, also between the controller's ticks and
+    beyond its limit.
+
+    All fields have the shape [joints], or [rows, joints] where supply or enabling change with time.
+    """
+
+    stiffness: np.ndarray  # Nm/rad
+    damping: np.ndarray  # Nm s/rad, of the controller
+    limit: np.ndarray  # Nm, infinite where there is none
+    back_emf: np.ndarray  # Nm s/rad, of the motor's back electromotive force
+
+    def torque(self, target: np.ndarray, position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+        """Computes the torque that the controller commands, without the back electromotive force.
+
+            clip(stiffness (target - position) - damping velocity, -limit, limit)
+
+        Args:
+          target: [..., joints] rad.
+          position: [..., joints] rad, as the controller reads it.
+          velocity: [..., joints] rad/s, as the controller reads it.
+
+        Returns:
+          [..., joints] Nm.
+        """
+        torque = self.stiffness * (target - position) - self.damping * velocity
+        return np.clip(torque, -self.limit, self.limit)
+
+    def __getitem__(self, index) -> "Impedance":
+        """Takes some rows (or joints, of one without rows), as of an array."""
+        return Impedance(
+            stiffness=self.stiffness[index],
+            damping=self.damping[index],
+            limit=self.limit[index],
+            back_emf=self.back_emf[index],
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Controller:
+    """What turns a joint's position target into its torque; the `controller` of `meta.yaml`.
+
+    With e = target - q, and everything zero where the motors are switched off:
+
+        pd:     torque = clip(kp e - kd dq, -torque_limit_nm, torque_limit_nm)
+        servo:  duty = clip(gain e, -1, 1)
+                stall = volts kt / resistance_ohm
+                torque = kt (duty volts - kt dq) / resistance_ohm
+                       = clip(gain stall e, -stall, stall) - kt^2 / resistance_ohm dq
+
+    `impedance` brings both into one form.
+    """
+
+    kind: str
+    """`pd` (position and velocity error, limited) or `servo` (position error sets the duty cycle of a DC motor)."""
+    rate_hz: float
+    """How often it reads the joint; its torque is held in between."""
+    gains: Mapping[str, np.ndarray]
+    """[joints] by name, the names of `GAINS`: kp Nm/rad, kd Nm s/rad, torque_limit_nm Nm; gain 1/rad, kt Nm/A at the
+    joint, resistance_ohm Ohm."""
+
+    def impedance(self, enabled: np.ndarray | None = None, volts: np.ndarray | None = None) -> Impedance:
+        """Writes the controller as a limited spring and damper, the same form for both types.
+
+        Args:
+          enabled: [rows], 0 where the motors are switched off and 1 elsewhere; always on where None.
+          volts: [rows] V, the supply; a servo needs it, a PD controller ignores it.
+
+        Returns:
+          Of shapes [rows, joints], or [joints] where nothing that was given has rows.
+        """
+        gains, on = self.gains, 1.0 if enabled is None else np.asarray(enabled)[..., None]
+        if self.kind == "pd":
+            stiffness = on * gains["kp"]
+            return Impedance(
+                stiffness=stiffness,
+                damping=on * gains["kd"],
+                # Not a product: the limit may be infinite.
+                limit=np.where(on > 0, gains["torque_limit_nm"], 0.0),
+                back_emf=np.zeros_like(stiffness),
+            )
+        stall = on * np.asarray(volts)[..., None] * gains["kt"] / gains["resistance_ohm"]
+        return Impedance(
+            stiffness=stall * gains["gain"],
+            damping=np.zeros_like(stall),
+            limit=stall,
+            back_emf=np.broadcast_to(on * gains["kt"] ** 2 / gains["resistance_ohm"], stall.shape),
+        )
