@@ -30,16 +30,34 @@ ByEffect = Mapping[str, Mapping[str, jax.Array]]
 _ITERATIONS, _LINE_SEARCHES = 4, 6
 _LONGEST_STEP_S = 0.001
 
+# Parameters that every model has, by the effect that changes them. Each may be off by a tenth of its nominal value.
+_PRIOR_SHARE = 0.1
+_NOMINAL_RATIOS = ("link_mass", "gain_error")
+_NOMINAL_FIELDS = {"armature": "dof_armature", "viscous": "dof_damping", "coulomb": "dof_frictionloss"}
+
 
 @dataclass(frozen=True)
 class Axis:
-    """One coordinate of one effect at one place."""
+    """One coordinate of a rig: one parameter of one effect at one place, and what a unit of it stands for.
+
+    A coordinate of zero leaves the robot as it is. `Rig.scaled` changes what units stand for, and with them `scale`,
+    `least` and `prior_sd`.
+    """
 
     effect: str
     parameter: str
     place: str
     index: int
-    """Of the place."""
+    """Of the place, among all places where the effect may sit."""
+    scale: float
+    """What one unit of the coordinate stands for, in the unit of the parameter."""
+    least: float
+    """Smallest coordinate: no more can be taken from a field of the model than it has, but for a tenth."""
+    prior_sd: float
+    """Prior standard deviation, in coordinates, of a parameter that every model has; zero for an effect it lacks."""
+    joints: tuple[int, ...]
+    """Indices of the joints beside which something at this place shows: the joint itself, or those that carry a
+    link."""
 
 
 class Rig:
@@ -91,18 +109,46 @@ class Rig:
         self.places = {"joint": self.joints, "body": self.bodies, "foot": (), "robot": ("robot",)}
         self.effects = {row.name: row for row in EVERY.values() if self.places[row.on] and row.needs != "free"}
         self.chain = Chain(self.dt, tuple(self.effects.values()), self.qpos, self.dof, self._bodies)
-        self.axes = tuple(
-            Axis(name, parameter.name, place, index)
-            for name, row in self.effects.items()
-            for parameter in row.parameters
-            for index, place in enumerate(self.places[row.on])
-        )
+        self.axes = self._describe_axes()
 
     def scaled(self, scales: Mapping[str, np.ndarray]) -> "Rig":
-        """The same robot, where coordinates stand for `scales`, [places] by name, instead of their units."""
+        """Returns the same robot with other units of its coordinates, so that all coordinates are of one size.
+
+        Args:
+          scales: [places] by the name of the scale (`jaxtune.types.Scale`); a name that is left out stays one unit.
+        """
         other = copy.copy(self)
         other._scales = dict(scales)
+        other.axes = other._describe_axes()
         return other
+
+    def _describe_axes(self) -> tuple[Axis, ...]:
+        return tuple(
+            self._describe(row, parameter, place, index, float(scale))
+            for row in self.effects.values()
+            for parameter in row.parameters
+            for index, (place, scale) in enumerate(zip(self.places[row.on], self.scale(row, parameter), strict=True))
+        )
+
+    def _describe(self, row: Effect, parameter: Parameter, place: str, index: int, scale: float) -> Axis:
+        least, prior_sd, fields = parameter.bounds[0], 0.0, parameter.fields
+        if parameter.form == "added" and row.on == "joint" and fields:
+            least = max(least, -0.9 * getattr(self.mj_model, fields[0])[self.dof[index]] / scale)
+        if row.name in _NOMINAL_RATIOS:
+            prior_sd = _PRIOR_SHARE
+        elif row.name in _NOMINAL_FIELDS:
+            value = getattr(self.mj_model, _NOMINAL_FIELDS[row.name])[self.dof[index]]
+            prior_sd = _PRIOR_SHARE * float(value / scale)
+        return Axis(
+            effect=row.name,
+            parameter=parameter.name,
+            place=place,
+            index=index,
+            scale=scale,
+            least=float(least),
+            prior_sd=prior_sd,
+            joints=tuple(sorted(self.moves(row.on, place))),
+        )
 
     def tree(self, vector: jax.Array) -> dict[str, dict[str, jax.Array]]:
         """A vector [axes] by effect and parameter."""
@@ -138,25 +184,6 @@ class Rig:
             found |= set(np.flatnonzero(mine).tolist())
             body = self.mj_model.body_parentid[body]
         return found
-
-    def prior_sd(self) -> dict[Axis, float]:
-        """The parameters that every model has, and how far they may be off: a standard deviation in coordinates.
-
-        A tenth of the nominal value, for every link's mass and every joint's armature, damping, friction and
-        controller gain, where the model has them.
-        """
-        share = 0.1
-        fields = {"armature": "dof_armature", "viscous": "dof_damping", "coulomb": "dof_frictionloss"}
-        spread = {}
-        for axis in self.axes:
-            row = self.effects[axis.effect]
-            if axis.effect in ("link_mass", "gain_error"):
-                spread[axis] = share
-            elif axis.effect in fields:
-                value = getattr(self.mj_model, fields[axis.effect])[self.dof[axis.index]]
-                if value > 0:
-                    spread[axis] = share * float(value / self.scale(row, row.parameters[0])[axis.index])
-        return spread
 
     def model(self, values: ByEffect) -> mjx.Model:
         """The model with what effects do to its fields."""

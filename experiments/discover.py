@@ -11,13 +11,12 @@ from pathlib import Path
 
 from envs import corrected, models
 from experiments.common import checkpoint
-from experiments.common.checkpoint import as_json, write_json
+from experiments.common.checkpoint import write_json
 from experiments.common.cli import bars, console, run
-from experiments.discovery import report as discovery_report
-from experiments.discovery.setup import HORIZONS_S, ask
-from jaxtune.discovery.workflow import Discovery
-
-_SHOWN = 12  # cells in the summary
+from experiments.discovery import report
+from experiments.discovery.setup import HORIZONS_S, build_question, read_logs
+from experiments.discovery.summary import details, free_runs, summarise
+from jaxtune.discovery import workflow
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,34 +36,37 @@ class Args:
 
 
 def main(args: Args) -> None:
-    """Sets the question up, discovers, and writes summary, details, model and page."""
+    """Builds the question, discovers, and writes summary, details, model and page."""
     checkpoint.set_up_compiler(checkpoint.a_device_a_core())
     began = time.monotonic()
-    log = gathered(args.logs)
+    _check(args)
+    log = read_logs(args.logs)
+    identity = {"logs": [str(path) for path in args.logs], "horizons": args.horizons, "healthy": args.healthy}
+    checkpoint.open_run(args.out, identity | {"seed": args.seed})
+    spec, saved = models.spec(log.robot), args.out / "state.json"
+    with bars() as progress:
+        task = progress.add_task("simulating null logs", total=None)
+        question = build_question(log, spec, args.horizons, args.healthy, args.seed)
+        result = workflow.discover(
+            question.problem,
+            saved=json.loads(saved.read_text()) if saved.exists() else None,
+            save=lambda state: write_json(saved, state),
+            say=lambda text: progress.update(task, description=text[:100]),
+        )
+    summary, free = summarise(question, result), free_runs(log, question, result)
+    seconds = {"seconds": time.monotonic() - began, "versions": checkpoint.versions()}
+    write_json(args.out / "summary.json", summary | seconds)
+    write_json(args.out / "details.json", details(question, result, free))
+    corrected.save(args.out / "model", spec, question.rig, (result.residual or result.fit).vector)
+    report.show(console, question, summary, free)
+    report.write(args.out / "report.html", log, question, result, summary, free)
+
+
+def _check(args: Args) -> None:
     if len(args.horizons) != 3 or sorted(set(args.horizons)) != list(args.horizons) or args.horizons[0] <= 0:
         raise ValueError(f"horizons: got {args.horizons}, expected three lengths that rise")
     if args.healthy < 2:
         raise ValueError(f"healthy: got {args.healthy}, expected 2 or more")
-    identity = {"logs": [str(path) for path in args.logs], "horizons": args.horizons, "healthy": args.healthy}
-    checkpoint.open_run(args.out, identity | {"seed": args.seed})
-    saved = args.out / "state.json"
-    with bars() as progress:
-        task = progress.add_task("asking", total=None)
-        say = lambda text: progress.update(task, description=text[:100])  # noqa: E731
-        question = ask(log, models.spec(log.robot), args.horizons, args.healthy, args.seed)
-        discovery = Discovery(question.problem, push=question.push, say=say)
-        state = json.loads(saved.read_text()) if saved.exists() else None
-        result = discovery.run(state, lambda state: write_json(saved, state))
-    spec = models.spec(log.robot)
-    summary = summarise(question, result)
-    free = free_runs(log, question, result)
-    write_json(
-        args.out / "summary.json", summary | {"seconds": time.monotonic() - began, "versions": checkpoint.versions()}
-    )
-    write_json(args.out / "details.json", as_json(details(question, result, free)))
-    corrected.save(args.out / "model", spec, question.rig, (result.residual or result.fit).vector)
-    discovery_report.write(args.out / "report.html", log, question, result, summary, free)
-    discovery_report.show(console, summary, result, free)
 
 
 if __name__ == "__main__":

@@ -25,12 +25,11 @@ from experiments.discovery.blind_cases import SIZE_BOUNDS, SIZES, Case
 from experiments.discovery.blind_robots import Truth, record
 from experiments.discovery.excitation import TargetRun, excitation
 from experiments.discovery.scores import page, score, tally
-from experiments.discovery.setup import HORIZONS_S, Question, ask
+from experiments.discovery.setup import HORIZONS_S, Question, build_question
 from experiments.discovery.summary import summarise
-from jaxtune.discovery.measure import refitted, slopes
-from jaxtune.discovery.problem import Residuals
-from jaxtune.discovery.result import Calibration
-from jaxtune.discovery.workflow import Discovery
+from jaxtune.discovery import workflow
+from jaxtune.discovery.noise_floor import Calibration, left_by_prior, prior_slopes
+from jaxtune.discovery.simulation import residuals
 
 _HALVINGS = 6  # of the interval in which a size is searched: the severity is then right to a tenth
 
@@ -71,20 +70,23 @@ class Bench:
         )
         return replace(log, robot=self.size.model)
 
-    def ask(self, log: Log, horizons: Sequence[float] = HORIZONS_S, healthy_logs: int = 0) -> Question:
-        """Sets up the question that discovery is asked: this log, and the nominal model."""
-        return ask(log, self.spec, horizons, healthy_logs, plain=self.rig)
+    def build_question(self, log: Log, horizons: Sequence[float] = HORIZONS_S, null_logs: int = 0) -> Question:
+        """Builds the question that discovery is asked, from a log and the nominal model, with shared programs.
+
+        Args:
+          log: of a case.
+          horizons: lengths of the segments in s.
+          null_logs: number of simulated null logs; none where a calibration is at hand.
+        """
+        return build_question(log, self.spec, horizons, null_logs, plain=self.rig)
 
     @cached_property
     def calibration(self) -> Calibration:
         """Noise floor and thresholds of this robot and motion, from simulated null logs; computed once and kept."""
         path = self._out / "calibration.npz"
         if not path.exists():
-            question = self.ask(self.record(Truth(None), 10_000), healthy_logs=self.size.healthy)
-            discovery = Discovery(question.problem, push=question.push)
-            discovery.prepare()
-            discovery.calibrate()
-            found = discovery.calibration
+            question = self.build_question(self.record(Truth(None), 10_000), null_logs=self.size.healthy)
+            found = workflow.calibrate(question.problem)
             arrays = {
                 f"floor {horizon} {split}": floor
                 for horizon, (floors, _) in found.floors.items()
@@ -134,19 +136,19 @@ class Bench:
         main = sorted(self.calibration.floors)[len(self.calibration.floors) // 2]
         (floors, weight), seed = self.calibration.floors[main], self.seed(case)
         floor = floors["train"]
-        problem = self.ask(self.record(Truth(None), seed, noise=False), (main,)).problem
-        measure, zero = Residuals(problem), np.zeros(problem.axes)
-        slope = slopes(problem, measure, main) / floor[..., None]
-        plain = measure(zero, problem.data["train"][main])[0]
+        problem = self.build_question(self.record(Truth(None), seed, noise=False), (main,)).problem
+        zero = np.zeros(problem.axes)
+        slope = prior_slopes(problem, main) / floor[..., None]
+        plain = residuals(problem, zero, problem.data["train"][main])[0]
         positions = slice(-len(self.size.joints), None)
 
         def severity(size: float) -> float:
             log = self.record(Truth(case.effect, places, size), seed, noise=False)
-            segments = self.ask(log, (main,)).problem.data["train"][main]
-            moved = (measure(zero, segments)[0] - plain) / floor
+            segments = self.build_question(log, (main,)).problem.data["train"][main]
+            moved = (residuals(problem, zero, segments)[0] - plain) / floor
             if not np.isfinite(moved).all():
                 return np.inf
-            left = refitted(moved, slope, weight)
+            left = left_by_prior(moved, slope, weight)
             return float(np.sqrt((left[..., positions] ** 2).mean(axis=(0, 1))).max())
 
         return severity
@@ -181,8 +183,8 @@ class Bench:
             folder = self.write(case)
             began = time.monotonic()
             log = read(folder)
-            question = self.ask(log)
-            result = Discovery(question.problem, push=question.push, calibration=self.calibration).run()
+            question = self.build_question(log)
+            result = workflow.discover(question.problem, calibration=self.calibration)
             path.parent.mkdir(parents=True, exist_ok=True)
             answer = summarise(question, result) | {"seconds": time.monotonic() - began, "rejected": result.rejected}
             write_json(path, checkpoint.as_json(answer))

@@ -1,44 +1,45 @@
-"""From a log and a model to the question that discovery is asked."""
+"""From measured logs and a model to the problem that discovery works on."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import jax
 import mujoco
 import numpy as np
 
-from envs import regimes, segments
+from envs import models, regimes, segments
 from envs.effects import LIBRARY, RESIDUAL
-from envs.healthy import healthy
-from envs.logs import Log, splits
+from envs.logs import Log, read, read_xl330, splits
+from envs.null_logs import simulate_null_log
 from envs.rig import Rig
-from jaxtune.discovery.problem import Hypothesis, Problem, Segments
-from jaxtune.types import Effect
+from experiments.discovery.hypotheses import hypotheses
+from jaxtune.discovery.problem import Problem, Segments
 
 HORIZONS_S = (0.05, 0.15, 0.45)
+"""Lengths of the segments that are simulated, by default."""
+
 _BIN_S = 0.01
 _LEAST_SEGMENTS = 3
-_LATE_S = 0.004  # a velocity that lags its position by more is a filter's, not a measurement
+_LATE_S = 0.004  # a velocity that lags its position by more was filtered, and would pass for a sensor's lag
 
 
 @dataclass(frozen=True)
 class Question:
-    """A problem, and what its numbers are about."""
+    """A problem, and the robot and runs that its numbers are about."""
 
     problem: Problem
     rig: Rig
-    push: Mapping[str, int]
-    """Axis of a constant torque, by joint."""
     splits: Mapping[str, tuple[str, ...]]
     """Names of the runs by split."""
     notes: tuple[str, ...]
-    """What the gate left out, and why."""
+    """Signals that are not used, and why."""
 
 
 @dataclass(frozen=True)
 class _Simulator:
-    """What a rig reads of some signals; equal where the rig is the same."""
+    """Simulates some signals of a rig; equal, so that programs are shared, where the rig is the same."""
 
     rig: Rig
     signals: tuple[str, ...]
@@ -48,14 +49,20 @@ class _Simulator:
         return {name: read[name] for name in self.signals}
 
 
-def gathered(folders: tuple[Path, ...]) -> Log:
-    """One log of several.
+def read_logs(folders: Sequence[Path]) -> Log:
+    """Reads the logs of one robot as a single log.
+
+    Args:
+      folders: of logs, or of the XL330 pendulum's JSON files.
+
+    Returns:
+      A log with the runs of all folders; of several, a run's name ends in the number of its folder.
 
     Raises:
-      ValueError: they are not of one robot, or its base is free.
+      ValueError: a log cannot be read, the logs are not of one robot, or its base is free.
     """
     logs = [
-        read(folder) if (folder / "meta.yaml").exists() or not _xl330(folder) else read_xl330(folder)
+        read(folder) if (folder / "meta.yaml").exists() or not any(folder.glob("*.json")) else read_xl330(folder)
         for folder in folders
     ]
     if not logs:
@@ -63,7 +70,7 @@ def gathered(folders: tuple[Path, ...]) -> Log:
     first = logs[0]
     for folder, log in zip(folders, logs, strict=True):
         if log.base != "fixed":
-            raise ValueError(f"{folder}: base: got '{log.base}', expected 'fixed': hang or clamp the robot")
+            raise ValueError(f"{folder}: base: got '{log.base}', expected 'fixed': suspend or clamp the robot")
         if log.joints != first.joints:
             raise ValueError(f"{folder}: joints: got {log.joints}, expected {first.joints}")
         if models.spec(log.robot).to_xml() != models.spec(first.robot).to_xml():
@@ -74,62 +81,59 @@ def gathered(folders: tuple[Path, ...]) -> Log:
     return replace(first, runs=runs)
 
 
-def _xl330(folder: Path) -> bool:
-    return any(folder.glob("*.json"))
-
-
-def ask(
+def build_question(
     log: Log,
     spec: mujoco.MjSpec,
     horizons: Sequence[float] = HORIZONS_S,
-    healthy_logs: int = 20,
+    null_logs: int = 20,
     seed: int = 0,
     plain: Rig | None = None,
 ) -> Question:
-    """Builds the question.
+    """Turns a log and a nominal model into a problem: hypotheses, measured segments, simulated null logs.
 
     Args:
       log: what was measured.
       spec: the nominal model.
       horizons: lengths of the segments in s.
-      healthy_logs: simulated logs in which nothing is missing.
-      seed: of those.
-      plain: the same robot and controller rate on the rig, if it was asked about before: programs are shared.
+      null_logs: number of simulated null logs, which set the noise floor and the thresholds.
+      seed: of the null logs.
+      plain: a rig of the same robot and controller rate, from an earlier question, whose compiled programs are used.
 
     Raises:
-      ValueError: the runs cannot be split, or are too short for a horizon.
+      ValueError: the runs cannot be split, are too short for a horizon, or lack what discovery needs.
     """
-    log, notes = gate(log)
-    rate = _checked(log, segments.HISTORY_S + min(horizons))
+    rate = _checked_rate(log, segments.HISTORY_S + min(horizons))
+    log, notes = drop_filtered(log)
     plain = plain or Rig(spec, log.joints, rate)
-    if (plain.joints, plain.control_hz) != (tuple(log.joints), rate):
-        raise ValueError(f"plain: got {plain.joints} at {plain.control_hz:g} Hz, expected {log.joints} at {rate:g} Hz")
-    if plain.others:
-        raise ValueError(f"joints: {', '.join(plain.others)} may move too, and the log does not have them")
+    _check_rig(plain, log, rate)
     rig = plain.scaled(measure_scales(plain, unsealed(log)))
     signals = tuple(name for name in ("dq", "gravity", "q") if all(name in run.signals for run in log.runs))
-    nominal = rig.nominal()
     index = {(axis.effect, axis.place): number for number, axis in enumerate(rig.axes)}
+    library = {name: row for name, row in rig.effects.items() if name in LIBRARY}
+    residual = hypotheses(rig.axes, rig.places, {RESIDUAL.name: RESIDUAL})
+    simulated = [simulate_null_log(log, spec, seed + number) for number in range(null_logs)]
+    measured, *nulls = (_cut(one, rig.dt, signals, horizons) for one in (log, *simulated))
     problem = Problem(
         simulate=_Simulator(plain, signals),
         values=rig.inner,
         axes=len(rig.axes),
-        hypotheses=hypotheses(rig, {name: row for name, row in rig.effects.items() if name in LIBRARY}),
-        prior=np.array([nominal.get(axis, 0.0) for axis in rig.axes]),
+        hypotheses=hypotheses(rig.axes, rig.places, library),
+        prior=np.array([axis.prior_sd for axis in rig.axes]),
         timing=_timing(rig),
-        data=_cut(log, rig, signals, horizons),
-        healthy=[_cut(healthy(log, spec, seed + number), rig, signals, horizons) for number in range(healthy_logs)],
+        data=measured,
+        null_logs=nulls,
         bin_rows=segments.rows_together(1.0 / log.rate_hz, _BIN_S),
         regimes=regimes.REGIMES,
         components={name: tuple("xyz") if name == "gravity" else rig.joints for name in signals},
-        residual={h.places[0]: h for h in hypotheses(rig, {RESIDUAL.name: RESIDUAL}) if len(h.places) == 1},
+        push={joint: index["constant_push", joint] for joint in rig.joints},
+        residual={one.places[0]: one for one in residual if len(one.places) == 1},
     )
     names = {split: tuple(run.name for run in runs) for split, runs in splits(log).items()}
-    return Question(problem, rig, {joint: index["constant_push", joint] for joint in rig.joints}, names, notes)
+    return Question(problem, rig, names, notes)
 
 
-def _checked(log: Log, least_s: float) -> float:
-    """The controller's rate in Hz, the same in all runs, which have what discovery needs."""
+def _checked_rate(log: Log, least_s: float) -> float:
+    """Returns the controller's rate in Hz, which all runs share, after checking that the runs can be simulated."""
     rate = log.runs[0].controller.rate_hz
     for run in log.runs:
         if run.controller.rate_hz != rate:
@@ -143,32 +147,49 @@ def _checked(log: Log, least_s: float) -> float:
     return rate
 
 
+def _check_rig(rig: Rig, log: Log, rate: float) -> None:
+    if (rig.joints, rig.control_hz) != (tuple(log.joints), rate):
+        raise ValueError(f"plain: got {rig.joints} at {rig.control_hz:g} Hz, expected {log.joints} at {rate:g} Hz")
+    if rig.others:
+        raise ValueError(f"joints: {', '.join(rig.others)} may move too, and the log does not have them")
+
+
 def unsealed(log: Log) -> Log:
-    """The log without its sealed runs."""
+    """Returns the log without its sealed runs, which nothing but the proof may see."""
     parts = splits(log)
     return replace(log, runs=(*parts["train"], *parts["select"]))
 
 
-def gate(log: Log) -> tuple[Log, tuple[str, ...]]:
-    """Takes out what is no measurement, and says so."""
+def drop_filtered(log: Log) -> tuple[Log, tuple[str, ...]]:
+    """Leaves out velocities that were filtered, because their lag would pass for one of the robot's own.
+
+    Returns:
+      The log, with the rate that its time stamps have, and a note for every signal that was left out.
+    """
     notes = []
     late = [segments.velocity_lag(run) for run in unsealed(log).runs if "dq" in run.signals]
     if late and np.median(late) > _LATE_S:
         notes.append(f"dq lags q by {1e3 * np.median(late):.0f} ms: it is filtered, and not used")
         runs = [replace(run, signals={k: v for k, v in run.signals.items() if k != "dq"}) for run in log.runs]
         log = replace(log, runs=tuple(runs))
-    # The recorded rate; time stamps win.
     rate = 1.0 / float(np.median([np.median(np.diff(run.time)) for run in log.runs]))
     return replace(log, rate_hz=rate), tuple(notes)
 
 
 def measure_scales(rig: Rig, log: Log) -> dict[str, np.ndarray]:
-    """What one unit of a coordinate stands for at every place: what the robot did in this log."""
+    """Measures what one unit of a coordinate stands for, from what the robot did in a log.
+
+    A unit of friction is then the torque that the joint had, a unit of inertia what it felt, and so on: effects of one
+    unit matter about equally, whatever the robot's size.
+
+    Returns:
+      [places] by the name of the scale (`jaxtune.types.Scale`).
+    """
     torque, speed, limit, pose = [], [], [], []
     for run in log.runs:
         position, velocity = np.moveaxis(segments.smoothed(run), 1, 0)
-        asked, most = regimes.control_torque(run, position, velocity)
-        torque.append(asked)
+        wanted, most = regimes.control_torque(run, position, velocity)
+        torque.append(wanted)
         speed.append(velocity)
         limit.append(np.where(np.isfinite(most), most, 0.0))
         pose.append(position)
@@ -190,73 +211,20 @@ def _rms(values: Sequence[np.ndarray]) -> np.ndarray:
     return np.sqrt((np.concatenate(values) ** 2).mean(axis=0)) + 1e-6
 
 
-def hypotheses(rig: Rig, rows: Mapping[str, Effect]) -> tuple[Hypothesis, ...]:
-    """Every effect at every place alone, at left/right pairs, and at all of them."""
-    index = {(axis.effect, axis.parameter, axis.place): number for number, axis in enumerate(rig.axes)}
-    found = []
-    for name, row in rows.items():
-        free = [number for number, parameter in enumerate(row.parameters) if not parameter.shape]
-        sizes = np.zeros((len(free) if len(free) > 1 else len(row.sizes), len(row.parameters)))
-        if len(free) > 1:
-            sizes[np.arange(len(free)), free] = row.sizes[0]
-        else:
-            sizes[:, free[0]] = row.sizes
-        for places in place_sets(rig.places[row.on]):
-            directions = np.zeros((len(row.parameters), len(rig.axes)))
-            for number, parameter in enumerate(row.parameters):
-                scale = dict(zip(rig.places[row.on], rig.scale(row, parameter), strict=True))
-                for place in places:
-                    # The same physical size everywhere, whatever a coordinate stands for there.
-                    ratio = scale[places[0]] / scale[place]
-                    factor = 1.0 / ratio if parameter.form == "reciprocal" else ratio
-                    shared = parameter.form == "ratio"
-                    directions[number, index[name, parameter.name, place]] = 1.0 if shared else factor
-            found.append(
-                Hypothesis(
-                    name=name,
-                    family=row.family,
-                    places=places,
-                    directions=directions,
-                    probes=sizes,
-                    bounds=_bounds(rig, row, places),
-                    prior=np.array([parameter.prior for parameter in row.parameters]),
-                    joints=tuple(sorted({joint for place in places for joint in rig.moves(row.on, place)})),
-                )
-            )
-    return tuple(found)
-
-
-def _bounds(rig: Rig, row: Effect, places: Sequence[str]) -> np.ndarray:
-    """Least and largest coordinates, [parameters, 2]; no less is taken from a model's field than there is."""
-    bounds = np.array([parameter.bounds for parameter in row.parameters], float)
-    for number, parameter in enumerate(row.parameters):
-        if parameter.form == "added" and row.on == "joint" and parameter.fields:
-            at = [rig.joints.index(place) for place in places]
-            there = getattr(rig.mj_model, parameter.fields[0])[rig.dof[at]] / rig.scale(row, parameter)[at]
-            bounds[number, 0] = max(bounds[number, 0], -0.9 * there.min())
-    return bounds
-
-
 def _timing(rig: Rig) -> np.ndarray:
     """Half a period of the controller, as the delay of all readings and as that of all targets, [2, axes]."""
     late = [[axis.effect == effect for axis in rig.axes] for effect in ("sensor_delay", "command_delay")]
     return np.array(late, float) * 0.5 / rig.control_hz
 
 
-def place_sets(places: Sequence[str]) -> list[tuple[str, ...]]:
-    """Each alone, left and right together, all."""
-    pairs = [(one, one.replace("left", "right")) for one in places if "left" in one]
-    sets = [(place,) for place in places] + [pair for pair in pairs if pair[1] in places]
-    return sets if len(places) < 2 or tuple(places) in sets else [*sets, tuple(places)]
-
-
-def _cut(log: Log, rig: Rig, signals, horizons) -> dict[str, dict[float, Any]]:
+def _cut(log: Log, dt: float, signals: Sequence[str], horizons: Sequence[float]) -> dict[str, dict[float, Segments]]:
+    """Cuts a log into segments by split and horizon, each row with the regime of its joints."""
     names = {split: {run.name for run in runs} for split, runs in splits(log).items()}
     labels = [regimes.regimes(run) for run in log.runs]
     data: dict[str, dict[float, Any]] = {split: {} for split in names}
     for horizon in horizons:
-        # All runs at once: segments of equal shape compile once.
-        cut = segments.cut(log.runs, horizon, rig.dt, _BIN_S)
+        # All runs at once, so that segments have one shape and programs compile once.
+        cut = segments.cut(log.runs, horizon, dt, _BIN_S)
         label = np.stack([labels[run][rows] for run, rows in zip(cut.run, cut.row, strict=True)])
         for split in names:
             mine = np.array([log.runs[run].name in names[split] for run in cut.run])

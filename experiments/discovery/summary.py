@@ -1,5 +1,7 @@
-"""What a discovery found, in the form of `summary.json` and `details.json`, and whole runs simulated before and
+"""What a discovery found: the contents of `summary.json` and `details.json`, and whole runs simulated before and
 after."""
+
+from collections.abc import Mapping, Sequence
 
 import jax
 import numpy as np
@@ -7,6 +9,7 @@ import numpy as np
 from envs import segments
 from envs.effects import LIBRARY
 from envs.logs import Log
+from envs.rig import Rig
 from experiments.discovery.setup import Question
 from jaxtune.discovery.fit import Fit
 from jaxtune.discovery.problem import Hypothesis
@@ -16,20 +19,27 @@ _SHOWN = 12  # cells in the summary
 
 
 def summarise(question: Question, result: Result) -> dict:
-    """What `summary.json` says; times and versions apart."""
+    """Returns the content of `summary.json`, but for times and versions.
+
+    Args:
+      question: what was asked.
+      result: what was found.
+
+    Returns:
+      The verdict; effects and parameter changes with values, intervals and confusable names; what these logs cannot
+      show; the cells with the largest gap; and the gap on sealed runs.
+    """
     effects, changes = [], []
-    for rung in result.rungs:
-        nominal = question.problem.is_nominal(rung.hypothesis)
-        (changes if nominal else effects).append(
-            _effect(question, rung.hypothesis, result.fit, result.errors, rung.alike)
-        )
+    for term in result.terms:
+        group = changes if question.problem.is_nominal(term.hypothesis) else effects
+        group.append(_effect(question.rig, term.hypothesis, result.fit, result.errors, term.confusable_with))
     singles = {h.key: h for h in question.problem.hypotheses if len(h.places) == 1 and len(h.directions) == 1}
-    for axis in result.changed:
-        named = question.rig.axes[axis]
-        hypothesis = singles[f"{named.effect}@{named.place}"]
-        if not any(change["name"] == named.effect and named.place in change["places"] for change in changes):
-            alike = tuple(name for name in result.changed_alike[axis] if name != named.effect)
-            changes.append(_effect(question, hypothesis, result.fit, result.errors, alike))
+    for number in result.changed:
+        axis = question.rig.axes[number]
+        if not any(change["name"] == axis.effect and axis.place in change["places"] for change in changes):
+            others = tuple(name for name in result.changed_alike[number] if name != axis.effect)
+            hypothesis = singles[f"{axis.effect}@{axis.place}"]
+            changes.append(_effect(question.rig, hypothesis, result.fit, result.errors, others))
     not_there = [name for name in LIBRARY if name not in question.rig.effects]
     return {
         "verdict": result.verdict,
@@ -45,18 +55,15 @@ def summarise(question: Question, result: Result) -> dict:
     }
 
 
-def _effect(question: Question, hypothesis: Hypothesis, fit: Fit, errors: np.ndarray, alike) -> dict:
-    rig = question.rig
+def _effect(rig: Rig, hypothesis: Hypothesis, fit: Fit, errors: np.ndarray, others: Sequence[str]) -> dict:
+    """Describes an effect of a fit: physical values with 95 % intervals, and what would distinguish it from others."""
     row = rig.effects[hypothesis.name]
-    place = rig.places[row.on].index(hypothesis.places[0])
     parameters = {}
-    for number, parameter in enumerate(row.parameters):
-        direction = hypothesis.directions[number]
+    for parameter, direction in zip(row.parameters, hypothesis.directions, strict=True):
         mine = [i for i, free in enumerate(fit.free.directions) if ((free != 0) & (direction != 0)).any()]
-        axis = int(np.flatnonzero(direction)[0])
-        value = fit.vector[axis]
-        error = 1.96 * float(np.sqrt(sum((errors[i] * fit.free.directions[i][axis]) ** 2 for i in mine)))
-        scale = float(rig.scale(row, parameter)[place])
+        number = int(np.flatnonzero(direction)[0])
+        value, scale = fit.vector[number], rig.axes[number].scale
+        error = 1.96 * float(np.sqrt(sum((errors[i] * fit.free.directions[i][number]) ** 2 for i in mine)))
         # A limit or a stiffness that may as well not be there has no upper end.
         least = max(value - error, 1e-12) if parameter.form == "reciprocal" else value - error
         ends = sorted(float(parameter.value(end, scale)) for end in (least, value + error))
@@ -66,13 +73,25 @@ def _effect(question: Question, hypothesis: Hypothesis, fit: Fit, errors: np.nda
         "family": hypothesis.family,
         "places": list(hypothesis.places),
         "parameters": parameters,
-        "confusable_with": list(alike),
+        "confusable_with": list(others),
         "split_by": f"{row.excited_by} on {', '.join(hypothesis.places)}",
     }
 
 
 def free_runs(log: Log, question: Question, result: Result) -> dict:
-    """Every run simulated from its first state to its end, before and after: errors in rad, and the traces."""
+    """Simulates every run from its first state to its end, with the nominal, the fitted and the corrected model.
+
+    A run that is simulated whole shows what a user of the model will get; discovery itself works on short segments.
+
+    Args:
+      log: what was measured.
+      question: what was asked.
+      result: what was found.
+
+    Returns:
+      `runs`: name, split, time in s, positions in rad [rows, joints] (`measured`, `before`, `null`, `after`) and their
+      mean absolute errors; `error_rad`: means of these errors by split and model.
+    """
     rig = question.rig
     cut = segments.whole(log.runs, rig.dt)
     play = jax.jit(jax.vmap(lambda value, inputs: rig.simulate(rig.tree(value), inputs)["q"], (None, 0)))
@@ -87,43 +106,48 @@ def free_runs(log: Log, question: Question, result: Result) -> dict:
     runs = []
     for piece, recorded in enumerate(log.runs):
         rows = np.unique(cut.row[piece])
+        measured = recorded.signals["q"][rows]
+        simulated = {name: values[piece][: len(rows)] for name, values in found.items()}
         runs.append(
             {
                 "run": recorded.name,
                 "split": splits[recorded.name],
                 "time": recorded.time[rows] - recorded.time[rows[0]],
-                "measured": recorded.signals["q"][rows],
-                **{name: values[piece][: len(rows)] for name, values in found.items()},
-                "error_rad": {
-                    name: float(np.abs(values[piece][: len(rows)] - recorded.signals["q"][rows]).mean())
-                    for name, values in found.items()
-                },
+                "measured": measured,
+                **simulated,
+                "error_rad": {name: float(np.abs(values - measured).mean()) for name, values in simulated.items()},
             }
         )
+    return {"runs": runs, "error_rad": _mean_errors(runs, list(found))}
+
+
+def _mean_errors(runs: Sequence[Mapping], names: Sequence[str]) -> dict[str, dict[str, float]]:
     return {
-        "runs": runs,
-        "error_rad": {
-            split: {
-                name: float(np.mean([run["error_rad"][name] for run in runs if run["split"] == split]))
-                for name in found
-            }
-            for split in ("train", "select", "sealed")
-        },
+        split: {
+            name: float(np.mean([run["error_rad"][name] for run in runs if run["split"] == split])) for name in names
+        }
+        for split in ("train", "select", "sealed")
     }
 
 
 def details(question: Question, result: Result, free: dict) -> dict:
-    """What a reader of the summary may want to know more of."""
+    """Returns the content of `details.json`: evidence, tests and proofs behind the summary.
+
+    Args:
+      question: what was asked.
+      result: what was found.
+      free: of `free_runs`.
+    """
     return {
         "notes": question.notes,
         "ladder": [
             {
-                "hypothesis": rung.hypothesis.key,
-                "evidence": rung.evidence,
-                "thresholds": rung.thresholds,
-                "confusable_with": rung.alike,
+                "hypothesis": term.hypothesis.key,
+                "evidence": term.evidence,
+                "thresholds": term.thresholds,
+                "confusable_with": term.confusable_with,
             }
-            for rung in result.rungs
+            for term in result.terms
         ],
         "rejected": result.rejected,
         "where": result.where,

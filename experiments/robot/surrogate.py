@@ -166,8 +166,8 @@ class Robot:
         per_tick = round(tick_s / _STEP_S)
         if targets.controller.kind != "pd" or not np.isclose(per_tick * _STEP_S, tick_s):
             raise ValueError(
-                f"{targets.name}: controller: got {targets.controller.kind} at {targets.controller.rate_hz:g} Hz, expected "
-                f"pd with ticks that are multiples of {_STEP_S} s"
+                f"{targets.name}: controller: got {targets.controller.kind} at {targets.controller.rate_hz:g} Hz, "
+                f"expected pd with ticks that are multiples of {_STEP_S} s"
             )
         self.data = mujoco.MjData(self.model)
         self.data.qpos[self._qpos] = targets.signals["target"][0]

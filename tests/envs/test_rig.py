@@ -9,7 +9,7 @@ import rigs
 from envs import models
 from envs.biteno import constants
 from envs.effects import LIBRARY
-from envs.rig import Axis, Rig, suspended
+from envs.rig import Rig, suspended
 
 START = np.array([0.5, -0.7])
 
@@ -240,28 +240,40 @@ def test_a_bent_arm_has_less_inertia_at_its_shoulder(arm):
 # Parameters.
 
 
+def prior_sd(rig):
+    """Prior standard deviations of nominal parameters, by effect and place."""
+    return {(axis.effect, axis.place): axis.prior_sd for axis in rig.axes if axis.prior_sd > 0}
+
+
 def test_nominal_parameters_are_those_that_the_model_has(pendulum):
     # The pendulum's hinge has no viscous friction.
     expected = {
-        Axis("coulomb", "torque_nm", "hinge", 0): 0.0019,
-        Axis("gain_error", "ratio", "hinge", 0): 0.1,
-        Axis("armature", "kg_m2", "hinge", 0): 0.00019,
-        Axis("link_mass", "ratio", "arm", 0): 0.1,
+        ("coulomb", "hinge"): 0.0019,
+        ("gain_error", "hinge"): 0.1,
+        ("armature", "hinge"): 0.00019,
+        ("link_mass", "arm"): 0.1,
     }
-    got = pendulum.prior_sd()
+    got = prior_sd(pendulum)
     assert got.keys() == expected.keys()
-    for axis, share in expected.items():
-        np.testing.assert_allclose(got[axis], share, rtol=1e-6)
+    for place, sd in expected.items():
+        np.testing.assert_allclose(got[place], sd, rtol=1e-6)
 
 
-def test_nominal_parameters_are_spread_in_coordinates(arm):
-    got = {(axis.effect, axis.place): spread for axis, spread in arm.rig.prior_sd().items()}
+def test_prior_standard_deviations_are_in_coordinates(arm):
+    got = prior_sd(arm.rig)
     # A tenth of 0.01 kg m^2 and of 0.05 Nm s/rad, over what a coordinate stands for; the arm has no dry friction.
     np.testing.assert_allclose(got["armature", "shoulder"], 0.001 / 0.11, rtol=1e-6)
     np.testing.assert_allclose(got["armature", "elbow"], 0.001 / 0.03, rtol=1e-6)
     np.testing.assert_allclose(got["viscous", "elbow"], 0.005 / 0.3, rtol=1e-6)
     assert {effect for effect, _ in got} == {"armature", "viscous", "link_mass", "gain_error"}
     assert {place for _, place in got} == {"shoulder", "elbow", "upper", "lower"}
+
+
+def test_a_tenth_of_a_field_stays_when_an_effect_takes_from_it(arm):
+    least = {(axis.effect, axis.place): axis.least for axis in arm.rig.axes}
+    # The arm's armature is 0.01 kg m^2; a coordinate stands for 0.11 and 0.03 of them.
+    np.testing.assert_allclose(least["armature", "shoulder"], -0.009 / 0.11, rtol=1e-6)
+    np.testing.assert_allclose(least["armature", "elbow"], -0.009 / 0.03, rtol=1e-6)
 
 
 def test_a_vector_has_its_axes_by_effect_parameter_and_place(arm):

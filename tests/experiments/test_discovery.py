@@ -9,12 +9,13 @@ import pytest
 
 from envs.logs import Controller, read, splits, write
 from envs.segments import noise
-from experiments import discover, discovery_bench
+from experiments import discover
+from experiments.discovery.blind_cases import ARM, SIZE_BOUNDS, SIZES
 from experiments.discovery.blind_robots import OUTSIDE, Truth, record
+from experiments.discovery.excitation import excitation
+from experiments.discovery.hypotheses import hypotheses, place_sets
 from experiments.discovery.scores import score, tally, wilson
-from experiments.discovery.setup import ask, gate, hypotheses, measure_scales, place_sets
-from experiments.discovery_bench import ARM, SIZES
-from experiments.excite import excitation
+from experiments.discovery.setup import build_question, drop_filtered, measure_scales
 
 JOINTS = ("shoulder", "elbow")
 GAINS = {"kp": np.array([40.0, 20.0]), "kd": np.array([2.0, 0.8]), "torque_limit_nm": np.array([15.0, 15.0])}
@@ -107,12 +108,12 @@ def test_readings_are_rounded_and_noisy(spec, motions):
 
 
 def test_a_velocity_that_lags_is_left_out_and_said_so(plain):
-    assert gate(plain)[1] == ()
+    assert drop_filtered(plain)[1] == ()
     runs = []
     for run in plain.runs:
         late = np.stack([np.interp(run.time - 0.02, run.time, column) for column in run.signals["dq"].T], axis=1)
         runs.append(type(run)(**{**run.__dict__, "signals": {**run.signals, "dq": late}}))
-    kept, notes = gate(type(plain)(**{**plain.__dict__, "runs": tuple(runs)}))
+    kept, notes = drop_filtered(type(plain)(**{**plain.__dict__, "runs": tuple(runs)}))
     assert notes == ("dq lags q by 20 ms: it is filtered, and not used",)
     assert all("dq" not in run.signals for run in kept.runs)
 
@@ -136,9 +137,8 @@ def test_a_size_at_two_places_is_the_same_physical_size(spec, plain):
 
     rig = Rig(spec, JOINTS, 1000.0)
     rig = rig.scaled(measure_scales(rig, plain))
-    for hypothesis in hypotheses(
-        rig, {name: rig.effects[name] for name in ("coulomb", "torque_limit", "torque_scale")}
-    ):
+    rows = {name: rig.effects[name] for name in ("coulomb", "torque_limit", "torque_scale")}
+    for hypothesis in hypotheses(rig.axes, rig.places, rows):
         row = rig.effects[hypothesis.name]
         (parameter,), (direction,) = row.parameters, hypothesis.directions
         values = [
@@ -209,7 +209,7 @@ def test_sizes_hide_what_the_library_has_and_what_it_has_not():
     assert {name for name, _ in standard.outside} == set(OUTSIDE)
     for severity in (2.0, 5.0, 15.0):
         assert sum(asked == severity for _, asked in standard.hidden) == 16
-    assert all(name in discovery_bench._BOUNDS for name, _ in (*standard.hidden, *standard.outside))
+    assert all(name in SIZE_BOUNDS for name, _ in (*standard.hidden, *standard.outside))
 
 
 def test_the_learner_reads_a_log_that_says_nothing_of_the_truth(tmp_path, spec, motions):
@@ -271,7 +271,7 @@ def test_logs_that_cannot_be_simulated_are_refused_with_the_run_named(spec, plai
         (replace(plain, joints=("elbow",)), "joints: shoulder may move too"),
     ]:
         with pytest.raises(ValueError, match=message):
-            ask(log, spec, healthy_logs=0)
+            build_question(log, spec, null_logs=0)
     # One run of a second has two segments of 0.45 s, less what comes before the first.
     with pytest.raises(ValueError, match=r"'select' has 2 segment\(s\) of 0.45 s, expected 3 or more"):
-        ask(plain, spec, healthy_logs=0)
+        build_question(plain, spec, null_logs=0)
