@@ -19,10 +19,10 @@ from experiments import checkpoint, discovery_report
 from experiments.checkpoint import as_json, write_json
 from experiments.question import HORIZONS_S, Question, ask
 from experiments.train import bars, console, run
+from jaxtune.discovery import workflow
 from jaxtune.discovery.fit import Fit
 from jaxtune.discovery.problem import Hypothesis
 from jaxtune.discovery.result import Result
-from jaxtune.discovery.workflow import Discovery
 
 _SHOWN = 12  # cells in the summary
 
@@ -59,9 +59,8 @@ def main(args: Args) -> None:
         task = progress.add_task("asking", total=None)
         say = lambda text: progress.update(task, description=text[:100])  # noqa: E731
         question = ask(log, models.spec(log.robot), args.horizons, args.healthy, args.seed)
-        discovery = Discovery(question.problem, push=question.push, say=say)
         state = json.loads(saved.read_text()) if saved.exists() else None
-        result = discovery.run(state, lambda state: write_json(saved, state))
+        result = workflow.discover(question.problem, saved=state, save=lambda state: write_json(saved, state), say=say)
     spec = models.spec(log.robot)
     summary = summarise(question, result)
     free = free_runs(log, question, result)
@@ -107,10 +106,10 @@ def _xl330(folder: Path) -> bool:
 def summarise(question: Question, result: Result) -> dict:
     """What `summary.json` says; times and versions apart."""
     effects, changes = [], []
-    for rung in result.rungs:
-        nominal = question.problem.is_nominal(rung.hypothesis)
+    for term in result.terms:
+        nominal = question.problem.is_nominal(term.hypothesis)
         (changes if nominal else effects).append(
-            _effect(question, rung.hypothesis, result.fit, result.errors, rung.alike)
+            _effect(question, term.hypothesis, result.fit, result.errors, term.confusable_with)
         )
     singles = {h.key: h for h in question.problem.hypotheses if len(h.places) == 1 and len(h.directions) == 1}
     for axis in result.changed:
@@ -207,12 +206,12 @@ def details(question: Question, result: Result, free: dict) -> dict:
         "notes": question.notes,
         "ladder": [
             {
-                "hypothesis": rung.hypothesis.key,
-                "evidence": rung.evidence,
-                "thresholds": rung.thresholds,
-                "confusable_with": rung.alike,
+                "hypothesis": term.hypothesis.key,
+                "evidence": term.evidence,
+                "thresholds": term.thresholds,
+                "confusable_with": term.confusable_with,
             }
-            for rung in result.rungs
+            for term in result.terms
         ],
         "rejected": result.rejected,
         "where": result.where,

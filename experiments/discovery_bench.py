@@ -31,10 +31,9 @@ from experiments.excite import Motion, excitation
 from experiments.hidden import OUTSIDE, Truth, record
 from experiments.question import HORIZONS_S, Question, ask
 from experiments.train import console, run
-from jaxtune.discovery.measure import refitted, slopes
-from jaxtune.discovery.problem import Residuals
-from jaxtune.discovery.result import Calibration
-from jaxtune.discovery.workflow import Discovery
+from jaxtune.discovery import workflow
+from jaxtune.discovery.noise_floor import Calibration, left_by_prior, prior_slopes
+from jaxtune.discovery.simulation import residuals
 
 ARM = Path(__file__).parent / "arm.xml"
 
@@ -181,10 +180,7 @@ class Bench:
         path = self.args.out / "calibration.npz"
         if not path.exists():
             question = self.ask(self.record(Truth(None), 10_000), healthy_logs=self.size.healthy)
-            discovery = Discovery(question.problem, push=question.push)
-            discovery.prepare()
-            discovery.calibrate()
-            found = discovery.calibration
+            found = workflow.calibrate(question.problem)
             arrays = {
                 f"floor {horizon} {split}": floor
                 for horizon, (floors, _) in found.floors.items()
@@ -234,18 +230,18 @@ class Bench:
         (floors, weight), seed = self.calibration.floors[main], self.seed(case)
         floor = floors["train"]
         problem = self.ask(self.record(Truth(None), seed, noise=False), (main,)).problem
-        measure, zero = Residuals(problem), np.zeros(problem.axes)
-        slope = slopes(problem, measure, main) / floor[..., None]
-        plain = measure(zero, problem.data["train"][main])[0]
+        zero = np.zeros(problem.axes)
+        slope = prior_slopes(problem, main) / floor[..., None]
+        plain = residuals(problem, zero, problem.data["train"][main])[0]
         positions = slice(-len(self.size.joints), None)
 
         def severity(size: float) -> float:
             log = self.record(Truth(case.effect, places, size), seed, noise=False)
             segments = self.ask(log, (main,)).problem.data["train"][main]
-            moved = (measure(zero, segments)[0] - plain) / floor
+            moved = (residuals(problem, zero, segments)[0] - plain) / floor
             if not np.isfinite(moved).all():
                 return np.inf
-            left = refitted(moved, slope, weight)
+            left = left_by_prior(moved, slope, weight)
             return float(np.sqrt((left[..., positions] ** 2).mean(axis=(0, 1))).max())
 
         return severity
@@ -281,7 +277,7 @@ class Bench:
             began = time.monotonic()
             log = read(folder)
             question = self.ask(log)
-            result = Discovery(question.problem, push=question.push, calibration=self.calibration).run()
+            result = workflow.discover(question.problem, calibration=self.calibration)
             path.parent.mkdir(parents=True, exist_ok=True)
             answer = summarise(question, result) | {"seconds": time.monotonic() - began, "rejected": result.rejected}
             write_json(path, checkpoint.as_json(answer))

@@ -21,8 +21,8 @@ VERDICTS = {
 def write(path: Path, log: Log, question: Question, result: Result, summary: dict, free: dict) -> None:
     """Writes the page; whatever came from the log is escaped."""
     pictures = {"where": plots.heat_map(result.where), "traces": plots.traces(free["runs"], log.joints)}
-    if result.rungs:
-        pictures["ladder"] = plots.ladder(result.rungs)
+    if result.terms:
+        pictures["ladder"] = plots.ladder(result.terms)
     effects = [*summary["effects"], *summary["parameter_changes"]]
     page = report.render(
         "discovery_report.html",
@@ -37,7 +37,7 @@ def write(path: Path, log: Log, question: Question, result: Result, summary: dic
             for name in summary["not_testable"]
         ],
         proof=result.proof,
-        rungs=result.rungs,
+        rungs=result.terms,
         rejected=result.rejected,
         free=free,
         pictures={name: plots.embedded(figure) for name, figure in pictures.items()},

@@ -28,8 +28,6 @@ class Question:
 
     problem: Problem
     rig: Rig
-    push: Mapping[str, int]
-    """Axis of a constant torque, by joint."""
     splits: Mapping[str, tuple[str, ...]]
     """Names of the runs by split."""
     notes: tuple[str, ...]
@@ -88,14 +86,15 @@ def ask(
         prior=np.array([nominal.get(axis, 0.0) for axis in rig.axes]),
         timing=_timing(rig),
         data=_cut(log, rig, signals, horizons),
-        healthy=[_cut(healthy(log, spec, seed + number), rig, signals, horizons) for number in range(healthy_logs)],
+        null_logs=[_cut(healthy(log, spec, seed + number), rig, signals, horizons) for number in range(healthy_logs)],
         bin_rows=segments.rows_together(1.0 / log.rate_hz, _BIN_S),
         regimes=regimes.REGIMES,
         components={name: tuple("xyz") if name == "gravity" else rig.joints for name in signals},
+        push={joint: index["constant_push", joint] for joint in rig.joints},
         residual={h.places[0]: h for h in hypotheses(rig, {RESIDUAL.name: RESIDUAL}) if len(h.places) == 1},
     )
     names = {split: tuple(run.name for run in runs) for split, runs in splits(log).items()}
-    return Question(problem, rig, {joint: index["constant_push", joint] for joint in rig.joints}, names, notes)
+    return Question(problem, rig, names, notes)
 
 
 def _checked(log: Log, least_s: float) -> float:
