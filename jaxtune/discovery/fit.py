@@ -1,98 +1,116 @@
-"""Fits of several hypotheses at once, the nominal parameters free in each (steps 3 and 6).
+"""Gauss-Newton fits of many models at once, with slopes that are learnt from the steps taken.
 
-Gauss and Newton with secants. Slopes are found where a round of discovery begins and, of the finalists, where they
-stand (`polish`); in between they are learnt from the steps taken (Broyden): a round of a fit costs two simulations.
+A fit minimises the loss of `least_squares.Linear`: squared residuals in floor units, plus the prior of every coordinate
+that is free. With residuals r(c), slopes J = dr/dc, weight w and prior deviations s, a step solves
+
+    (w J'J + diag(1/s^2)) u = -(w J'r + c/s^2),   low <= c + u <= high.
+
+A simulation is the expensive part, so slopes are secants that are taken where a round of discovery begins and, for the
+finalists, where they stand (`polish`). In between, Broyden's update learns them from the steps themselves, and one
+iteration costs two simulations. Source: Nocedal and Wright, Numerical Optimization, chapters 10 and 11.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from jaxtune.discovery.least_squares import Linear
 from jaxtune.discovery.problem import Hypothesis
+from jaxtune.discovery.simulation import Evaluate
 
-Evaluate = Callable[[np.ndarray], np.ndarray]
-"""`evaluate(vectors [n, axes]) -> residuals [n, features]` in floor units."""
-
-ROUNDS_MORE = 2  # of a fit that starts from another one
-_SCALES = (1.0, 0.35)
+_SCALES = (1.0, 0.35)  # shares of the Gauss-Newton step that are tried side by side
 _DAMPING = 1e-3
-_IDLE = 0.5  # of a loss, in which chance counts one
-_PATIENCE = 2  # rounds
-_SHORTEST = 0.03  # of a step that slopes are learnt from
+_IDLE = 0.5  # fall of the loss that chance gives: about a half for a squared unit residual
+_PATIENCE = 2  # rounds without more than that
+_SHORTEST = 0.03  # length of a step, in coordinates, below which rounding hides what it could teach
 
 
 @dataclass(frozen=True)
 class Free:
-    """What may move: `vector = coordinates @ directions`."""
+    """The coordinates that a fit may move, and the vector they stand for: `vector = coordinates @ directions`.
+
+    The nominal parameters and the timing (the prior directions) come first; the coordinates of every accepted or tried
+    effect follow.
+    """
 
     directions: np.ndarray
-    """[coordinates, axes] a standard deviation, or a typical size, along each."""
+    """[coordinates, axes]: a standard deviation of the prior, or a typical size, along each."""
     sd: np.ndarray
-    """[coordinates] of the prior, in units of the directions."""
+    """[coordinates]: standard deviation of the prior, in units of the directions."""
     bounds: np.ndarray
-    """[coordinates, 2]"""
+    """[coordinates, 2]: least and largest value."""
     nominal: np.ndarray
-    """[coordinates] True for what is free under every hypothesis."""
+    """[coordinates]: True for the prior directions, which are free under every hypothesis."""
 
     def and_then(self, other: "Free") -> "Free":
-        """Both together."""
+        """Joins two sets of coordinates, those of the other one last."""
         return Free(*(np.concatenate(pair) for pair in zip(self.parts(), other.parts(), strict=True)))
 
+    def only(self, kept: np.ndarray) -> "Free":
+        """Keeps the coordinates for which `kept` [coordinates] is True."""
+        return Free(*(part[kept] for part in self.parts()))
+
     def parts(self) -> tuple[np.ndarray, ...]:
-        """Its fields."""
+        """Lists its arrays in the order of the fields; each has one row for each coordinate."""
         return self.directions, self.sd, self.bounds, self.nominal
 
 
 @dataclass(frozen=True)
 class Fit:
-    """A point, and what was found there."""
+    """A model at one horizon: where its coordinates stand, and residuals and slopes there.
+
+    Fits are values: every function that moves one returns another one.
+    """
 
     free: Free
     coordinates: np.ndarray
     """[coordinates]"""
     residual: np.ndarray
-    """[features]"""
+    """[features]: residuals on `train` in floor units; a feature is a (segment, bin, component)."""
     jacobian: np.ndarray
-    """[features, coordinates]"""
+    """[features, coordinates]: secants, or what Broyden's update made of them."""
     weight: float
+    """Share of the features that count as independent."""
     finite: bool = True
+    """False where every step from here broke the simulation."""
 
     @property
     def vector(self) -> np.ndarray:
-        """[axes]"""
+        """The model as the simulator's vector, [axes]."""
         return self.coordinates @ self.free.directions
 
     def own(self, hypothesis: Hypothesis) -> np.ndarray:
-        """Coordinates [parameters] of the hypothesis that it was begun for."""
+        """Coordinates [parameters] of the hypothesis that joined last."""
         return self.coordinates[-len(hypothesis.directions) :]
 
     def along(self, hypothesis: Hypothesis) -> np.ndarray:
-        """Which coordinates [coordinates] are those of a hypothesis that is in it."""
+        """Mask [coordinates] of a hypothesis that is part of the model, whenever it joined."""
         return np.array([any((row == mine).all() for mine in hypothesis.directions) for row in self.free.directions])
 
     @property
     def linear(self) -> Linear:
-        """Residuals near the point."""
+        """The linear model of the residuals around this point, with the prior: r(c + u) = r + J u."""
         return Linear(self.residual, self.jacobian, self.coordinates, self.free.sd, self.weight)
 
     def moved(self, scale: float) -> np.ndarray:
-        """Coordinates a share of the best step away, within the bounds."""
+        """Coordinates after a share of the Gauss-Newton step, within the bounds."""
         step = self.linear.step(_DAMPING, self.free.bounds)
         return np.clip(self.coordinates + scale * step, self.free.bounds[:, 0], self.free.bounds[:, 1])
 
     @property
     def at_bounds(self) -> np.ndarray:
-        """Which coordinates [coordinates] are where they may not go on."""
+        """Mask [coordinates] of those at a bound, which can make no room for anything else."""
         low, high = self.free.bounds.T
         return (self.coordinates <= low) | (self.coordinates >= high)
 
 
 def refine(fits: Sequence[Fit], evaluate: Evaluate, rounds: int) -> list[Fit]:
-    """Moves every fit towards its least loss; one that meets nothing but numbers that are not finite says so.
+    """Moves every fit towards its least loss, all of them in the same batches of simulations.
 
-    One that twice in a row has not gained what chance would is done.
+    A round tries a whole and a short Gauss-Newton step of every fit and keeps the better one, if it lowers the loss.
+    A fit that gained less than chance in two rounds in a row is done. One whose trials are all not finite is returned
+    with `finite=False`.
     """
     fits, idle = list(fits), [0] * len(fits)
     for _ in range(rounds):
@@ -103,22 +121,18 @@ def refine(fits: Sequence[Fit], evaluate: Evaluate, rounds: int) -> list[Fit]:
         vectors = [p @ fits[index].free.directions for index, pair in zip(active, trials, strict=True) for p in pair]
         found = evaluate(np.stack(vectors)).reshape(len(active), len(_SCALES), -1)
         for index, points, residuals in zip(active, trials, found, strict=True):
-            before, fits[index] = fits[index].linear.loss, _best(fits[index], points, residuals)
+            before, fits[index] = fits[index].linear.loss, _best_trial(fits[index], points, residuals)
             idle[index] = idle[index] + 1 if before - fits[index].linear.loss < _IDLE else 0
     return fits
 
 
-def anew(free: Free, coordinates: np.ndarray, weight: float, evaluate: Evaluate) -> Fit:
-    """A fit of which no more is known than where it stands."""
-    residual = evaluate((coordinates @ free.directions)[None])[0]
-    slopes = np.zeros((len(residual), len(coordinates)))
-    return polish([Fit(free, coordinates, residual, slopes, weight)], evaluate, 0)[0]
-
-
 def polish(fits: Sequence[Fit], evaluate: Evaluate, rounds: int) -> list[Fit]:
-    """Finds all slopes anew where fits stand, one simulation for each, and goes on from there."""
-    steps = [_own_step(fit) for fit in fits]
-    found = _dealt(
+    """Takes the slopes of all coordinates anew where fits stand, and refines from there.
+
+    It costs one simulation for each coordinate. With no rounds it only renews the slopes.
+    """
+    steps = [_secant_step(fit) for fit in fits]
+    found = evaluate_groups(
         evaluate,
         [
             [(fit.coordinates + step) @ fit.free.directions for step in np.diag(size)]
@@ -132,19 +146,82 @@ def polish(fits: Sequence[Fit], evaluate: Evaluate, rounds: int) -> list[Fit]:
     return refine(fresh, evaluate, rounds)
 
 
-def _own_step(fit: Fit) -> np.ndarray:
-    """How far to go for slopes, [coordinates], inwards from a bound."""
+def fit_at(free: Free, coordinates: np.ndarray, weight: float, evaluate: Evaluate) -> Fit:
+    """Makes a fit of which only the coordinates are known: simulates its residuals and takes its slopes.
+
+    Args:
+      free: what the coordinates are.
+      coordinates: [coordinates] where the fit stands.
+      weight: share of the features that count as independent.
+      evaluate: residuals of vectors.
+    """
+    residual = evaluate((coordinates @ free.directions)[None])[0]
+    slopes = np.zeros((len(residual), len(coordinates)))
+    return polish([Fit(free, coordinates, residual, slopes, weight)], evaluate, 0)[0]
+
+
+def evaluate_groups(evaluate: Evaluate, groups: Sequence[Sequence[np.ndarray]]) -> list[np.ndarray]:
+    """Evaluates the vectors of all groups in one batch; returns residuals [vectors of the group, features] by group."""
+    found = evaluate(np.stack([vector for group in groups for vector in group]))
+    return np.split(found, np.cumsum([len(group) for group in groups])[:-1])
+
+
+def best_point(fit: Fit, residuals: np.ndarray) -> int:
+    """Chooses, among residuals [points, features], the point with the least misfit that a step of `fit` would leave."""
+    misfits = []
+    for residual in residuals:
+        linear = replace(fit, residual=residual).linear
+        misfits.append(np.sum((residual + linear.jacobian @ linear.step(_DAMPING)) ** 2))
+    return int(np.argmin(np.where(np.isfinite(misfits), misfits, np.inf)))
+
+
+def taken_over(free: Free, hypothesis: Hypothesis) -> np.ndarray:
+    """Mask [coordinates] of the nominal parameters that a hypothesis takes over, prior and all.
+
+    A hypothesis about a link's mass replaces the mass that is free from the start: it has wider bounds and its own
+    prior, and beside it the old coordinate would be the same direction twice.
+    """
+    return np.any([_taken_by_single(free, part) for part in hypothesis.singles], axis=0)
+
+
+def hand_over(fit: Fit, own: np.ndarray, hypothesis: Hypothesis) -> tuple[Fit, np.ndarray]:
+    """Takes the coordinates `own` [coordinates] out of a fit, on behalf of a hypothesis.
+
+    Returns:
+      The fit without them, and where they stood in the hypothesis' coordinates, [parameters].
+    """
+    stood, start = np.zeros(len(hypothesis.directions)), 0
+    for part in hypothesis.singles:
+        mine, direction = own & _taken_by_single(fit.free, part), part.directions[0]
+        vector = fit.coordinates[mine] @ fit.free.directions[mine]
+        stood[start] = (vector[direction != 0] / direction[direction != 0]).mean()
+        start += len(part.directions)
+    kept = replace(fit, free=fit.free.only(~own), coordinates=fit.coordinates[~own], jacobian=fit.jacobian[:, ~own])
+    return kept, stood
+
+
+def _taken_by_single(free: Free, hypothesis: Hypothesis) -> np.ndarray:
+    """As `taken_over`, of a hypothesis that is no pair; only one with a single parameter can be a nominal one."""
+    if len(hypothesis.directions) > 1:
+        return np.zeros(len(free.sd), bool)
+    mine = hypothesis.directions[0] != 0
+    within = np.array([not (direction[~mine] != 0).any() for direction in free.directions])
+    return within & free.nominal
+
+
+def _secant_step(fit: Fit) -> np.ndarray:
+    """How far to go for a secant along each coordinate, [coordinates], inwards from an upper bound."""
     size = np.maximum(0.3 * fit.free.sd * np.where(fit.free.nominal, 1.0, 0.1), 0.1 * np.abs(fit.coordinates))
     return np.where(fit.coordinates + size > fit.free.bounds[:, 1], -size, size)
 
 
-def _best(fit: Fit, points: Sequence[np.ndarray], residuals: np.ndarray) -> Fit:
-    """The better of the trials, if one is better than where it is; what they taught in any case."""
+def _best_trial(fit: Fit, points: Sequence[np.ndarray], residuals: np.ndarray) -> Fit:
+    """The best of the trials, if one is better than the fit; in any case with the slopes that all of them taught."""
     best, learnt = None, fit
     for point, residual in zip(points, residuals, strict=True):
         if not np.isfinite(residual).all():
             continue
-        learnt = _learn(learnt, point, residual)
+        learnt = _broyden(learnt, point, residual)
         moved = replace(fit, coordinates=point, residual=residual)
         if moved.linear.loss < (best or fit).linear.loss:
             best = moved
@@ -153,8 +230,8 @@ def _best(fit: Fit, points: Sequence[np.ndarray], residuals: np.ndarray) -> Fit:
     return replace(best or fit, jacobian=learnt.jacobian)
 
 
-def _learn(fit: Fit, point: np.ndarray, residual: np.ndarray) -> Fit:
-    """Slopes that would have foreseen the residual at a point."""
+def _broyden(fit: Fit, point: np.ndarray, residual: np.ndarray) -> Fit:
+    """Broyden's update of the slopes J after a step u that found residuals r+: J + (r+ - r - J u) u' / (u'u)."""
     step = point - fit.coordinates
     length = step @ step
     # A short step teaches nothing but the rounding of single precision.
@@ -162,99 +239,3 @@ def _learn(fit: Fit, point: np.ndarray, residual: np.ndarray) -> Fit:
         return fit
     surprise = residual - fit.residual - fit.jacobian @ step
     return replace(fit, jacobian=fit.jacobian + np.outer(surprise, step) / length)
-
-
-def begin(
-    base: Fit,
-    hypotheses: Sequence[Hypothesis],
-    tried: Sequence[Sequence[np.ndarray]],
-    evaluate: Evaluate,
-    absolute: bool = False,
-    like: Sequence[Fit] | None = None,
-) -> list[Fit]:
-    """Fits that are about to start: each hypothesis beside what is free in `base`, at the best of its points.
-
-    Args:
-      base: the model without them.
-      hypotheses: one for every fit.
-      tried: points [parameters] for every hypothesis, seen from where the base has what the hypothesis takes over.
-      evaluate: residuals of vectors.
-      absolute: points are seen from the nominal model instead.
-      like: fits of the same hypotheses to other segments, where everything else starts.
-    """
-    kept, points = [], []
-    for number, (hypothesis, group) in enumerate(zip(hypotheses, tried, strict=True)):
-        fit, stood = without(base, given_up(base.free, hypothesis), hypothesis)
-        if like:
-            fit = replace(fit, coordinates=like[number].coordinates[: len(fit.coordinates)])
-        kept.append(fit)
-        points.append([np.clip(point if absolute else stood + point, *hypothesis.bounds.T) for point in group])
-    places = list(zip(kept, hypotheses, points, strict=True))
-    found = _dealt(evaluate, [[fit.vector + p @ h.directions for p in group] for fit, h, group in places])
-    best = [_best_start(fit, residuals) for fit, residuals in zip(kept, found, strict=True)]
-    at = [(group[index], residuals[index]) for group, residuals, index in zip(points, found, best, strict=True)]
-    steps = [_probing_step(hypothesis, point) for hypothesis, (point, _) in zip(hypotheses, at, strict=True)]
-    moved = _dealt(
-        evaluate,
-        [
-            [fit.vector + (point + step) @ h.directions for step in np.diag(size)]
-            for fit, h, (point, _), size in zip(kept, hypotheses, at, steps, strict=True)
-        ],
-    )
-    return [
-        replace(
-            fit,
-            free=fit.free.and_then(Free(h.directions, h.prior, h.bounds, np.zeros(len(h.prior), bool))),
-            coordinates=np.concatenate([fit.coordinates, point]),
-            residual=residual,
-            jacobian=np.concatenate([fit.jacobian, np.nan_to_num((shifted - residual) / size[:, None]).T], axis=1),
-            finite=bool(np.isfinite(residual).all() and np.isfinite(shifted).all()),
-        )
-        for fit, h, (point, residual), size, shifted in zip(kept, hypotheses, at, steps, moved, strict=True)
-    ]
-
-
-def given_up(free: Free, hypothesis: Hypothesis) -> np.ndarray:
-    """Which coordinates [coordinates] are the hypothesis' own: nominal parameters at its places, prior and all."""
-    return np.any([_own(free, part) for part in hypothesis.parts or (hypothesis,)], axis=0)
-
-
-def _own(free: Free, hypothesis: Hypothesis) -> np.ndarray:
-    if len(hypothesis.directions) > 1:
-        return np.zeros(len(free.sd), bool)
-    mine = hypothesis.directions[0] != 0
-    within = np.array([not (direction[~mine] != 0).any() for direction in free.directions])
-    return within & free.nominal
-
-
-def without(fit: Fit, own: np.ndarray, hypothesis: Hypothesis) -> tuple[Fit, np.ndarray]:
-    """A fit without some of its coordinates, and where those stood in the hypothesis' [parameters]."""
-    stood, start = np.zeros(len(hypothesis.directions)), 0
-    for part in hypothesis.parts or (hypothesis,):
-        mine, direction = own & _own(fit.free, part), part.directions[0]
-        vector = fit.coordinates[mine] @ fit.free.directions[mine]
-        stood[start] = (vector[direction != 0] / direction[direction != 0]).mean()
-        start += len(part.directions)
-    free = Free(*(part[~own] for part in fit.free.parts()))
-    return replace(fit, free=free, coordinates=fit.coordinates[~own], jacobian=fit.jacobian[:, ~own]), stood
-
-
-def _probing_step(hypothesis: Hypothesis, point: np.ndarray) -> np.ndarray:
-    """How far to go for slopes, [parameters], inwards from a bound."""
-    size = 0.2 * np.abs(point) + 0.2 * hypothesis.probes.max(axis=0) + 0.02 * (hypothesis.probes == 0).all(axis=0)
-    return np.where(point + size > hypothesis.bounds[:, 1], -size, size)
-
-
-def _best_start(fit: Fit, residuals: np.ndarray) -> int:
-    """The point with the least misfit once the nominal parameters have answered."""
-    misfits = []
-    for residual in residuals:
-        linear = replace(fit, residual=residual).linear
-        misfits.append(np.sum((residual + linear.jacobian @ linear.step(_DAMPING)) ** 2))
-    return int(np.argmin(np.where(np.isfinite(misfits), misfits, np.inf)))
-
-
-def _dealt(evaluate: Evaluate, groups: Sequence[Sequence[np.ndarray]]) -> list[np.ndarray]:
-    """Evaluates all vectors of all groups at once; what was found, by group."""
-    found = evaluate(np.stack([vector for group in groups for vector in group]))
-    return np.split(found, np.cumsum([len(group) for group in groups])[:-1])

@@ -1,10 +1,48 @@
-"""Where simulation and measurement disagree (step 4)."""
+"""Where simulation and measurement disagree (step 4): which joint, which signal, in which regime of motion."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
+from jaxtune.discovery.noise_floor import NoiseFloor
+from jaxtune.discovery.problem import Problem
 from jaxtune.discovery.resample import blocks
+from jaxtune.discovery.simulation import secants
+from jaxtune.discovery.state import State
+
+_PUSH = 0.05  # coordinate of the torque that the slopes are secants of
+_LASSO_ROUNDS = 300
+_LEAST_SEGMENTS = 3  # in which a regime must occur to be reported
+
+
+def localise(problem: Problem, floor: NoiseFloor, state: State) -> State:
+    """Finds the cells above the floor, the first time, and the joints that need a torque of their own, every time.
+
+    The first says to a person where the model is wrong. The second tells the screen at which joints to look: a joint
+    that no torque could help lacks nothing.
+
+    Args:
+      problem: the simulator and the segments.
+      floor: the noise floor; its null logs give the penalty, if that is not known.
+      state: where the model stands, fitted at the main horizon.
+
+    Returns:
+      The state with `where`, `needs_torque` and `penalty`.
+    """
+    fit, segments = state.fits[problem.main_horizon], problem.data["train"][problem.main_horizon]
+    residual = floor[problem.main_horizon].unflatten(fit.residual)
+    if not state.where:
+        # The regime of a bin is that of its first row.
+        regimes = segments.regimes[:, :: problem.bin_rows][:, : residual.shape[1]]
+        where = cells(residual, regimes, problem.regimes, problem.cells, segments.run)
+        state = replace(state, where=tuple(where))
+    if not problem.push:
+        return state
+    slopes = torque_slopes(problem, floor, fit.vector)
+    penalty = state.penalty or null_penalty(floor[problem.main_horizon].null_fits, slopes)
+    need = free_torque(residual.reshape(len(residual), -1), slopes, penalty)
+    return replace(state, penalty=penalty, needs_torque=dict(zip(problem.push, need.tolist(), strict=True)))
 
 
 def cells(
@@ -14,13 +52,20 @@ def cells(
     components: Sequence[tuple[str, str]],
     run: np.ndarray,
 ) -> list[dict]:
-    """Energy above the floor by component and regime, largest first, with bootstrap intervals over segments.
+    """Lists the energy above the floor by component and regime, largest first.
+
+    Intervals come from a block bootstrap over segments. A regime that fewer than three segments reach is left out.
 
     Args:
       residual: [segments, bins, components] in floor units.
       regimes: [segments, bins, joints] index of each joint's regime.
+      regime_names: by that index.
       components: (signal, joint) of every component.
       run: [segments] index of each segment's run.
+
+    Returns:
+      A dictionary for every cell: `joint`, `signal`, `regime`, `excess_floor_units` with its 95 % interval `low` and
+      `high`, and `bins`, how many there were.
     """
     draws = blocks(run, 200)
     joints = [joint for signal, joint in components if signal == "q"]
@@ -30,7 +75,7 @@ def cells(
         for number, name in enumerate(regime_names):
             there = (column == number).astype(float)
             count = there.sum(axis=1)
-            if (count > 0).sum() < 3:
+            if (count > 0).sum() < _LEAST_SEGMENTS:
                 continue
             energy = (residual[..., index] ** 2 * there).sum(axis=1)
             resampled = energy[draws].sum(axis=1) / np.maximum(count[draws].sum(axis=1), 1.0)
@@ -50,36 +95,71 @@ def cells(
 
 
 def excess(energy: float) -> float:
-    """Floor units above the floor, of a mean square."""
+    """Turns a mean square in floor units into the amplitude above the floor: sqrt(energy - 1), at least zero."""
     return float(np.sqrt(max(energy - 1.0, 0.0)))
 
 
-def free_torque(residual: np.ndarray, slopes: np.ndarray, penalty: float) -> np.ndarray:
-    """What every joint needs if each may have a torque of its own in every segment: [joints], zero where none.
+def torque_slopes(problem: Problem, floor: NoiseFloor, vector: np.ndarray) -> np.ndarray:
+    """Takes secants along a constant torque at every joint of `problem.push`, from a model [axes].
 
-    A group lasso over joints: min sum over segments |r_s + S_s a_s|^2 / 2 + penalty sum over joints |a_.j|, in units in
-    which a joint's slopes have length one.
+    Returns:
+      [segments, features of a segment, joints] in floor units.
+    """
+    horizon = problem.main_horizon
+    directions = np.zeros((len(problem.push), problem.axes))
+    directions[np.arange(len(directions)), list(problem.push.values())] = _PUSH
+    slopes = secants(problem, vector, directions, problem.data["train"][horizon])
+    slopes = slopes / floor[horizon].scale["train"][..., None]
+    return slopes.reshape(len(slopes), -1, len(directions))
+
+
+def free_torque(residual: np.ndarray, slopes: np.ndarray, penalty: float) -> np.ndarray:
+    """Says what every joint needs if each may have a torque of its own in every segment.
+
+    A group lasso whose groups are the joints (Yuan and Lin, 2006), solved by proximal gradient steps. With residuals
+    r_s and slopes S_s of segment s, and a torque a_sj for every segment and joint,
+
+        min over a:  sum_s |r_s + S_s a_s|^2 / 2  +  penalty * sum_j |a_.j|,
+
+    in units in which a joint's slopes have length one. The penalty on a joint's whole history makes it exactly zero
+    for joints that need no torque.
 
     Args:
       residual: [segments, features] in floor units.
       slopes: [segments, features, joints] of a constant torque at each joint.
-      penalty: as large as the largest need in healthy logs.
+      penalty: as large as the largest need in null logs.
+
+    Returns:
+      |a_.j|, [joints].
     """
-    size = np.sqrt((slopes**2).sum(axis=(0, 1)))
-    slopes = slopes / np.where(size > 0, size, 1.0)
+    slopes = _unit_length(slopes)
     torque = np.zeros((len(residual), slopes.shape[-1]))
     rate = 1.0 / max(np.linalg.eigvalsh(np.einsum("sfi,sfj->sij", slopes, slopes)).max(), 1e-12)
-    for _ in range(300):
+    for _ in range(_LASSO_ROUNDS):
         left = residual + np.einsum("sfj,sj->sf", slopes, torque)
         torque = torque - rate * np.einsum("sfj,sf->sj", slopes, left)
         norm = np.sqrt((torque**2).sum(axis=0))
-        torque *= np.maximum(1.0 - rate * penalty / np.maximum(norm, 1e-12), 0.0)
+        torque = torque * np.maximum(1.0 - rate * penalty / np.maximum(norm, 1e-12), 0.0)
     return np.sqrt((torque**2).sum(axis=0))
 
 
+def null_penalty(null_fits: Sequence, slopes: np.ndarray) -> float:
+    """Finds the smallest penalty under which no joint of any null log needs a torque.
+
+    Args:
+      null_fits: the prior directions fitted to every null log.
+      slopes: [segments, features, joints] of a constant torque at each joint.
+    """
+    return max(least_penalty(log.residual.reshape(len(slopes), -1), slopes) for log in null_fits)
+
+
 def least_penalty(residual: np.ndarray, slopes: np.ndarray) -> float:
-    """The smallest penalty under which no joint needs a torque."""
-    size = np.sqrt((slopes**2).sum(axis=(0, 1)))
-    slopes = slopes / np.where(size > 0, size, 1.0)
-    pull = np.einsum("sfj,sf->sj", slopes, residual)
+    """Finds the smallest penalty under which `free_torque` gives every joint zero: max over joints of |S'r|."""
+    pull = np.einsum("sfj,sf->sj", _unit_length(slopes), residual)
     return float(np.sqrt((pull**2).sum(axis=0)).max())
+
+
+def _unit_length(slopes: np.ndarray) -> np.ndarray:
+    """Slopes [segments, features, joints] scaled so that every joint's have length one."""
+    size = np.sqrt((slopes**2).sum(axis=(0, 1)))
+    return slopes / np.where(size > 0, size, 1.0)

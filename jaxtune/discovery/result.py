@@ -1,82 +1,88 @@
-"""How much a discovery tries, what it finds, and what it leaves for the next one of the same robot and motion."""
+"""How much a discovery tries, and what it finds."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from jaxtune.discovery.accept import Rung
 from jaxtune.discovery.fit import Fit
+from jaxtune.discovery.state import AcceptedTerm
 
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """How much is tried, and what it takes."""
+    """How much a discovery tries, and how much evidence it asks for.
+
+    The defaults are those that the blind benchmark was measured with. More hypotheses on the shortlist cost time; the
+    other numbers trade missed effects against invented ones.
+    """
 
     shortlist: int = 8
     """Hypotheses that are fitted beside the best of each family."""
     finalists: int = 4
-    """Of those, how many are fitted with fresh slopes, at every horizon, and compared."""
+    """How many of those are fitted with fresh slopes, at every horizon, and compared."""
     paired: int = 4
-    """How many of the best are tried two by two where none pays alone."""
+    """How many of the best are tried two by two where none passes alone."""
     most: int = 4
-    """Effects that are accepted at most."""
+    """Largest number of effects that are accepted."""
     level: float = 0.05
-    """Of naming something where nothing is missing."""
+    """Probability of naming something where nothing is missing, which the thresholds allow."""
     share: float = 0.5
-    """Of the energy above the floor that the named effects must explain together; else it is `unnamed`."""
+    """Share of the energy above the floor that the accepted effects must explain together; with less the verdict is
+    `unnamed`."""
     at_floor: float = 1.5
-    """Floor units up to which a gap is none, and up to which, in every signal, nothing more is looked for."""
+    """Gap in floor units that counts as none. No further effect is looked for once every signal is below it."""
     promising: float = 0.3
-    """Share of the gain it takes that the screen must see for a fit."""
+    """Share of the smallest accepted gain that the screen must see in a hypothesis before it is fitted."""
     same: float = 0.8
-    """Share of what is explained from which on another name may as well be right: effects have more forms than one."""
+    """Share of the best explanation from which on another name may as well be right, since effects have more functional
+    forms than the one in the library."""
     changed: float = 3.0
-    """Prior standard deviations beyond which a nominal parameter is another one."""
+    """Prior standard deviations beyond which a nominal parameter is reported as changed."""
     rounds: int = 4
-    """Of a fit."""
+    """Rounds of a fit."""
 
 
 DEFAULTS = Settings()
 
 
-@dataclass
+@dataclass(frozen=True, kw_only=True)
 class Result:
-    """What was found."""
+    """What a discovery found, for reports.
 
-    verdict: str = ""
-    rungs: list[Rung] = field(default_factory=list)
-    fit: Fit | None = None
-    errors: np.ndarray | None = None
-    """Standard errors of the fit's coordinates."""
-    null: Fit | None = None
-    where: list[dict] = field(default_factory=list)
-    """Cells above the floor before anything was accepted."""
-    needs_torque: dict[str, float] = field(default_factory=dict)
-    not_testable: list[str] = field(default_factory=list)
-    not_finite: list[str] = field(default_factory=list)
-    dropped: list[str] = field(default_factory=list)
-    """What was accepted and no longer paid beside later effects."""
-    rejected: dict[str, Any] = field(default_factory=dict)
-    """The best that was not accepted, and its tests."""
-    changed: dict[int, float] = field(default_factory=dict)
-    """Nominal axes that moved too far to be the same parameter, with their standard deviations from the prior."""
-    changed_alike: dict[int, tuple[str, ...]] = field(default_factory=dict)
-    """Names of effects that these logs could not tell from such a change."""
-    residual: Fit | None = None
-    """With a free torque at one joint, where something has no name."""
-    gap: dict[str, float] = field(default_factory=dict)
-    proof: dict[str, Any] = field(default_factory=dict)
+    The corrected model is `residual` where there is one, else `fit`; its `vector` is what the simulator is given.
+    """
 
-
-@dataclass(frozen=True)
-class Calibration:
-    """What healthy logs say, which depends on the robot, its motion and its noise alone."""
-
-    floors: dict[float, tuple[Mapping[str, np.ndarray], float]]
-    """Floors [bins, components] by split, and independent share, by horizon."""
-    gain: float
-    """What the best hypothesis gains on them."""
-    penalty: float
-    """Under which no joint of them needs a torque."""
+    verdict: str
+    """`named` (an effect is missing), `parameter_change` (nominal parameters alone are off), `no_missing_effect` (the
+    model is at the floor) or `unnamed` (something is missing that no hypothesis explains)."""
+    terms: tuple[AcceptedTerm, ...]
+    fit: Fit
+    """The model with all accepted effects, at the main horizon."""
+    errors: np.ndarray
+    """[coordinates] standard errors of `fit`."""
+    null: Fit
+    """The model with none, its nominal parameters fitted."""
+    where: tuple[Mapping[str, Any], ...]
+    """Cells above the floor before anything was accepted, largest first; see `localise.cells`."""
+    needs_torque: Mapping[str, float]
+    """How much every joint needs a torque of its own beside the last model that was looked at."""
+    not_testable: tuple[str, ...]
+    """Names of effects that these logs could not show. They are not absent: other motions could show them."""
+    not_finite: tuple[str, ...]
+    """Keys of hypotheses that broke the simulation."""
+    dropped: tuple[str, ...]
+    """Keys of hypotheses that were accepted and no longer paid beside later ones."""
+    rejected: Mapping[str, Any]
+    """The best hypothesis that was not accepted, with its tests and evidence."""
+    changed: Mapping[int, float]
+    """Nominal axes that moved too far to be the same parameter, with the distance in prior standard deviations."""
+    changed_alike: Mapping[int, tuple[str, ...]]
+    """Names of effects that these logs cannot distinguish from such a change, by axis."""
+    residual: Fit | None
+    """The model with a learned torque at one joint, where something is missing that has no name."""
+    gap: Mapping[str, float]
+    """Rms of the worst position on the sealed segments, in floor units: `before`, `null` and `after`."""
+    proof: Mapping[str, Any]
+    """`cells` (rms of every component), `no_cell_worse`, and `others`: the gap of ablations and placebos."""

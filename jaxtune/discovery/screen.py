@@ -1,20 +1,29 @@
 """Which hypotheses deserve a fit (step 5): a score test of every effect at every place.
 
-A hypothesis' slopes are secants at the sizes at which it is looked for, from where the model stands; those of several
-places are the sum of those of each. What the free coordinates explain is projected out.
+A fit of the whole library would cost thousands of simulations; a secant for every (axis, size) costs one. The columns
+of a hypothesis at several places are sums of those at each. From them the test says by how much the loss would fall
+with the hypothesis in the model, after the free coordinates have explained what they can: these are projected out.
+Source: Rao's score test, in its Gauss-Newton form.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from jaxtune.discovery.fit import Fit, given_up
+from jaxtune.discovery.evaluate import residuals_on
+from jaxtune.discovery.fit import Fit, taken_over
 from jaxtune.discovery.least_squares import Linear, complement
-from jaxtune.discovery.problem import Hypothesis
+from jaxtune.discovery.noise_floor import NoiseFloor, Say
+from jaxtune.discovery.problem import Hypothesis, Problem
+from jaxtune.discovery.result import Settings
+from jaxtune.discovery.state import Columns, State
 
 _VISIBLE = 4.0  # standard deviations
 _OUT_OF_SIZE = 3.0  # a secant speaks for sizes up to this multiple of its own
+_LEAST_GAIN = 4.0  # of the loss; two standard deviations of one coordinate
+_MOST_PLACES = 3  # of one name on the shortlist: they tell where; more would crowd out other names
+_BATCH = 32  # columns between two reports of progress
 
 
 @dataclass(frozen=True)
@@ -22,117 +31,166 @@ class Score:
     """What a score test says of a hypothesis."""
 
     gain: float
-    """By how much the loss falls."""
+    """By how much the loss would fall, if residuals were linear."""
     coordinates: np.ndarray
-    """[parameters] at which it falls most."""
+    """[parameters] at which it falls most; the fit starts there."""
     visible: float
     """How many standard deviations the smallest size of interest would move the residuals."""
 
     @property
     def testable(self) -> bool:
-        """Whether these logs could show it."""
+        """True if these logs could show the effect at the smallest size of interest."""
         return self.visible >= _VISIBLE
 
 
-class Screen:
-    """Secants of all hypotheses at one point.
+def screen(
+    settings: Settings, problem: Problem, floor: NoiseFloor, state: State, say: Say
+) -> tuple[State, dict[str, Score]]:
+    """Tests all hypotheses that were not accepted yet, from where the model stands.
+
+    The first screen also settles what holds for all rounds: which effects are not testable, what each hypothesis
+    promises, and what chance gains, unless a calibration has said so.
 
     Args:
-      fit: the point, with the slopes of what is free.
-      columns: [features] of every (axis, size) that `probes` asked for, per unit of the coordinate.
+      settings: the level of the threshold.
+      problem: the hypotheses and the simulator.
+      floor: the noise floor and the fits to null logs.
+      state: where the model stands, fitted at the main horizon.
+      say: told about progress.
+
+    Returns:
+      The state with the secants, and a score by hypothesis' key.
     """
-
-    def __init__(self, fit: Fit, columns: Mapping[tuple, np.ndarray]):
-        self._fit, self._columns = fit, columns
-        self._projections = {}
-
-    def scores(self, hypotheses: Sequence[Hypothesis], at: Fit | None = None) -> dict[str, Score]:
-        """A score for every hypothesis; at another fit of the same coordinates, if given."""
-        return {hypothesis.key: self._score(hypothesis, at) for hypothesis in hypotheses}
-
-    def _score(self, hypothesis: Hypothesis, at: Fit | None) -> Score:
-        # What is at its bound cannot make room for anything.
-        none = (at or self._fit).at_bounds
-        own = none | given_up(self._fit.free, hypothesis)
-        project = self._projection(own)
-        value = project(_without(at or self._fit, own).rows()[0])
-        least = np.sum(self._projection(none)(_without(at or self._fit, none).rows()[0]) ** 2)
-        best = Score(0.0, np.zeros(len(hypothesis.directions)), 0.0)
-        visible = 0.0
-        for sizes, group in groups(hypothesis):
-            column = np.stack(
-                [sum(share * self._columns[key] for key, share in keys.items()) for keys in group], axis=1
-            )
-            padding = np.zeros((len(value) - len(column), column.shape[1]))
-            slope = project(np.concatenate([np.sqrt(self._fit.weight) * column, padding]))
-            # Of the smallest size of interest, which comes first.
-            visible = visible or float(np.abs(sizes * np.sqrt((slope**2).sum(axis=0))).max())
-            normal = slope.T @ slope
-            if np.trace(normal) < 1e-12:
-                continue
-            found = -np.linalg.solve(normal + 1e-9 * np.trace(normal) * np.eye(len(normal)), slope.T @ value)
-            full = np.zeros(len(hypothesis.directions))
-            full[: len(found)] = found
-            low, high = hypothesis.bounds.T
-            if len(hypothesis.probes) > 1 and low[0] >= 0:
-                high = np.minimum(high, _OUT_OF_SIZE * sizes.max())
-            full = np.clip(full, low, high)
-            gain = float(least - np.sum((value + slope @ full[: len(found)]) ** 2))
-            if gain > best.gain:
-                best = Score(gain, full, 0.0)
-        return Score(best.gain, best.coordinates, visible)
-
-    def like(self, axis: int, change: float, hypotheses: Sequence[Hypothesis], share: float) -> tuple[str, ...]:
-        """Names of hypotheses that explain a share of what a change along an axis does, best first.
-
-        What the other free coordinates explain is projected out of both.
-        """
-        free = self._fit.free.directions
-        own = (free[:, axis] != 0) & self._fit.free.nominal
-        if not own.any():
-            return ()
-        project = self._projection(own)
-        root, rest = np.sqrt(self._fit.weight), np.zeros(int((~own).sum()))
-        seen = lambda column: project(np.concatenate([root * column, rest]))  # noqa: E731
-        wanted = np.sign(change) * seen(self._fit.jacobian[:, own][:, 0])
-        found = {}
-        for hypothesis in hypotheses:
-            for _, group in groups(hypothesis):
-                if not all(key in self._columns for keys in group for key in keys):
-                    continue
-                columns = [sum(part * self._columns[key] for key, part in keys.items()) for keys in group]
-                columns = np.stack([seen(column) for column in columns], axis=1)
-                # What can only be added does not explain what was taken away.
-                if hypothesis.bounds[0, 0] >= 0 and columns[:, 0] @ wanted < 0:
-                    continue
-                left = complement(columns)(wanted)
-                explained = 1.0 - np.sum(left**2) / max(np.sum(wanted**2), 1e-12)
-                found[hypothesis.name] = max(found.get(hypothesis.name, 0.0), float(explained))
-        return tuple(sorted((name for name in found if found[name] >= share), key=lambda name: -found[name]))
-
-    def _projection(self, own: np.ndarray):
-        """Onto what the coordinates cannot explain that a hypothesis does not take over."""
-        key = own.tobytes()
-        if key not in self._projections:
-            self._projections[key] = complement(_without(self._fit, own).rows()[1])
-        return self._projections[key]
+    base = state.fits[problem.main_horizon]
+    hypotheses = untried(problem, state)
+    columns = secant_columns(problem, floor, base, hypotheses, say)
+    state = replace(state, columns=columns)
+    if state.screened:
+        (found,) = scores(base, columns, hypotheses, [base])
+        return state, found
+    null_fits = () if state.least_gain else floor[problem.main_horizon].null_fits
+    found, *of_null_logs = scores(base, columns, hypotheses, [base, *null_fits])
+    testable = {h.name for h in hypotheses if found[h.key].testable}
+    names = dict.fromkeys(h.name for h in hypotheses)
+    state = replace(
+        state,
+        promise={key: score.gain for key, score in found.items()},
+        not_testable=tuple(name for name in names if name not in testable),
+        least_gain=state.least_gain or chance_gain(of_null_logs, settings.level),
+    )
+    say(f"these logs cannot show: {', '.join(state.not_testable) or 'nothing is beyond them'}")
+    return state, found
 
 
-def _without(fit: Fit, own: np.ndarray) -> Linear:
-    """A fit's surroundings without some of its coordinates."""
-    linear = fit.linear
-    return Linear(linear.residual, linear.jacobian[:, ~own], linear.offset[~own], linear.sd[~own], linear.weight)
+def untried(problem: Problem, state: State) -> list[Hypothesis]:
+    """Lists the hypotheses that were neither accepted nor dropped."""
+    taken = {term.hypothesis.key for term in state.terms} | set(state.dropped)
+    return [hypothesis for hypothesis in problem.hypotheses if hypothesis.key not in taken]
+
+
+def secant_columns(
+    problem: Problem, floor: NoiseFloor, fit: Fit, hypotheses: Sequence[Hypothesis], say: Say
+) -> Columns:
+    """Takes the secants of the residuals that the hypotheses are made of, one simulation for each.
+
+    Args:
+      problem: the simulator.
+      floor: the noise floor.
+      fit: where the model stands at the main horizon.
+      hypotheses: what is asked about.
+      say: told about progress.
+
+    Returns:
+      [features] by (axis, size), per unit of the coordinate; zero where a simulation is not finite.
+    """
+    evaluate = residuals_on(problem, floor, problem.main_horizon, "train")
+    asked = probes(hypotheses)
+    steps = np.zeros((len(asked), problem.axes))
+    for row, (axis, size) in enumerate(asked):
+        steps[row, axis] = size
+    columns = {}
+    for start in range(0, len(asked), _BATCH):
+        say(f"screen {start}/{len(asked)}")
+        found = evaluate(fit.vector + steps[start : start + _BATCH])
+        for key, moved in zip(asked[start : start + _BATCH], found, strict=True):
+            columns[key] = np.nan_to_num((moved - fit.residual) / key[1], posinf=0.0, neginf=0.0)
+    return columns
+
+
+def scores(
+    fit: Fit, columns: Columns, hypotheses: Sequence[Hypothesis], points: Sequence[Fit]
+) -> list[dict[str, Score]]:
+    """Scores every hypothesis at every point.
+
+    Slopes are those of `fit` for all points, so that a null log costs no simulation: its residuals alone count.
+
+    Args:
+      fit: where the columns were taken, with the slopes of the free coordinates.
+      columns: secants by (axis, size).
+      hypotheses: what is scored.
+      points: fits of the same coordinates to the same or to other logs.
+
+    Returns:
+      For every point, a score by hypothesis' key.
+    """
+    taken = [taken_over(fit.free, hypothesis) for hypothesis in hypotheses]
+    # What is at its bound cannot make room for anything.
+    masks = [[point.at_bounds, *(point.at_bounds | own for own in taken)] for point in points]
+    # Many hypotheses share what they take over, mostly nothing; a projection is the dearest part.
+    distinct = {mask.tobytes(): mask for row in masks for mask in row}
+    projections = {key: complement(_prior_and_slopes(fit, mask)[1]) for key, mask in distinct.items()}
+    found = []
+    for point, (none, *own) in zip(points, masks, strict=True):
+        least = np.sum(projections[none.tobytes()](_prior_and_slopes(point, none)[0]) ** 2)
+        scored = {}
+        for hypothesis, mask in zip(hypotheses, own, strict=True):
+            project = projections[mask.tobytes()]
+            value = project(_prior_and_slopes(point, mask)[0])
+            scored[hypothesis.key] = _score(hypothesis, columns, project, value, least, fit.weight)
+        found.append(scored)
+    return found
+
+
+def chance_gain(of_null_logs: Sequence[Mapping[str, Score]], level: float) -> float:
+    """Returns the gain that the best hypothesis exceeds with probability `level` where nothing is missing.
+
+    It is the quantile 1 - level, over null logs, of the largest gain over all hypotheses: the threshold holds for the
+    whole library at once.
+    """
+    best = [max(score.gain for score in scores.values()) for scores in of_null_logs]
+    return float(np.quantile(best, 1.0 - level, method="higher"))
+
+
+def candidates(settings: Settings, problem: Problem, state: State, scores: Mapping[str, Score]) -> list[Hypothesis]:
+    """Chooses the hypotheses that a round fits.
+
+    They sit beside a joint that needs a torque (or may show anywhere), could show in these logs, and promise a share
+    of the gain that acceptance takes. Of these the shortlist is taken.
+
+    Args:
+      settings: lengths and shares.
+      problem: the hypotheses.
+      state: the joints in need, and what chance gains.
+      scores: by hypothesis' key.
+    """
+    index = {joint: number for number, joint in enumerate(problem.push)}
+    needing = {index[joint] for joint, need in state.needs_torque.items() if need > 0}
+    near = [h for h in untried(problem, state) if not needing or not h.joints or needing & set(h.joints)]
+    # What is larger than the smallest size of interest may show where that would not.
+    near = [h for h in near if scores[h.key].testable or scores[h.key].gain > state.least_gain]
+    # A fit finds more than its first step does, but not many times as much.
+    near = [h for h in near if scores[h.key].gain > settings.promising * state.least_gain]
+    return shortlist(scores, near, settings.shortlist)
 
 
 def shortlist(scores: Mapping[str, Score], hypotheses: Sequence[Hypothesis], count: int) -> list[Hypothesis]:
-    """The best `count`, and the best of each family."""
+    """Takes the best `count` hypotheses and the best of each family, at most three places of one name, best first."""
     ranked = sorted(hypotheses, key=lambda h: -scores[h.key].gain)
-    ranked = [h for h in ranked if scores[h.key].gain > 4.0]
+    ranked = [h for h in ranked if scores[h.key].gain > _LEAST_GAIN]
     chosen, seen, names = [], set(), {}
     for hypothesis in ranked:
         first = hypothesis.family not in seen
-        # Three places of one name tell where; more would crowd out other names.
-        if names.get(hypothesis.name, 0) >= 3:
+        if names.get(hypothesis.name, 0) >= _MOST_PLACES:
             continue
         if first or len(chosen) < count:
             chosen.append(hypothesis)
@@ -141,8 +199,56 @@ def shortlist(scores: Mapping[str, Score], hypotheses: Sequence[Hypothesis], cou
     return chosen
 
 
-def groups(hypothesis: Hypothesis):
-    """For every size at which it is looked for: sizes [k], and its (axis, size) and shares for each of k directions."""
+def looks_like(
+    fit: Fit, columns: Columns, axis: int, hypotheses: Sequence[Hypothesis], share: float
+) -> tuple[str, ...]:
+    """Names the hypotheses that these logs cannot distinguish from the change of a nominal parameter.
+
+    A hypothesis looks like the change if it explains a share of what the change does to the residuals. What the other
+    free coordinates explain is projected out of both first.
+
+    Args:
+      fit: the model, whose axis `axis` has changed.
+      columns: secants where the model stands; a hypothesis without its columns is skipped.
+      axis: index of the nominal parameter.
+      hypotheses: what it may be mistaken for.
+      share: of the squared change that must be explained.
+
+    Returns:
+      Names, best first.
+    """
+    change = fit.vector[axis]
+    own = (fit.free.directions[:, axis] != 0) & fit.free.nominal
+    if not own.any():
+        return ()
+    _, others = _prior_and_slopes(fit, own)
+    project = complement(others)
+    root, rest = np.sqrt(fit.weight), np.zeros(int((~own).sum()))
+    seen = lambda column: project(np.concatenate([root * column, rest]))  # noqa: E731
+    wanted = np.sign(change) * seen(fit.jacobian[:, own][:, 0])
+    found = {}
+    for hypothesis in hypotheses:
+        for _, group in groups(hypothesis):
+            if not all(key in columns for keys in group for key in keys):
+                continue
+            mine = np.stack([seen(_column(columns, keys)) for keys in group], axis=1)
+            # What can only be added does not explain what was taken away.
+            if hypothesis.bounds[0, 0] >= 0 and mine[:, 0] @ wanted < 0:
+                continue
+            left = complement(mine)(wanted)
+            explained = 1.0 - np.sum(left**2) / max(np.sum(wanted**2), 1e-12)
+            found[hypothesis.name] = max(found.get(hypothesis.name, 0.0), float(explained))
+    return tuple(sorted((name for name in found if found[name] >= share), key=lambda name: -found[name]))
+
+
+def groups(hypothesis: Hypothesis) -> Iterator[tuple[np.ndarray, list[dict[tuple[int, float], float]]]]:
+    """Lists what the screen asks about a hypothesis: for every size, the columns that it is a sum of.
+
+    Parameters that can be probed alone are asked about together, as one group of k directions.
+
+    Yields:
+      Sizes [k], and for each of the k directions the share of every (axis, size).
+    """
     free = [index for index in range(len(hypothesis.directions)) if (hypothesis.probes[:, index] != 0).any()]
     together = len(free) > 1
     rows = [hypothesis.probes.max(axis=0)] if together else hypothesis.probes
@@ -160,7 +266,60 @@ def groups(hypothesis: Hypothesis):
 
 
 def probes(hypotheses: Sequence[Hypothesis]) -> list[tuple[int, float]]:
-    """All (axis, size) whose secants the hypotheses need."""
+    """Lists all (axis, size) whose secants the hypotheses need, each once, in order."""
     return sorted(
         {key for hypothesis in hypotheses for _, group in groups(hypothesis) for keys in group for key in keys}
     )
+
+
+def _score(
+    hypothesis: Hypothesis,
+    columns: Columns,
+    project: Callable[[np.ndarray], np.ndarray],
+    value: np.ndarray,
+    least: float,
+    weight: float,
+) -> Score:
+    """The best score over the sizes at which a hypothesis is looked for.
+
+    Args:
+      hypothesis: what is scored.
+      columns: secants by (axis, size).
+      project: projects out what the free coordinates explain that the hypothesis does not take over.
+      value: projected residuals, with the prior's rows.
+      least: what the free coordinates leave of the loss without the hypothesis.
+      weight: share of the features that count as independent.
+    """
+    best = Score(0.0, np.zeros(len(hypothesis.directions)), 0.0)
+    visible = 0.0
+    low, high = hypothesis.bounds.T
+    for sizes, group in groups(hypothesis):
+        column = np.stack([_column(columns, keys) for keys in group], axis=1)
+        padding = np.zeros((len(value) - len(column), column.shape[1]))
+        slope = project(np.concatenate([np.sqrt(weight) * column, padding]))
+        # Of the smallest size of interest, which comes first.
+        visible = visible or float(np.abs(sizes * np.sqrt((slope**2).sum(axis=0))).max())
+        normal = slope.T @ slope
+        if np.trace(normal) < 1e-12:
+            continue
+        found = -np.linalg.solve(normal + 1e-9 * np.trace(normal) * np.eye(len(normal)), slope.T @ value)
+        full = np.zeros(len(hypothesis.directions))
+        full[: len(found)] = found
+        one_sided = len(hypothesis.probes) > 1 and low[0] >= 0
+        full = np.clip(full, low, np.minimum(high, _OUT_OF_SIZE * sizes.max()) if one_sided else high)
+        gain = float(least - np.sum((value + slope @ full[: len(found)]) ** 2))
+        if gain > best.gain:
+            best = Score(gain, full, 0.0)
+    return Score(best.gain, best.coordinates, visible)
+
+
+def _column(columns: Columns, shares: Mapping[tuple[int, float], float]) -> np.ndarray:
+    """The secant [features] along a direction: a sum of columns by their shares."""
+    return sum(share * columns[key] for key, share in shares.items())
+
+
+def _prior_and_slopes(fit: Fit, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Value [n] and slopes [n, coordinates] of what a fit's loss squares, without the coordinates `own`."""
+    linear = fit.linear
+    kept = Linear(linear.residual, linear.jacobian[:, ~own], linear.offset[~own], linear.sd[~own], linear.weight)
+    return kept.rows()

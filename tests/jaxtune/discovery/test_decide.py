@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
+from slider import HYPOTHESES
 
 from jaxtune.discovery import decide
 from jaxtune.discovery.least_squares import Linear
-from jaxtune.discovery.problem import together
+from jaxtune.discovery.problem import pair_of
 from jaxtune.discovery.resample import blocks, standard_error
-from tests.jaxtune.discovery.test_workflow import HYPOTHESES
 
 RUN = np.repeat([4, 1, 7], [10, 5, 2])
 
@@ -81,7 +81,7 @@ def test_the_better_hypothesis_wins_when_it_is_fitted_again():
 
 def test_a_pair_is_two_hypotheses_side_by_side():
     one, two = HYPOTHESES[2], HYPOTHESES[3]
-    pair = together(one, two)
+    pair = pair_of(one, two)
     point = np.array([0.4, -0.3])
     np.testing.assert_allclose(point @ pair.directions, 0.4 * one.directions[0] - 0.3 * two.directions[0])
     np.testing.assert_allclose(pair.bounds, np.concatenate([one.bounds, two.bounds]))

@@ -1,10 +1,12 @@
 """What looks like the change of a nominal parameter."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from jaxtune.discovery.fit import Fit, Free
 from jaxtune.discovery.problem import Hypothesis
-from jaxtune.discovery.screen import Screen
+from jaxtune.discovery.screen import looks_like
 
 
 def hypothesis(name, axis, least=-1.0):
@@ -23,7 +25,7 @@ def hypothesis(name, axis, least=-1.0):
 def test_a_change_looks_like_what_moves_the_residuals_as_it_does():
     change, other, third = np.eye(60)[:3]
     free = Free(directions=np.eye(5)[:1], sd=np.ones(1), bounds=np.array([[-5.0, 5.0]]), nominal=np.ones(1, bool))
-    fit = Fit(free=free, coordinates=np.zeros(1), residual=other, jacobian=change[:, None], weight=0.5)
+    fit = Fit(free=free, coordinates=np.ones(1), residual=other, jacobian=change[:, None], weight=0.5)
     # A share of 0.81 of what the change does, and of 0.36.
     columns = {
         (1, 0.5): 3 * change,
@@ -34,11 +36,15 @@ def test_a_change_looks_like_what_moves_the_residuals_as_it_does():
     same, near, far, less = (
         hypothesis(name, axis) for axis, name in enumerate(("same", "near", "far", "less"), start=1)
     )
-    screen = Screen(fit, columns)
-    assert screen.like(0, 1.0, [near, far, same, less], 0.8) == ("same", "less", "near")
-    assert screen.like(0, 1.0, [near, far, same], 0.3) == ("same", "near", "far")
+
+    def alike(hypotheses, share, axis=0, change=1.0):
+        moved = replace(fit, coordinates=np.array([change]))
+        return looks_like(moved, columns, axis, hypotheses, share)
+
+    assert alike([near, far, same, less], 0.8) == ("same", "less", "near")
+    assert alike([near, far, same], 0.3) == ("same", "near", "far")
     # What can only be added explains a change in one direction alone.
     added = hypothesis("less", 4, least=0.0)
-    assert screen.like(0, 1.0, [added], 0.8) == ()
-    assert screen.like(0, -1.0, [added], 0.8) == ("less",)
-    assert screen.like(2, 1.0, [same], 0.8) == (), "nothing that is free lies along this axis"
+    assert alike([added], 0.8) == ()
+    assert alike([added], 0.8, change=-1.0) == ("less",)
+    assert alike([same], 0.8, axis=2) == (), "nothing that is free lies along this axis"

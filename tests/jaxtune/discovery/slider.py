@@ -1,0 +1,106 @@
+"""A slider whose truth is known: mass, damping, and whatever is hidden in it."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxtune.discovery.problem import Hypothesis, Problem, Segments
+
+AXES = ("mass", "damping", "coulomb", "push", "nothing", "cubic", "wild")
+HORIZONS = (0.1, 0.2, 0.4)
+DT, NOISE = 0.01, 0.002
+DRAWS = np.random.default_rng(5).standard_normal((12, 2)).clip(-2, 2)
+"""[null logs, 2] mass and damping of the simulated null logs, in prior standard deviations."""
+
+
+def simulate(vector, segment):
+    """A slider of 1 kg and 1 N s/m pushed by a force [steps]; coordinates are what is added to them."""
+    mass, damping, coulomb, push, _, cubic, wild = vector
+
+    def step(state, force):
+        x, v = state
+        rub = coulomb * jnp.tanh(v / 0.02) + cubic * x**3
+        # A hypothesis that breaks the simulation wherever it is tried.
+        broken = jnp.where(wild > 0, jnp.nan, 0.0)
+        v = v + DT * (force + push - (1.0 + damping) * v - rub) / jnp.exp(mass) + broken
+        x = x + DT * v
+        return (x, v), (x, v)
+
+    _, (x, v) = jax.lax.scan(step, (segment["x"], segment["v"]), segment["force"])
+    return {"q": x[:, None], "dq": v[:, None]}
+
+
+play = jax.jit(jax.vmap(simulate, (None, 0)))
+
+
+def hypothesis(name, bounds, probes, family="friction"):
+    direction = np.array([[float(axis == name) for axis in AXES]])
+    return Hypothesis(
+        name=name,
+        family=family,
+        places=("slider",),
+        directions=direction,
+        probes=np.array(probes)[:, None],
+        bounds=np.array([bounds]),
+        prior=np.array([1.0]),
+        joints=(0,),
+    )
+
+
+HYPOTHESES = (
+    hypothesis("mass", (-1.0, 1.0), [0.1], "inertia"),
+    hypothesis("damping", (-0.9, 5.0), [0.3]),
+    hypothesis("coulomb", (0.0, 5.0), [0.05, 0.3]),
+    hypothesis("push", (-5.0, 5.0), [0.3], "external"),
+    hypothesis("nothing", (-5.0, 5.0), [0.05], "external"),
+)
+WILD = hypothesis("wild", (0.0, 1.0), [0.1], "external")
+
+
+def measured(truth, seed, split=0, count=40, motion=None):
+    """Segments by horizon: the truth's motion with noise, from states that are known to within the noise."""
+    rng, moved = np.random.default_rng((seed, 1)), np.random.default_rng(seed if motion is None else motion)
+    vector = np.array([truth.get(axis, 0.0) for axis in AXES], np.float32)
+    found = {}
+    for horizon in HORIZONS:
+        steps = round(horizon / DT)
+        force = (
+            6.0 * moved.uniform(-1, 1, (count, 1)) * np.sin(moved.uniform(2, 12, (count, 1)) * DT * np.arange(steps))
+        )
+        start = {"x": moved.normal(0, 0.5, count), "v": moved.normal(0, 0.7, count), "force": force}
+        start = {name: value.astype(np.float32) for name, value in start.items()}
+        read = {name: np.asarray(value) for name, value in play(vector, start).items()}
+        read = {name: value + NOISE * rng.standard_normal(value.shape) for name, value in read.items()}
+        inputs = start | {name: start[name] + np.float32(NOISE) * rng.standard_normal(count) for name in ("x", "v")}
+        inputs = {name: value.astype(np.float32) for name, value in inputs.items()}
+        found[horizon] = Segments(
+            inputs=inputs,
+            signals=read,
+            run=4 * split + np.arange(count) // 10,
+            regimes=np.zeros((count, steps, 1), int),
+        )
+    return found
+
+
+def problem(truth, seed=0, hypotheses=HYPOTHESES):
+    prior = np.array([0.1, 0.1, 0.0, 0.0, 0.0, 0.0, 0.0])
+    # Nobody knows the nominal parameters better than to a tenth.
+    drawn = [{"mass": 0.1 * m, "damping": 0.1 * d} for m, d in DRAWS]
+    splits = ("train", "select", "sealed")
+    null_logs = [
+        {split: measured(one, 900 + 100 * k + i, k, motion=10 * seed + k) for k, split in enumerate(splits)}
+        for i, one in enumerate(drawn)
+    ]
+    return Problem(
+        simulate=simulate,
+        axes=len(AXES),
+        hypotheses=hypotheses,
+        prior=prior,
+        timing=np.zeros((0, len(AXES))),
+        data={split: measured(truth, 10 * seed + i, i) for i, split in enumerate(splits)},
+        null_logs=null_logs,
+        bin_rows=2,
+        regimes=("steady",),
+        components={"q": ("slider",), "dq": ("slider",)},
+        push={"slider": AXES.index("push")},
+    )
