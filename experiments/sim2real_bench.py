@@ -1,9 +1,9 @@
 """Repeats the paper's Fig. 6 on a stand-in robot: `python -m experiments.sim2real_bench --out DIR`.
 
-The learner starts with all masses at half of the robot's, and with a policy that was trained there, in the nominal model.
-The robot is a process of its own (`experiments.robot_stub`) with what a real one has: delay, lag, noise, drift, another
-friction. Falls in the walks of the rounds are the price of tuning. At the end each policy is evaluated in further walks,
-from which nothing is learnt.
+The learner starts with all masses at half of the robot's, and with a policy that was trained there, in the nominal
+model. The robot is a process of its own (`experiments.robot_stub`) with what a real one has: delay, lag, noise, drift,
+another friction. Falls in the walks of the rounds are the price of tuning. At the end each policy is evaluated in
+further walks, from which nothing is learnt.
 """
 
 import json
