@@ -369,7 +369,7 @@ def without(log, *names):
         (lambda log: replace(log, runs=(faster(log.runs[0], 1.2),)), "run_000: got 120 rows a second, expected"),
         (
             lambda log: replace(log, runs=(*log.runs, lying(log.runs[1]))),
-            "run_001: got no two ticks in a row on its feet",
+            "run_001: got no two consecutive ticks with the robot on its feet",
         ),
         (lambda log: replace(log, base="fixed"), "base: got fixed, expected free"),
     ],
