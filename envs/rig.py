@@ -71,6 +71,7 @@ class Rig:
         self.control_hz = control_hz
         self.dt = 1.0 / control_hz / np.ceil(1.0 / control_hz / _LONGEST_STEP_S - 1e-9)
         model.opt.timestep = self.dt
+        # Torques are the chain's, applied to the joints directly.
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION
         self.joints = tuple(joints)
         found = [model.joint(name) for name in joints]
@@ -117,6 +118,7 @@ class Rig:
         Args:
           scales: [places] by the name of the scale (`jaxtune.types.Scale`).
         """
+        # A shallow copy shares the model on the device.
         other = copy.copy(self)
         other._scales = dict(scales)
         return other
@@ -275,6 +277,7 @@ class Rig:
             return (data, memory), read
 
         _, read = jax.lax.scan(move, (data, memory), future)
+        # Rows lie between steps of the simulation.
         step, share = segment.row_step, segment.row_share[:, None]
         following = jnp.minimum(step + 1, len(future["sample"]) - 1)
         read = jax.tree.map(lambda x: x[step] + share * (x[following] - x[step]), read)

@@ -98,7 +98,7 @@ def read_bag(path: Path, columns: Mapping[str, str]) -> dict[str, np.ndarray]:
     of_rows = [ours for first in ("action.", "q.") for ours in places if ours.startswith(first)]
     if not of_rows:
         raise ValueError(f"{path}: columns: got none of 'q.*', expected where in the bag the positions are")
-    topics = _heard(path, places)
+    topics = _read_topics(path, places)
     ticks = places[of_rows[0]].topic
     period, start, time = _rows(path, topics, ticks)
     found = {"t": time}
@@ -140,7 +140,7 @@ def _rows(path: Path, topics: Mapping[str, _Topic], of_rows: str) -> tuple[float
     return float(np.median(np.diff(time))), int(stamps[0]), time
 
 
-def _heard(path: Path, places: Mapping[str, _Place]) -> dict[str, _Topic]:
+def _read_topics(path: Path, places: Mapping[str, _Place]) -> dict[str, _Topic]:
     """Reads all messages of the topics that are needed."""
     # rosbags is an optional dependency.
     try:
@@ -149,21 +149,21 @@ def _heard(path: Path, places: Mapping[str, _Place]) -> dict[str, _Topic]:
     except ModuleNotFoundError as error:
         raise ValueError(f"{path}: reading a bag needs rosbags: pip install 'jaxtune[bags]'") from error
     store = get_typestore(Stores.ROS1_NOETIC if path.suffix == ".bag" else Stores.ROS2_HUMBLE)
-    heard = {place.topic: [] for place in places.values()}
+    found = {place.topic: [] for place in places.values()}
     try:
         with AnyReader([path], default_typestore=store) as reader:
-            for topic in heard:
+            for topic in found:
                 if topic not in reader.topics:
                     raise LookupError(f"there is no topic '{topic}', expected some of {', '.join(reader.topics)}")
-            connections = [one for one in reader.connections if one.topic in heard]
+            connections = [one for one in reader.connections if one.topic in found]
             for connection, recorded, raw in reader.messages(connections):
-                messages = heard[connection.topic]
+                messages = found[connection.topic]
                 message = reader.deserialize(raw, connection.msgtype)
                 messages.append(_read(message, recorded, connection.topic, len(messages) + 1, places))
     except Exception as error:  # a damaged bag fails in many ways
         raise ValueError(f"{path}: {type(error).__name__}: {error}") from error
-    stamped = all(stamp for messages in heard.values() for stamp, _, _ in messages)
-    return {topic: _topic(path, topic, messages, 0 if stamped else 1, places) for topic, messages in heard.items()}
+    stamped = all(stamp for messages in found.values() for stamp, _, _ in messages)
+    return {topic: _topic(path, topic, messages, 0 if stamped else 1, places) for topic, messages in found.items()}
 
 
 def _read(message: Any, recorded: int, topic: str, number: int, places: Mapping[str, _Place]) -> tuple:

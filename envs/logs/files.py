@@ -116,6 +116,7 @@ def _as_meta(controller: Controller) -> dict:
 
 def _run(path: Path, meta: Meta, needed: str) -> Run:
     columns = read_bag(path, meta.columns) if is_bag(path) else READERS[path.suffix](path)
+    # All columns, also those that the format does not know: a NaN in one of them is a damaged file.
     for name, values in columns.items():
         refuse_first(path, name, values, ~np.isfinite(values), "a finite number")
     columns = _rename(path, columns, meta)
@@ -127,12 +128,12 @@ def _run(path: Path, meta: Meta, needed: str) -> Run:
     if not 1 / _RATE_RATIO <= rate / meta.rate_hz <= _RATE_RATIO:
         raise ValueError(f"{path}, column 't': got {rate:.6g} rows a second, expected rate_hz, {meta.rate_hz:g}")
     signals = _signals(path, columns, meta, needed)
-    said = meta.runs.get(path.stem, {"controller": meta.controller})
+    entry = meta.runs.get(path.stem, {"controller": meta.controller})
     return Run(
         name=path.stem,
-        condition=said.get("condition", path.stem),
-        split=said.get("split"),
-        controller=said["controller"],
+        condition=entry.get("condition", path.stem),
+        split=entry.get("split"),
+        controller=entry["controller"],
         time=time,
         signals=signals,
         other=columns,

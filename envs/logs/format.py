@@ -47,8 +47,8 @@ class Run:
     time: np.ndarray
     """[rows] s, strictly increasing."""
     signals: Mapping[str, np.ndarray]
-    """[rows], [rows, joints] or [rows, components] by the name of the signal, those that were recorded; units as in
-    LOGS.md."""
+    """[rows], [rows, joints] or [rows, components] by the name of the signal, those that were recorded. Angles are in
+    rad, torques in Nm, supply in V, velocities of the base in m/s; phases in cycles."""
     other: Mapping[str, np.ndarray] = field(default_factory=dict)
     """Columns that the format does not know, [rows] by name, unchanged."""
 
@@ -93,19 +93,22 @@ def splits(log: Log) -> dict[str, tuple[Run, ...]]:
     Raises:
       ValueError: a split would be empty, or a condition is in two.
     """
-    said = {}
+    split_of = {}
     for run in log.runs:
-        if run.split is not None and said.setdefault(run.condition, run.split) != run.split:
-            raise ValueError(f"runs: condition '{run.condition}' is in '{said[run.condition]}' and in '{run.split}'")
-    for condition in sorted({run.condition for run in log.runs} - set(said)):
-        counts = list(said.values())
-        said[condition] = min(_SHARES, key=lambda split: counts.count(split) / _SHARES[split])
-    chosen = {split: tuple(run for run in log.runs if said[run.condition] == split) for split in SPLITS}
+        if run.split is not None and split_of.setdefault(run.condition, run.split) != run.split:
+            raise ValueError(
+                f"runs: condition '{run.condition}' is in '{split_of[run.condition]}' and in '{run.split}'"
+            )
+    # The split that is furthest below its share gets the next condition. Sorted, the result does not depend on files.
+    for condition in sorted({run.condition for run in log.runs} - set(split_of)):
+        counts = list(split_of.values())
+        split_of[condition] = min(_SHARES, key=lambda split: counts.count(split) / _SHARES[split])
+    chosen = {split: tuple(run for run in log.runs if split_of[run.condition] == split) for split in SPLITS}
     for split, runs in chosen.items():
         if not runs:
             raise ValueError(
                 f"runs: no run is left for '{split}'; got {len(log.runs)} run(s) of conditions "
-                f"{', '.join(sorted(said))}, expected three conditions that differ in split or leave it open"
+                f"{', '.join(sorted(split_of))}, expected three conditions that differ in split or leave it open"
             )
     return chosen
 

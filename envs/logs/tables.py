@@ -75,6 +75,7 @@ def _read_csv(path: Path) -> dict[str, np.ndarray]:
             raise ValueError(f"{path}, column '{name}': expected a name that is there once")
     if not names:
         raise ValueError(f"{path}: is empty")
+    # Nothing counts as a missing value, so that an empty cell is refused.
     options = pyarrow.csv.ConvertOptions(
         column_types=dict.fromkeys(names, pyarrow.float64()), null_values=[], strings_can_be_null=False
     )

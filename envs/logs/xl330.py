@@ -75,6 +75,7 @@ def _run(path: Path) -> Run:
             raise ValueError(f"entries: got {len(entries)}, expected 2 or more")
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{path}: {type(error).__name__}: {error}") from error
+    # Everything is checked before the first value is used.
     columns = {key: _column(path, entries, key) for key in ("timestamp", *_SIGNALS.values(), *_OTHER)}
     check_time(path, "timestamp", columns["timestamp"])
     for ours, theirs in _SIGNALS.items():

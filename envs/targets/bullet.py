@@ -125,6 +125,7 @@ class Bullet:
         rows = []
         for row in range(len(pushed)):
             world = self._worlds[row]
+            # Only a push changes a velocity between two steps; else the engine keeps its own, which is more exact.
             if np.any(pushed[row] != self._last_qvel[row]):
                 self._set_base_velocity(world, _rotation(np.asarray(state.qpos[row], float)[3:7]), pushed[row])
             rows.append(self._move(world, targets[row]))

@@ -62,6 +62,7 @@ class HostTarget:
         self, key: jax.Array, act: Act, count: int, steps: int, commands: Commands | None = None
     ) -> tuple[Trajectory, Recording]:
         """Measures episodes and records the motion behind them; see `envs.targets.protocol.Target`."""
+        # As a pytree a policy is an argument of one compiled program, not a constant of a new one.
         act = act if isinstance(act, jax.tree_util.Partial) else jax.tree_util.Partial(act)
         keys = jax.vmap(jax.random.split)(jax.random.split(key, count))
         step_keys = np.asarray(jax.vmap(lambda key: jax.random.split(key, steps))(keys[:, 1]))
@@ -85,6 +86,7 @@ class HostTarget:
             records.append(jax.tree.map(np.asarray, record))
             alive &= np.asarray(following.done) == 0
             not_finite |= broke
+            # Also after a fall: masked steps cost little, and the batch keeps its shape.
             state = following
         stacked = jax.tree.map(lambda *leaves: np.stack(leaves, axis=1), *records)
         (obs, action, valid, score), recording = jax.tree.map(jnp.asarray, stacked)

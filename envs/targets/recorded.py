@@ -80,9 +80,9 @@ def episodes(log: Log, steps: int) -> Recorded:
         begins = np.round((ticks["time"] - ticks["time"][pieces[0][0][0]]) / constants.POLICY_DT_S).astype(int)
         for rows, fell in pieces:
             found += [one | {"run": index} for one in _chunks(_steps(ticks, rows, fell), steps, begins[rows[0]])]
-        # A tick is found by a change of the action; where the second one brought no change, the first is not found.
-        unheard = 0.5 < (ticks["time"][0] - run.time[0]) / constants.POLICY_DT_S < 1.5
-        leads.append(2 if unheard else 1)
+        # Among faster rows ticks are found by changes of the action, so the run's first tick is not among them.
+        first_missing = 0.5 < (ticks["time"][0] - run.time[0]) / constants.POLICY_DT_S < 1.5
+        leads.append(2 if first_missing else 1)
     return _as_simulated(jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *found), max(leads))
 
 
@@ -92,7 +92,7 @@ def beginning(recorded: Recorded, steps: int) -> Recorded:
     one = jax.tree.map(lambda leaf: leaf[first], recorded)
     trajectory, commands = one.trajectory, one.commands
     lead = commands.command.shape[1] - trajectory.alive.shape[1]
-    # A fall after the cut does not count.
+    # A fall after the cut does not count: the robot was still up.
     fell = trajectory.fell & ~trajectory.alive[:, steps:].any(axis=1)
     cut = {name: trajectory[name][:, :steps] for name in ("obs", "action", "alive", "score")}
     return one.replace(
@@ -182,12 +182,12 @@ def _ticks(name: str, time: np.ndarray, action: np.ndarray) -> tuple[np.ndarray,
         raise ValueError(f"{name}: 'action' changes {every}, expected every {period:g} s")
     # Where two actions are equal, the second is no change: its tick is filled in. After a long silence the policy has
     # stopped.
-    unheard = [
+    unchanged = [
         np.searchsorted(time, time[row] + np.arange(1, round(gap / period)) * period - 0.5 * width)
         for row, gap in zip(rows, apart, strict=False)
         if gap < _SILENCE * period
     ]
-    rows = np.unique(np.concatenate([rows, *unheard]))
+    rows = np.unique(np.concatenate([rows, *unchanged]))
     steady = np.diff(rows) == round(period / width)
     return rows, bool(steady.mean() >= _STEADY)
 

@@ -51,7 +51,7 @@ def test_an_arm_without_effects_moves_as_in_mujoco(arm, plain):
     np.testing.assert_array_equal(read["tau"].reshape(-1, 5, 2), read["tau"][::5, None] * np.ones((5, 1)))
 
 
-def test_a_hanging_biteno_moves_as_in_mujoco():
+def test_a_suspended_biteno_moves_as_in_mujoco():
     rig = Rig(models.spec("biteno"), constants.JOINTS, rigs.CONTROL_HZ)
     start = np.array([0.0, -0.35, 0.7] * 2)
     target = start + np.array([0.2, 0.3, -0.4, -0.1, -0.2, 0.3])
@@ -240,7 +240,7 @@ def test_a_bent_arm_has_less_inertia_at_its_shoulder(arm):
 # Parameters.
 
 
-def test_nominal_parameters_are_those_that_the_model_has(pendulum):
+def test_the_prior_is_of_parameters_that_the_model_has(pendulum):
     # The pendulum's hinge has no viscous friction.
     expected = {
         Axis("coulomb", "torque_nm", "hinge", 0): 0.0019,
@@ -254,7 +254,7 @@ def test_nominal_parameters_are_those_that_the_model_has(pendulum):
         np.testing.assert_allclose(got[axis], share, rtol=1e-6)
 
 
-def test_nominal_parameters_are_spread_in_coordinates(arm):
+def test_the_prior_standard_deviation_is_in_coordinates(arm):
     got = {(axis.effect, axis.place): spread for axis, spread in arm.rig.prior_sd().items()}
     # A tenth of 0.01 kg m^2 and of 0.05 Nm s/rad, over what a coordinate stands for; the arm has no dry friction.
     np.testing.assert_allclose(got["armature", "shoulder"], 0.001 / 0.11, rtol=1e-6)
@@ -292,7 +292,7 @@ def test_links_show_in_the_joints_that_carry_them(arm):
 # Hanging.
 
 
-def test_a_hung_robot_has_its_joints_and_no_base():
+def test_a_suspended_robot_has_its_joints_and_no_base():
     model = suspended(models.spec("biteno"))
     assert (model.nq, model.nv, model.nkey) == (6, 6, 0)
     assert model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT
