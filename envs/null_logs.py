@@ -88,12 +88,14 @@ def replay(run: Run, model: mujoco.MjModel, joints: Sequence[str], rng: np.rando
     looks = np.cumsum(np.append(rng.integers(0, steps), steps + np.diff(rng.integers(0, 2, count))))
     times = run.time[0] + model.opt.timestep * looks
     last = np.clip(np.searchsorted(run.time, times + 1e-9, side="right") - 1, 0, len(run.time) - 1)
+    # States are recorded where the controller reads them and interpolated at the rows' times below.
     states, torques = np.empty((len(looks), 2, len(joints))), np.empty((len(looks), len(joints)))
     if looks[0]:
         mujoco.mj_step(model, data, int(looks[0]))
     for look, row in enumerate(last):
         q, dq = data.qpos[qpos], data.qvel[dof]
         torque = controller[row].torque(run.signals["target"][row], q, dq) if driven else run.signals["tau"][row]
+        # As damping, back electromotive force acts continuously between two ticks.
         model.dof_damping[dof] = damping + controller.back_emf[row]
         states[look, 0], states[look, 1], torques[look] = q, dq, torque
         data.qfrc_applied[dof] = torque

@@ -90,6 +90,7 @@ class Rig:
         self.control_hz = control_hz
         self.dt = 1.0 / control_hz / np.ceil(1.0 / control_hz / _LONGEST_STEP_S - 1e-9)
         model.opt.timestep = self.dt
+        # Torques are the chain's, applied to the joints directly.
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION
         self.joints = tuple(joints)
         found = [model.joint(name) for name in joints]
@@ -121,6 +122,25 @@ class Rig:
         self.effects = {row.name: row for row in EVERY.values() if self.places[row.on] and row.needs != "free"}
         self.chain = Chain(self.dt, tuple(self.effects.values()), self.qpos, self.dof, self._bodies)
         self.axes = self._describe_axes()
+        # The IMU sits on the body that holds the others.
+        self._gravity = sensing.projected_gravity(jnp.asarray(model.body_quat[1], jnp.float32))
+
+    def check_matches(self, joints: Sequence[str], control_hz: float) -> None:
+        """Checks that the rig can be compared with a log: its joints and rate, and no other joint that may move.
+
+        Args:
+          joints: of the log, in its order.
+          control_hz: rate of the log's controller.
+
+        Raises:
+          ValueError: joints or rate differ, or a joint of the model is not in the log.
+        """
+        if (self.joints, self.control_hz) != (tuple(joints), control_hz):
+            raise ValueError(
+                f"rig: got {self.joints} at {self.control_hz:g} Hz, expected {tuple(joints)} at {control_hz:g} Hz"
+            )
+        if self.others:
+            raise ValueError(f"joints: {', '.join(self.others)} may move too, and the log does not have them")
 
     def scaled(self, scales: Mapping[str, np.ndarray]) -> "Rig":
         """Returns the same robot with other units of its coordinates.
@@ -131,6 +151,7 @@ class Rig:
         Args:
           scales: [places] by the name of the scale (`jaxtune.types.Scale`); a name that is left out stays one unit.
         """
+        # A shallow copy shares the model on the device.
         other = copy.copy(self)
         other._scales = dict(scales)
         other.axes = other._describe_axes()
@@ -298,6 +319,7 @@ class Rig:
             return (data, memory), read
 
         _, read = jax.lax.scan(move, (data, memory), future)
+        # Rows lie between steps of the simulation.
         step, share = segment.row_step, segment.row_share[:, None]
         following = jnp.minimum(step + 1, len(future["sample"]) - 1)
         read = jax.tree.map(lambda x: x[step] + share * (x[following] - x[step]), read)

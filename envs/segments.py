@@ -167,7 +167,9 @@ def cut(runs: Sequence[Run], horizon_s: float, dt: float, bin_s: float = 0.01) -
     if not pieces:
         longest = max(run.time[-1] - run.time[0] for run in runs)
         raise ValueError(f"runs: the longest has {longest:.3g} s, expected more than {horizon_s + HISTORY_S:.3g} s")
+    # As many steps as the longest segment needs, because rows are not exactly periodic.
     after = 1 + max(int(np.ceil((runs[n].time[i + rows] - runs[n].time[i]) / dt - 1e-6)) for n, i in pieces)
+    # Smoothing is done once for a run, not once for a segment.
     prepared = [_Prepared(run, dt) for run in runs]
     segments = [prepared[number].segment(start, start + 1 + np.arange(rows), after) for number, start in pieces]
     names = [name for name in ("q", "dq", "tau", "gravity") if all(name in run.signals for run in runs)]
@@ -250,6 +252,7 @@ class _Prepared:
         grid = begin + dt * np.arange(-before, after)
         # A row's target acts from its time stamp until the next.
         last = np.clip(np.searchsorted(run.time, grid + 1e-9, side="right") - 1, 0, len(run.time) - 1)
+        # Where the controller's ticks lie between rows is unknown; they are counted from the run's first row.
         period = 1.0 / run.controller.rate_hz
         ticks = np.floor((grid - run.time[0]) / period + 1e-6)
         at = (run.time[rows] - begin) / dt

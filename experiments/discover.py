@@ -9,7 +9,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from envs import corrected, models
+from envs import corrected
 from experiments.common import checkpoint
 from experiments.common.checkpoint import write_json
 from experiments.common.cli import bars, console, run
@@ -40,10 +40,10 @@ def main(args: Args) -> None:
     checkpoint.set_up_compiler(checkpoint.a_device_a_core())
     began = time.monotonic()
     _check(args)
-    log = read_logs(args.logs)
+    log, spec = read_logs(args.logs)
     identity = {"logs": [str(path) for path in args.logs], "horizons": args.horizons, "healthy": args.healthy}
     checkpoint.open_run(args.out, identity | {"seed": args.seed})
-    spec, saved = models.spec(log.robot), args.out / "state.json"
+    saved = args.out / "state.json"
     with bars() as progress:
         task = progress.add_task("simulating null logs", total=None)
         question = build_question(log, spec, args.horizons, args.healthy, args.seed)

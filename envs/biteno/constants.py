@@ -82,6 +82,7 @@ ENTRIES = {
             )
             for column, axis in enumerate("xyz")
         ),
+        # Gains and limits alike, so that the torque is a share of the nominal one.
         Entry(
             name="torque_scale",
             kind="actuator",

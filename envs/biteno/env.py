@@ -96,9 +96,8 @@ class Biteno:
         """Starts an episode near the standing pose, at a random phase, under a random command.
 
         Args:
-          params: physical values by name (`jaxtune.mjx`). A reset does not depend on them; the argument is there
-          because
-            a robot with effects may.
+          params: physical values by name (`jaxtune.mjx`). A reset does not depend on them; the argument is
+            there because every function of an episode takes it.
           key: random key; it is also the source of everything random in the episode.
 
         Returns:
@@ -176,7 +175,7 @@ class Biteno:
         )
 
     def _foot_force(self, model: mjx.Model, data: mjx.Data) -> jax.Array:
-        # Nothing but the floor touches a shank.
+        # Only the floor touches a shank, so the external force on it is the floor's on the foot.
         return mjx.rne_postconstraint(model, data)._impl.cfrc_ext[self._shanks, 3:]
 
     def settle(self, state: State, drive: Drive, motion: Motion) -> State:
@@ -219,6 +218,7 @@ class Biteno:
         fell = fallen(readings["gravity"], qpos[2])
         done = (fell | ~finite).astype(jnp.float32)
 
+        # The new command is in the next observation; this step was rewarded by the old one.
         redraw = steps % round(self.config.command_s / constants.POLICY_DT_S) == 0
         moved = moved.replace(
             qacc_warmstart=warmstart,

@@ -66,6 +66,7 @@ def leg_angles(foot: jax.Array) -> jax.Array:
     length = jnp.hypot(x, depth)
     # The two links are equally long, so the knee folds by twice the angle between a link and the line hip to foot.
     knee = 2.0 * jnp.arccos(jnp.clip(length / (2.0 * constants.LINK_M), 0.0, 1.0))
+    # The thigh points away from that line by half the knee's angle.
     hip = -jnp.arctan2(x, depth) - knee / 2.0
     return jnp.stack([jnp.arctan2(y, -z), hip, knee], axis=-1)
 
@@ -176,6 +177,7 @@ def quality(
     use = np.hypot(foot_force[..., 0], foot_force[..., 1])[pressed] / normal[pressed]
     speed = np.hypot(velocity[..., 0], velocity[..., 1])
     trunk = np.asarray(_trunk_velocities(qpos, qvel))
+    # In its first second a robot is still speeding up.
     late = alive & (np.arange(alive.shape[1]) >= 1.0 / constants.POLICY_DT_S)
     weight = late / np.maximum(late.sum(axis=1, keepdims=True), 1)
     walked = late.any(axis=1)

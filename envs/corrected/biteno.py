@@ -45,6 +45,7 @@ class CorrectedBiteno(Biteno):
         self._chain = Chain(step, self._rows, self.joint_qpos, self.joint_dof, np.array(bodies))
 
     def _prepare(self, model: mujoco.MjModel) -> None:
+        # The chain computes the torques; MuJoCo's actuators stay in the model for their gains and limits.
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION
         if any(row.enters == "friction" for row in self._rows):
             dof = self.joint_dof
@@ -59,6 +60,7 @@ class CorrectedBiteno(Biteno):
         state = state.replace(
             memory=self._chain.start(self._values, still, self._controller_inputs(self._model, joint))
         )
+        # Once more, because readings depend on the memories.
         return state.replace(obs=self._observe(state, jax.random.fold_in(key, 1)))
 
     def simulate(self, params: parameters.Params, state: State, drive: Drive) -> Motion:
@@ -88,6 +90,7 @@ class CorrectedBiteno(Biteno):
     def perceive(self, state: State) -> dict[str, jax.Array]:
         """Returns what the sensors read, by signal, with their errors (bias, delay, tilt); see `Biteno.perceive`."""
         readings = super().perceive(state)
+        # While the parent class resets, there are no memories yet.
         if not state.memory:
             return readings
         joint = jnp.stack([readings["joint"], readings["joint_velocity"]])

@@ -97,6 +97,7 @@ def read(folder: Path) -> Correction:
         if not (folder / name).exists():
             raise ValueError(f"model: {folder / name} is missing")
     effects = json.loads((folder / EFFECTS).read_text())["effects"]
+    # Here and not when it is simulated, so that a run is refused before anything is computed.
     for name in effects:
         if name not in EVERY:
             raise ValueError(f"{folder / EFFECTS}: got effect '{name}', expected one of {', '.join(EVERY)}")

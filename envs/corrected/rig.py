@@ -43,12 +43,15 @@ def _corrected_spec(spec: mujoco.MjSpec, rig: Rig, vector: np.ndarray) -> mujoco
         body.mass = float(device.body_mass[number])
         for field in ("ipos", "iquat", "inertia"):
             setattr(body, field, np.asarray(getattr(device, f"body_{field}")[number], float))
+        # The compiler refuses a body that has both forms of inertia.
         body.fullinertia = np.full(6, np.nan)
     for number, name in enumerate(rig.joints):
         dof, joint = rig.dof[number], spec.joint(name)
         joint.armature = float(device.dof_armature[dof])
         joint.damping = [float(device.dof_damping[dof]), *np.ravel(joint.damping)[1:]]
+        # Of the nominal model: the one on the device has a trace of friction, for MJX's sake.
         joint.frictionloss = max(float(model.dof_frictionloss[dof] + values["coulomb"]["torque_nm"][number]), 0.0)
+    # A spec is written as XML only after it compiled.
     spec.compile()
     return spec
 

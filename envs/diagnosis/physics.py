@@ -11,17 +11,17 @@ from itertools import combinations
 import mujoco
 import numpy as np
 
+from envs.diagnosis.disagreement import Disagreement, relative_difference
 from envs.diagnosis.finding import MEASURED, Finding
 from envs.logs import Run
 from envs.segments import quantum_of, smoothed
 
-_MOST = 2.0  # disagreement of two signals that have opposite signs
 # A repair is believed where the disagreement falls by more than both.
 _BETTER = 0.25  # in units of one joint's whole signal
 _SHARE = 0.1  # of the disagreement before
 _MOST_REPAIRS = 3
+_KEPT_ROWS = 1500  # of a long run; more take time and change nothing
 _UNITS = ("degrees", "radians twice", "millinewtonmetres")
-_ROWS = 250  # at which inverse dynamics are evaluated, at most
 _DELAYS_S = (0.004, 0.008, 0.012, 0.016, 0.024, 0.032, 0.045)
 _LEAST_OFFSET_RAD = 0.025
 _LEAST_DRIFT = 0.015
@@ -56,7 +56,7 @@ def physics(run: Run, joints: tuple[str, ...], model: mujoco.MjModel, held: bool
     """
     run, found = _thinned(run), []
     # Coarse encoders make accelerations useless, and with them the comparison with the model.
-    disagreement = _Disagreement(run, joints, model, held and not _is_coarse(run))
+    disagreement = Disagreement(run, joints, model, held and not _is_coarse(run))
     now = disagreement(run)
     for _ in range(_MOST_REPAIRS):
         repairs = _repairs(run, disagreement)
@@ -75,7 +75,7 @@ def physics(run: Run, joints: tuple[str, ...], model: mujoco.MjModel, held: bool
     return [*found, *_drift(run), *_coarse(run, joints), *_clipped(run, joints)]
 
 
-def _best(chains: list[list[_Repair]], run: Run, disagreement: "_Disagreement") -> tuple[list[_Repair], Run, float]:
+def _best(chains: list[list[_Repair]], run: Run, disagreement: Disagreement) -> tuple[list[_Repair], Run, float]:
     """Returns the chain of repairs after which a run disagrees least, the repaired run, and its disagreement."""
     found = [(chain, reduce(lambda run, repair: repair.apply(run), chain, run)) for chain in chains]
     return min(((chain, one, disagreement(one)) for chain, one in found), key=lambda each: each[2])
@@ -87,7 +87,7 @@ def _believed(now: float, then: float) -> bool:
 
 def _thinned(run: Run) -> Run:
     """Keeps no more rows than are needed: the piece in which the joints move most."""
-    count = 6 * _ROWS
+    count = _KEPT_ROWS
     if len(run.time) <= count:
         return run
     moved = np.abs(np.diff(run.signals["q"], axis=0, prepend=run.signals["q"][:1])).sum(axis=1).cumsum()
@@ -96,86 +96,10 @@ def _thinned(run: Run) -> Run:
     return replace(run, time=run.time[rows], signals={name: values[rows] for name, values in run.signals.items()})
 
 
-class _Disagreement:
-    """How much a run disagrees with itself and with the model: parts from 0 to 2 for every joint, summed.
-
-    Args:
-      run: as it was read; what is not in it is not examined.
-      joints: names of the joints, in the log's order.
-      model: of the robot.
-      dynamics: whether torques are compared with the model's inverse dynamics.
-    """
-
-    def __init__(self, run: Run, joints: tuple[str, ...], model: mujoco.MjModel, dynamics: bool):
-        self._model, self._data, self.dynamics = model, mujoco.MjData(model), dynamics
-        self._driven = "target" in run.signals and run.controller.kind == "pd"
-        places = [model.joint(name) for name in joints]
-        self._qpos = np.array([place.qposadr[0] for place in places])
-        self._dof = np.array([place.dofadr[0] for place in places])
-        limited = np.array([bool(model.jnt_limited[place.id]) for place in places])
-        span = np.array([place.range for place in places])
-        self._range = np.where(limited[:, None], span, [-np.inf, np.inf]).T
-
-    def __call__(self, run: Run) -> float:
-        """Sums all parts over all joints."""
-        return float(sum(part.sum() for part in self.parts(run).values()))
-
-    def parts(self, run: Run) -> dict[str, np.ndarray]:
-        """Computes the parts of the disagreement by name, [joints] each; those whose signals are there."""
-        position, slope = np.moveaxis(smoothed(replace(run, signals={"q": run.signals["q"]})), 1, 0)
-        found = {}
-        if "dq" in run.signals:
-            found["velocity"] = _apart(run.signals["dq"], slope)
-        commanded = self.commanded(run)
-        if commanded is not None and "tau" in run.signals:
-            found["torque"] = _apart(run.signals["tau"], commanded)
-        if "target" in run.signals:
-            found["target"] = 0.5 * _apart(run.signals["target"], position)
-        low, high = self._range
-        found["range"] = _MOST * ((position < low - 0.1) | (position > high + 0.1)).mean(axis=0)
-        given = commanded if commanded is not None else run.signals.get("tau")
-        if self.dynamics and given is not None:
-            needed, rows = self.needed(run, position, slope)
-            found["dynamics"] = _apart(_together(given)[rows], needed)
-        return found
-
-    def commanded(self, run: Run) -> np.ndarray | None:
-        """Torque that the controller commanded, [rows, joints] Nm; None of a servo or where there are no targets."""
-        if not self._driven:
-            return None
-        speed = run.signals["dq"] if "dq" in run.signals else smoothed(run)[:, 1]
-        return run.impedance().torque(run.signals["target"], run.signals["q"], speed)
-
-    def needed(self, run: Run, position: np.ndarray, slope: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Torque that the model needs for the motion, [some rows, joints] Nm, and which rows these are."""
-        acceleration = np.gradient(_together(slope), run.time, axis=0)
-        # At the ends the fit behind the smoothed states is one-sided.
-        rows = np.unique(np.linspace(10, len(run.time) - 11, _ROWS).astype(int))
-        found = np.empty((len(rows), len(self._dof)))
-        for index, row in enumerate(rows):
-            self._data.qpos[self._qpos], self._data.qvel[self._dof] = position[row], slope[row]
-            self._data.qacc[self._dof] = acceleration[row]
-            mujoco.mj_inverse(self._model, self._data)
-            found[index] = self._data.qfrc_inverse[self._dof]
-        return found, rows
-
-
-def _together(values: np.ndarray) -> np.ndarray:
-    """Moving mean over seven rows, [rows, joints]."""
-    kernel = np.ones(7) / 7.0
-    return np.stack([np.convolve(column, kernel, "same") for column in values.T], axis=1)
-
-
-def _apart(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Rms difference of two signals [rows, joints], over the mean of their rms, [joints]; at most 2."""
-    difference = np.sqrt(((one - other) ** 2).mean(axis=0))
-    size = 0.5 * (np.sqrt((one**2).mean(axis=0)) + np.sqrt((other**2).mean(axis=0)))
-    return np.minimum(difference / np.maximum(size, 1e-9), _MOST)
-
-
-def _repairs(run: Run, disagreement: _Disagreement) -> list[_Repair]:
+def _repairs(run: Run, disagreement: Disagreement) -> list[_Repair]:
     """Lists every repair to be tried."""
     count = run.signals["q"].shape[1]
+    # An error may be in one signal, in all that sensors give (a driver's mistake), or in targets as well.
     measured = tuple(name for name in MEASURED if name in run.signals)
     groups = {"measured": measured} | {name: (name,) for name in (*MEASURED, "target") if name in run.signals}
     groups["all"] = tuple(dict.fromkeys([*measured, *(["target"] if "target" in run.signals else [])]))
@@ -188,6 +112,7 @@ def _repairs(run: Run, disagreement: _Disagreement) -> list[_Repair]:
         for joint in range(count):
             sign = np.where(np.arange(count) == joint, -1.0, 1.0)
             found.append(_Repair("flipped sign", label, (joint,), -1.0, _on(names, lambda v, sign=sign: v * sign)))
+        # Torques have no angles in them, whatever group they are in.
         angles = tuple(name for name in names if name != "tau")
         for kind, factor in (("degrees", np.pi / 180.0), ("radians twice", 180.0 / np.pi)) if angles else ():
             found.append(_Repair(kind, label, (), factor, _on(angles, lambda v, factor=factor: v * factor)))
@@ -218,7 +143,7 @@ def _earlier(names: tuple[str, ...], rows: int, run: Run) -> Run:
     return replace(run, time=run.time[:-rows], signals=signals)
 
 
-def _offsets(run: Run, disagreement: _Disagreement) -> list[_Repair]:
+def _offsets(run: Run, disagreement: Disagreement) -> list[_Repair]:
     """Repairs of a constant offset of positions.
 
     An offset shows as a constant difference of the controller's torque from what the model needs, kp times the offset.
@@ -228,6 +153,7 @@ def _offsets(run: Run, disagreement: _Disagreement) -> list[_Repair]:
         return []
     position, slope = np.moveaxis(smoothed(replace(run, signals={"q": run.signals["q"]})), 1, 0)
     needed, rows = disagreement.needed(run, position, slope)
+    # A torque at its limit, or of motors that are off, says nothing of the offset.
     free = np.abs(commanded[rows]) < 0.98 * run.controller.gains["torque_limit_nm"]
     on = run.signals.get("enabled", np.ones(len(run.time)))[rows, None] > 0
     lacks = np.where(free & on, commanded[rows] - needed, np.nan)
@@ -235,6 +161,7 @@ def _offsets(run: Run, disagreement: _Disagreement) -> list[_Repair]:
     for joint, column in enumerate(lacks.T):
         if np.isnan(column).all():
             continue
+        # The median, because friction adds to the difference with both signs.
         offset = float(np.nanmedian(column)) / run.controller.gains["kp"][joint]
         if abs(offset) >= _LEAST_OFFSET_RAD:
             shift = np.where(np.arange(len(run.signals["q"][0])) == joint, offset, 0.0)
@@ -249,7 +176,7 @@ def _drift(run: Run) -> list[Finding]:
     slope = smoothed(replace(run, signals={"q": run.signals["q"]}))[:, 1]
     ratio = (run.signals["dq"] * slope).sum(axis=0) / np.maximum((slope**2).sum(axis=0), 1e-12)
     drift = float(np.median(ratio) - 1.0)
-    apart = [_apart(run.signals["dq"], slope * factor).mean() for factor in (1.0, np.median(ratio))]
+    apart = [relative_difference(run.signals["dq"], slope * factor).mean() for factor in (1.0, np.median(ratio))]
     if abs(drift) < _LEAST_DRIFT or np.ptp(ratio) > 0.5 * abs(drift) or apart[1] > 0.6 * apart[0]:
         return []
     speed = "fast" if drift > 0 else "slow"

@@ -1,9 +1,9 @@
 """Measured logs: a folder of `meta.yaml` and runs, read with every check, or refused with file, row and column.
 
-A log says how a robot was held, how its joints were controlled and what was recorded; a run is one continuous recording
-(`run_000.csv`, `.npz`, `.parquet`, or a ROS bag). Whatever names, units and signs a log has, what is read has ours:
-joint positions, velocities and targets in rad, torques in Nm, all about the model's axes; `units` and `sign` speak of
-nothing else. Nothing is dropped, reordered or filled.
+A log records how a robot was held, how its joints were controlled and what was measured. A run is one continuous
+recording: `run_000.csv`, `.npz`, `.parquet`, or a ROS bag. Whatever names, units and signs a log has, `read` returns
+the model's: joint positions, velocities and targets in rad, torques in Nm, all about the model's axes. `units` and
+`sign` of `meta.yaml` concern these four signals alone. Nothing is dropped, reordered or filled.
 """
 
 from envs.logs.controller import Controller, Impedance

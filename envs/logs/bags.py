@@ -1,16 +1,16 @@
-"""ROS 1 and ROS 2 bags and MCAP files as columns; `columns` in `meta.yaml` says where each of them is found:
+"""Reads ROS 1 and ROS 2 bags and MCAP files. `columns` in `meta.yaml` says where each column is found:
 
     columns:
       q.left_knee: /joint_states.position[left_knee]    # its place in the message's own `name`
       gyro.x: /imu.angular_velocity.x
       action.left_knee: /policy.data[2]
 
-The rows are the messages of one topic: that of the actions where there is one, else that of the positions. What other
-topics say is sampled there; what else a policy says is of the tick to whose action it is nearest. Time is the stamp in
-the headers where all messages have one, else that of the recorder; it starts at zero. A run begins where the last of
-its topics begins and ends where the first measured one ends: rows go on for a while after the last action, because a
-policy may fall silent before its robot falls. Rows in a hole of a measured topic are left out, which leaves a hole in
-the time stamps.
+The rows are the messages of one topic: that of the actions where there is one, else that of the positions. Other topics
+are sampled at these times; other messages of a policy belong to the tick whose action is nearest. Time is the stamp in
+the headers where all messages have one, else the recorder's; it starts at zero. A run begins where the last of its
+topics begins and ends where the first measured one ends. Rows continue for a while after the last action, because a
+policy may stop before its robot falls. Rows in a hole of a measured topic are left out, which leaves a hole in the time
+stamps.
 """
 
 import re
@@ -21,24 +21,24 @@ from typing import Any
 
 import numpy as np
 
-from envs.logs.sampling import ASKED, HELD, SAID, held, sampled
+from envs.logs.sampling import COMMANDED, HELD, SENT, held, sampled
 
 SUFFIXES = (".bag", ".mcap", ".db3")
-"""Of files; a folder with a `metadata.yaml` is a bag as well."""
+"""Suffixes of bags that are files; a folder with a `metadata.yaml` is a bag as well."""
 
 _PLACE = re.compile(r"(?P<topic>/[^.\[\]\s]+)\.(?P<field>\w+(?:\.\w+)*)(?:\[(?P<index>[^\[\]]+)\])?")
-_HOLE = 3.5  # times a topic's period
-_MORE_ROWS = 500  # after the last message of the topic that gives them, at most
+_HOLE = 3.5  # periods of a topic without a message that count as a hole
+_MORE_ROWS = 500  # at most, after the last message of the topic that gives the rows
 
 
 def is_bag(path: Path) -> bool:
-    """Whether a path is one of these."""
+    """Returns whether a path is a ROS bag or MCAP file, by its suffix, or a ROS 2 bag's folder."""
     return (path.suffix in SUFFIXES and path.is_file()) or (path / "metadata.yaml").is_file()
 
 
 @dataclass(frozen=True)
 class _Place:
-    """Where a column is found."""
+    """Where a column is found in a bag: topic, field of the message, and index in the field."""
 
     topic: str
     fields: tuple[str, ...]
@@ -56,7 +56,7 @@ class _Place:
 
 @dataclass(frozen=True)
 class _Topic:
-    """What was heard on a topic."""
+    """Messages of a topic: their times and the values of the columns found on it."""
 
     time: np.ndarray
     """[messages] ns"""
@@ -65,7 +65,7 @@ class _Topic:
 
     @property
     def signals(self) -> set[str]:
-        """Of whose columns some are heard on it."""
+        """Names of the signals that have columns on it."""
         return {_signal(ours) for ours in self.values}
 
 
@@ -74,14 +74,14 @@ def _signal(column: str) -> str:
 
 
 def read_bag(path: Path, columns: Mapping[str, str]) -> dict[str, np.ndarray]:
-    """Reads the columns that are asked for.
+    """Reads the columns that `meta.yaml` maps to places in a bag.
 
     Args:
       path: of the bag.
-      columns: ours to theirs.
+      columns: place in the bag by the format's name of the column.
 
     Returns:
-      [rows] by their name, and `t`.
+      Columns [rows] by their place, and `t` in s.
 
     Raises:
       ValueError: names the topic, and the message (from 1) and field where it is about one.
@@ -98,25 +98,25 @@ def read_bag(path: Path, columns: Mapping[str, str]) -> dict[str, np.ndarray]:
     of_rows = [ours for first in ("action.", "q.") for ours in places if ours.startswith(first)]
     if not of_rows:
         raise ValueError(f"{path}: columns: got none of 'q.*', expected where in the bag the positions are")
-    topics = _heard(path, places)
+    topics = _read_topics(path, places)
     ticks = places[of_rows[0]].topic
     period, start, time = _rows(path, topics, ticks)
     found = {"t": time}
     for name, topic in topics.items():
         at = 1e-9 * (topic.time - start)
-        # Said in one tick, on two topics: one of them is heard first.
-        late = 0.5 * period if name != ticks and topics[ticks].signals & {*SAID} else 0.0
+        # What a policy sends in one tick on two topics arrives at slightly different times, in either order.
+        late = 0.5 * period if name != ticks and topics[ticks].signals & {*SENT} else 0.0
         for ours, values in topic.values.items():
             if _signal(ours) in HELD:
-                found[columns[ours]] = held(at, values, time + late if _signal(ours) in SAID else time)
+                found[columns[ours]] = held(at, values, time + late if _signal(ours) in SENT else time)
             else:
                 found[columns[ours]] = sampled(at, values, time, period)
     return found
 
 
 def _rows(path: Path, topics: Mapping[str, _Topic], of_rows: str) -> tuple[float, int, np.ndarray]:
-    """The period of the rows and the first stamp, ns, and times [rows], s from there."""
-    measured = {name: topic for name, topic in topics.items() if topic.signals - {*ASKED}}
+    """Returns the period of the rows in s, the first stamp in ns, and the times [rows] in s from there."""
+    measured = {name: topic for name, topic in topics.items() if topic.signals - {*COMMANDED}}
     for name in dict.fromkeys([of_rows, *measured]):
         if len(topics[name].time) < 2:
             raise ValueError(f"{path}, topic '{name}': got 1 message, expected 2 or more")
@@ -140,34 +140,34 @@ def _rows(path: Path, topics: Mapping[str, _Topic], of_rows: str) -> tuple[float
     return float(np.median(np.diff(time))), int(stamps[0]), time
 
 
-def _heard(path: Path, places: Mapping[str, _Place]) -> dict[str, _Topic]:
-    """All messages of the topics that are needed."""
-    # An extra: not everyone has bags.
+def _read_topics(path: Path, places: Mapping[str, _Place]) -> dict[str, _Topic]:
+    """Reads all messages of the topics that are needed."""
+    # rosbags is an optional dependency.
     try:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     except ModuleNotFoundError as error:
-        raise ValueError(f"{path}: a bag, which needs rosbags; expected `pip install 'jaxtune[bags]'`") from error
+        raise ValueError(f"{path}: reading a bag needs rosbags: pip install 'jaxtune[bags]'") from error
     store = get_typestore(Stores.ROS1_NOETIC if path.suffix == ".bag" else Stores.ROS2_HUMBLE)
-    heard = {place.topic: [] for place in places.values()}
+    found = {place.topic: [] for place in places.values()}
     try:
         with AnyReader([path], default_typestore=store) as reader:
-            for topic in heard:
+            for topic in found:
                 if topic not in reader.topics:
                     raise LookupError(f"there is no topic '{topic}', expected some of {', '.join(reader.topics)}")
-            connections = [one for one in reader.connections if one.topic in heard]
+            connections = [one for one in reader.connections if one.topic in found]
             for connection, recorded, raw in reader.messages(connections):
-                messages = heard[connection.topic]
+                messages = found[connection.topic]
                 message = reader.deserialize(raw, connection.msgtype)
                 messages.append(_read(message, recorded, connection.topic, len(messages) + 1, places))
     except Exception as error:  # a damaged bag fails in many ways
         raise ValueError(f"{path}: {type(error).__name__}: {error}") from error
-    stamped = all(stamp for messages in heard.values() for stamp, _, _ in messages)
-    return {topic: _topic(path, topic, messages, 0 if stamped else 1, places) for topic, messages in heard.items()}
+    stamped = all(stamp for messages in found.values() for stamp, _, _ in messages)
+    return {topic: _topic(path, topic, messages, 0 if stamped else 1, places) for topic, messages in found.items()}
 
 
 def _read(message: Any, recorded: int, topic: str, number: int, places: Mapping[str, _Place]) -> tuple:
-    """Stamp, time of recording, ns, and values in the order of the topic's places."""
+    """Returns stamp and time of recording of a message, in ns, and its values in the order of the topic's places."""
     stamp = getattr(getattr(message, "header", None), "stamp", None)
     values = []
     for place in places.values():

@@ -1,4 +1,4 @@
-"""Logs in and out."""
+"""Reads and writes logs: a folder of `meta.yaml` and runs."""
 
 from pathlib import Path
 
@@ -19,16 +19,19 @@ from envs.logs.meta import Meta
 from envs.logs.tables import READERS, WRITERS, check_time, check_values, refuse_first
 from envs.models import BUILT_IN
 
-_UNIT_NORM = 0.05  # how far a unit vector may be from one
-_RATE_RATIO = 2.0  # between nominal and recorded rate
+_UNIT_NORM = 0.05  # tolerance of the length of unit vectors
+_RATE_RATIO = 2.0  # between nominal and recorded rate, at most
 
 
 def read(folder: Path, measured: bool = True) -> Log:
-    """Reads a log.
+    """Reads a log and checks everything about it before anything is computed.
 
     Args:
-      folder: of meta.yaml and the runs.
-      measured: False where nothing was yet, and these are the targets that a robot is to play.
+      folder: with `meta.yaml` and the runs.
+      measured: True for a measured log, which needs positions. False for targets that a robot is still to play.
+
+    Returns:
+      The log in the model's names, units and signs.
 
     Raises:
       ValueError: names the file, the row (of data, from 1) or the key, what was found and what was expected.
@@ -46,7 +49,7 @@ def read(folder: Path, measured: bool = True) -> Log:
         raise ValueError(f"{folder}: no runs; expected run_*.csv, .npz, .parquet or a bag")
     for stem in stems:
         if stems.count(stem) > 1:
-            raise ValueError(f"{folder}: run '{stem}' is there twice, expected one file of a run")
+            raise ValueError(f"{folder}: run '{stem}' is there twice, expected one file for each run")
     for name in meta.runs:
         if name not in stems:
             raise ValueError(f"{meta.path}: runs.{name}: there is no such run; found {', '.join(stems)}")
@@ -61,11 +64,17 @@ def read(folder: Path, measured: bool = True) -> Log:
 
 
 def write(log: Log, folder: Path, suffix: str = ".csv") -> None:
-    """Writes a log in our units and names; `read` gives it back.
+    """Writes a log in the model's names, units and signs, from which `read` returns the same log.
+
+    `meta.yaml` is written last and appears at once, so that another program which waits for it finds all runs complete.
+
+    Args:
+      log: to write.
+      folder: to write to; new or empty.
+      suffix: of the runs' files: .csv, .npz or .parquet.
 
     Raises:
-      ValueError: the folder holds something already, the suffix is none of ours, or a run's name does not begin with
-        `run_`.
+      ValueError: the folder is not empty, the suffix is unknown, or a run's name does not begin with `run_`.
     """
     folder = Path(folder)
     if suffix not in WRITERS:
@@ -94,7 +103,7 @@ def write(log: Log, folder: Path, suffix: str = ".csv") -> None:
             names = column_names(signal, log.joints)
             columns |= dict(zip(names, values.reshape(len(run.time), -1).T, strict=True))
         WRITERS[suffix](folder / f"{run.name}{suffix}", columns)
-    # Who finds it finds it whole, and all runs.
+    # Renaming makes it appear complete, and after all runs.
     draft = folder / "meta.yaml.partial"
     draft.write_text(yaml.safe_dump(meta, sort_keys=False))
     draft.rename(folder / "meta.yaml")
@@ -107,6 +116,7 @@ def _as_meta(controller: Controller) -> dict:
 
 def _run(path: Path, meta: Meta, needed: str) -> Run:
     columns = read_bag(path, meta.columns) if is_bag(path) else READERS[path.suffix](path)
+    # All columns, also those that the format does not know: a NaN in one of them is a damaged file.
     for name, values in columns.items():
         refuse_first(path, name, values, ~np.isfinite(values), "a finite number")
     columns = _rename(path, columns, meta)
@@ -118,12 +128,12 @@ def _run(path: Path, meta: Meta, needed: str) -> Run:
     if not 1 / _RATE_RATIO <= rate / meta.rate_hz <= _RATE_RATIO:
         raise ValueError(f"{path}, column 't': got {rate:.6g} rows a second, expected rate_hz, {meta.rate_hz:g}")
     signals = _signals(path, columns, meta, needed)
-    said = meta.runs.get(path.stem, {"controller": meta.controller})
+    entry = meta.runs.get(path.stem, {"controller": meta.controller})
     return Run(
         name=path.stem,
-        condition=said.get("condition", path.stem),
-        split=said.get("split"),
-        controller=said["controller"],
+        condition=entry.get("condition", path.stem),
+        split=entry.get("split"),
+        controller=entry["controller"],
         time=time,
         signals=signals,
         other=columns,
@@ -131,7 +141,7 @@ def _run(path: Path, meta: Meta, needed: str) -> Run:
 
 
 def _signals(path: Path, columns: dict[str, np.ndarray], meta: Meta, needed: str) -> dict[str, np.ndarray]:
-    """Takes the signals out of the columns, in our units."""
+    """Takes the signals out of the columns and converts them to the model's units and signs."""
     signals = {}
     for signal in (*JOINT_SIGNALS, *VECTOR_SIGNALS, *SCALAR_SIGNALS):
         names = column_names(signal, meta.joints)
@@ -140,7 +150,7 @@ def _signals(path: Path, columns: dict[str, np.ndarray], meta: Meta, needed: str
             continue
         for name in names:
             if name not in columns:
-                raise ValueError(f"{path}, column '{name}': is missing, where '{there[0]}' is there")
+                raise ValueError(f"{path}, column '{name}': is missing, although '{there[0]}' is there")
         values = [columns.pop(name) for name in names]
         for name, one in zip(names, values, strict=True):
             check_values(path, signal, meta.columns.get(name, name), one)
@@ -161,12 +171,12 @@ def _signals(path: Path, columns: dict[str, np.ndarray], meta: Meta, needed: str
 
 
 def _rename(path: Path, columns: dict[str, np.ndarray], meta: Meta) -> dict[str, np.ndarray]:
-    """Foreign names to ours."""
+    """Renames foreign columns to the format's names."""
     for ours, theirs in meta.columns.items():
         if theirs not in columns:
-            raise ValueError(f"{path}, column '{theirs}': is missing, and {meta.path} calls it '{ours}'")
+            raise ValueError(f"{path}, column '{theirs}': is missing, which {meta.path} maps to '{ours}'")
         if ours in columns and ours not in meta.columns.values():
-            raise ValueError(f"{path}, column '{ours}': is there, and {meta.path} calls '{theirs}' so")
+            raise ValueError(f"{path}, column '{ours}': is there, although {meta.path} maps '{theirs}' to that name")
     foreign = {theirs: ours for ours, theirs in meta.columns.items()}
     columns = {foreign.get(name, name): values for name, values in columns.items()}
     if "t" not in columns:

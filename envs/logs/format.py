@@ -1,4 +1,4 @@
-"""What a log is: names of signals and controllers, runs, splits."""
+"""The format of a log: names of its signals, runs, conditions and splits."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -25,29 +25,35 @@ VECTOR_SIGNALS = {
 """Signals with a column for every component."""
 
 SCALAR_SIGNALS = ("enabled", "volts")
+"""Signals with one column."""
+
 SPLITS = ("train", "select", "sealed")
+"""Parts of a log: what is fitted, the validation set (select), and the held-out test that is read once (sealed)."""
+
 _SHARES = dict(zip(SPLITS, (2, 1, 1), strict=True))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Run:
-    """One continuous recording."""
+    """One continuous recording: its controller, time stamps and signals, in the model's names, units and signs."""
 
     name: str
     condition: str
-    """What it has in common with other runs; its own name where nothing was said."""
+    """Label that runs of one experiment share (a motion, a gain); the run's own name where `meta.yaml` has none. Runs
+    of one condition are always in the same split."""
     split: str | None
-    """train, select or sealed, where the log says so."""
+    """train, select or sealed, where `meta.yaml` sets it."""
     controller: Controller
     time: np.ndarray
     """[rows] s, strictly increasing."""
     signals: Mapping[str, np.ndarray]
-    """[rows], [rows, joints] or [rows, components] by the name of the signal; those that were recorded."""
+    """[rows], [rows, joints] or [rows, components] by the name of the signal, those that were recorded. Angles are in
+    rad, torques in Nm, supply in V, velocities of the base in m/s; phases in cycles."""
     other: Mapping[str, np.ndarray] = field(default_factory=dict)
-    """Columns that the format does not know, [rows] by name, as they are."""
+    """Columns that the format does not know, [rows] by name, unchanged."""
 
     def impedance(self) -> Impedance:
-        """The controller at every row, [rows, joints], switched off where the motors were.
+        """Returns the controller's impedance at every row, [rows, joints]; zero where the motors were switched off.
 
         A run without targets, whose torques were sent directly, has no stiffness, no damping and no limit.
         """
@@ -60,42 +66,59 @@ class Run:
 
 @dataclass(frozen=True, kw_only=True)
 class Log:
-    """Runs of one robot."""
+    """Runs of one robot, as `envs.logs.read` returns them."""
 
     robot: str
-    """A built-in model, or the path of an MJCF file."""
+    """Name of a built-in model, or the path of an MJCF file (`envs.models.spec`)."""
     base: str
-    """fixed or free."""
+    """`fixed` (suspended or clamped) or `free` (on the ground)."""
     rate_hz: float
+    """Nominal rate of the rows; time stamps count."""
     joints: tuple[str, ...]
+    """Names of the joints, in the order of the signals' last axis."""
     policy: Mapping[str, Any] | None
+    """`rate_hz`, `action_scale` and `base` of the policy that was running; None where none was."""
     runs: tuple[Run, ...]
 
 
 def splits(log: Log) -> dict[str, tuple[Run, ...]]:
-    """Runs by split. Conditions without one fill up train, select and sealed, in shares of 2 to 1 to 1.
+    """Divides the runs of a log into train, select (validation) and sealed (held-out test).
+
+    Conditions for which the log sets no split are distributed over the three in shares of 2 to 1 to 1, in the order of
+    their names. All runs of a condition go together, so that the test is on conditions that were not fitted.
+
+    Returns:
+      Runs by split; each split has one or more.
 
     Raises:
       ValueError: a split would be empty, or a condition is in two.
     """
-    said = {}
+    split_of = {}
     for run in log.runs:
-        if run.split is not None and said.setdefault(run.condition, run.split) != run.split:
-            raise ValueError(f"runs: condition '{run.condition}' is in '{said[run.condition]}' and in '{run.split}'")
-    for condition in sorted({run.condition for run in log.runs} - set(said)):
-        counts = list(said.values())
-        said[condition] = min(_SHARES, key=lambda split: counts.count(split) / _SHARES[split])
-    chosen = {split: tuple(run for run in log.runs if said[run.condition] == split) for split in SPLITS}
+        if run.split is not None and split_of.setdefault(run.condition, run.split) != run.split:
+            raise ValueError(
+                f"runs: condition '{run.condition}' is in '{split_of[run.condition]}' and in '{run.split}'"
+            )
+    # The split that is furthest below its share gets the next condition. Sorted, the result does not depend on files.
+    for condition in sorted({run.condition for run in log.runs} - set(split_of)):
+        counts = list(split_of.values())
+        split_of[condition] = min(_SHARES, key=lambda split: counts.count(split) / _SHARES[split])
+    chosen = {split: tuple(run for run in log.runs if split_of[run.condition] == split) for split in SPLITS}
     for split, runs in chosen.items():
         if not runs:
             raise ValueError(
                 f"runs: no run is left for '{split}'; got {len(log.runs)} run(s) of conditions "
-                f"{', '.join(sorted(said))}, expected three conditions that differ in split or leave it open"
+                f"{', '.join(sorted(split_of))}, expected three conditions that differ in split or leave it open"
             )
     return chosen
 
 
 def column_names(signal: str, joints: Sequence[str]) -> list[str]:
-    """Columns of a signal, in the order of its last axis."""
+    """Lists the columns of a signal in a file, in the order of its last axis (`q.left_hip`, `gyro.x`, `volts`).
+
+    Args:
+      signal: name of a signal, one of the three groups above.
+      joints: names of the joints of the log.
+    """
     parts = joints if signal in JOINT_SIGNALS else VECTOR_SIGNALS.get(signal)
     return [signal] if parts is None else [f"{signal}.{part}" for part in parts]

@@ -1,4 +1,4 @@
-"""`meta.yaml`, checked key by key."""
+"""Reads `meta.yaml` and checks it key by key."""
 
 import difflib
 import reprlib
@@ -20,7 +20,7 @@ from envs.logs.format import (
 )
 
 _ANGLE = {"rad": 1.0, "deg": np.pi / 180.0}
-_LARGEST = 1e300  # an integer may be too large for a float
+_LARGEST = 1e300  # YAML's integers may be too large for a float
 _TORQUE = {"Nm": 1.0, "mNm": 1e-3}
 _META = {
     "robot": True,
@@ -37,13 +37,13 @@ _META = {
 
 
 _short = reprlib.Repr()
-"""A few aliases of YAML are billions of values, which nobody can read."""
+"""Shortens values in error messages: a few aliases of YAML can be billions of values."""
 _short.maxlevel = 2
 _short.maxstring = _short.maxother = _short.maxlong = 200
 
 
 class _Loader(yaml.SafeLoader):
-    """YAML in which no key comes twice; the safe loader keeps the last one in silence."""
+    """Loads YAML and refuses keys that are there twice, of which the safe loader silently keeps the last."""
 
     def construct_mapping(self, node, deep=False):
         keys = [self.construct_object(key, deep=True) for key, _ in node.value]
@@ -56,7 +56,15 @@ class _Loader(yaml.SafeLoader):
 
 
 class Meta:
-    """What `meta.yaml` of a folder says."""
+    """The content of a folder's `meta.yaml`, checked, with defaults filled in.
+
+    Args:
+      folder: of the log.
+      robots: joints that may be logged, by the name of the built-in robot.
+
+    Raises:
+      ValueError: names the file and the key, what was found and what was expected.
+    """
 
     def __init__(self, folder: Path, robots: Mapping[str, Sequence[str]]):
         self.path = folder / "meta.yaml"
@@ -116,7 +124,7 @@ class Meta:
             read["split"] = self._one_of(f"{where}.split", entry["split"], SPLITS)
         if "controller" in entry:
             override = self._mapping(f"{where}.controller", entry["controller"], None)
-            # Another type of controller has other numbers: nothing of the log's own is left.
+            # Another type of controller has other numbers, so it inherits none from the log's own controller.
             base = {} if "type" in override else self._controller
             read["controller"] = self._read_controller(f"{where}.controller", {**base, **override})
         return read
@@ -138,7 +146,7 @@ class Meta:
         return np.array([self._number(where, one, zero=name in ("kp", "kd")) for one in values])
 
     def _robot(self, folder: Path, name: str, robots: Mapping[str, Sequence[str]]) -> tuple[str, Sequence[str]]:
-        """Name or path, and the joints that may be logged."""
+        """Resolves a robot to its name or path, and the joints that may be logged."""
         if name in robots:
             return name, robots[name]
         path = folder / name
@@ -160,7 +168,7 @@ class Meta:
         return names
 
     def _mapping(self, where: str, value: Any, keys: Mapping[str, bool | None] | None) -> dict:
-        """A mapping with these keys and no others; those that are True must be there."""
+        """Checks for a mapping with these keys and no others; keys that are True must be there."""
         value = {} if value is None and where else value
         if not isinstance(value, dict):
             self._refuse(where or "the file", value, "a mapping")
@@ -181,7 +189,7 @@ class Meta:
         return value
 
     def _number(self, where: str, value: Any, *, zero: bool = False) -> float:
-        """A finite number, positive or, where it may be, zero."""
+        """Checks for a finite number that is positive or, with `zero`, not negative."""
         if (
             isinstance(value, bool)
             or not isinstance(value, int | float)

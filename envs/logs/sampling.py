@@ -1,27 +1,45 @@
-"""What was recorded at some times, at other times."""
+"""Resamples recorded signals at other times."""
 
 import numpy as np
 
-SAID = ("action", "target", "phase")
-"""What a policy says in a tick."""
-ASKED = (*SAID, "enabled", "cmd")
-"""Signals that stay until they change."""
-HELD = (*ASKED, "contact", "quat")
-"""These, and what means nothing between two rows: never filtered, never mixed."""
+SENT = ("action", "target", "phase")
+"""Signals that a policy sends in a tick."""
+COMMANDED = (*SENT, "enabled", "cmd")
+"""Signals of a command, which hold until the next one is sent."""
+HELD = (*COMMANDED, "contact", "quat")
+"""These, and signals that cannot be interpolated; the last value counts, they are never filtered or averaged."""
 
-_FASTER = 1.25  # than it is asked for, from which on a signal is filtered
+_FASTER = 1.25  # ratio of recorded to wanted rate, from which on a signal is averaged
 
 
 def held(time: np.ndarray, values: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """The last of values [rows, ...] at other times [...]; the first one before any."""
+    """Samples a signal that holds until it changes: the last value at or before each time.
+
+    Args:
+      time: [rows] s, increasing.
+      values: [rows, ...].
+      at: other times; before the first row its value is taken.
+
+    Returns:
+      Values at these times, [times, ...].
+    """
     return values[np.maximum(np.searchsorted(time, at, side="right") - 1, 0)]
 
 
 def sampled(time: np.ndarray, values: np.ndarray, at: np.ndarray, period_s: float) -> np.ndarray:
-    """Measured values [rows, ...] at other times [times], `period_s` apart.
+    """Samples a measured signal at other times.
 
-    On the line between two rows; where rows come faster than they are asked for, the mean of that line over a period,
-    or what is too fast to be seen would look slow.
+    Values are interpolated linearly between two rows. Where the signal was recorded faster than it is wanted, the line
+    is averaged over one period around each time, or else fast motion would be aliased into slow motion.
+
+    Args:
+      time: [rows] s, increasing.
+      values: [rows, ...].
+      at: [times] s.
+      period_s: time between two of them.
+
+    Returns:
+      Values at these times, [times, ...].
     """
     left = np.clip(np.searchsorted(time, at, side="right") - 1, 0, len(time) - 2)
     if np.median(np.diff(time)) * _FASTER >= period_s:
@@ -32,7 +50,7 @@ def sampled(time: np.ndarray, values: np.ndarray, at: np.ndarray, period_s: floa
 
 
 def _integral(time: np.ndarray, values: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Of the line through the rows, from the first one on."""
+    """Integrates the line through the rows from the first row to other times."""
     width = np.diff(time)
     left = np.clip(np.searchsorted(time, at, side="right") - 1, 0, len(time) - 2)
     ahead = _along(at - time[left], values)
@@ -43,5 +61,5 @@ def _integral(time: np.ndarray, values: np.ndarray, at: np.ndarray) -> np.ndarra
 
 
 def _along(factor: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """A factor for every row, for values of as many dimensions."""
+    """Adds axes to a factor for every row, so that it multiplies values of several dimensions."""
     return factor.reshape(-1, *[1] * (values.ndim - 1))

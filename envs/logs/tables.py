@@ -1,4 +1,4 @@
-"""Columns of numbers from files: every cell what it may be, or its file, row and column in the error."""
+"""Reads and writes tables of numbers; a bad cell is refused with its file, row and column."""
 
 import csv
 from collections.abc import Mapping
@@ -11,13 +11,32 @@ import pyarrow.parquet
 
 
 def check_time(path: Path, name: str, time: np.ndarray) -> None:
-    """Refuses time stamps [rows] that do not increase."""
+    """Refuses time stamps that do not strictly increase.
+
+    Args:
+      path: of the file, for the message.
+      name: of the column, for the message.
+      time: [rows] s.
+
+    Raises:
+      ValueError: names the first row that is not later than the one before.
+    """
     late = np.append(False, np.diff(time) <= 0)
     refuse_first(path, name, time, late, lambda row: f"more than {float(time[row - 1])!r} in the row before")
 
 
 def check_values(path: Path, signal: str, name: str, values: np.ndarray) -> None:
-    """Refuses values [rows] that a signal cannot have."""
+    """Refuses values that a signal cannot have: flags are 0 or 1, phases 0 to 1 cycle, the supply not negative.
+
+    Args:
+      path: of the file, for the message.
+      signal: name of the signal in the format.
+      name: of the column in the file, for the message.
+      values: [rows].
+
+    Raises:
+      ValueError: names the first row with such a value.
+    """
     if signal in ("enabled", "contact"):
         refuse_first(path, name, values, (values != 0) & (values != 1), "0 or 1")
     elif signal == "phase":
@@ -27,7 +46,18 @@ def check_values(path: Path, signal: str, name: str, values: np.ndarray) -> None
 
 
 def refuse_first(path: Path, name: str, values: np.ndarray, bad: np.ndarray, expected) -> None:
-    """Refuses the first row that is bad."""
+    """Raises an error about the first bad row of a column, if there is one.
+
+    Args:
+      path: of the file, for the message.
+      name: of the column, for the message.
+      values: [rows].
+      bad: [rows], True where a value is refused.
+      expected: what was expected instead, or a function of the row (from 0) that says it.
+
+    Raises:
+      ValueError: names file, row (from 1), column, the value and what was expected.
+    """
     if bad.any():
         row = int(np.argmax(bad))
         wanted = expected(row) if callable(expected) else expected
@@ -45,6 +75,7 @@ def _read_csv(path: Path) -> dict[str, np.ndarray]:
             raise ValueError(f"{path}, column '{name}': expected a name that is there once")
     if not names:
         raise ValueError(f"{path}: is empty")
+    # Nothing counts as a missing value, so that an empty cell is refused.
     options = pyarrow.csv.ConvertOptions(
         column_types=dict.fromkeys(names, pyarrow.float64()), null_values=[], strings_can_be_null=False
     )
@@ -58,7 +89,7 @@ def _read_csv(path: Path) -> dict[str, np.ndarray]:
 
 
 def _read_csv_by_row(path: Path, names: list[str], error: Exception) -> dict[str, np.ndarray]:
-    """Slower, and knows the row and column of what is wrong."""
+    """Reads a CSV row by row, slowly, to find the row and column of an error."""
     rows = []
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
@@ -139,6 +170,6 @@ def _write_parquet(path: Path, columns: Mapping[str, np.ndarray]) -> None:
 
 _NUMBERS = (pyarrow.types.is_floating, pyarrow.types.is_integer, pyarrow.types.is_boolean)
 READERS = {".csv": _read_csv, ".npz": _read_npz, ".parquet": _read_parquet}
-"""Readers by suffix: path to columns [rows] by name."""
+"""Readers by suffix: from a path to columns [rows] by name."""
 WRITERS = {".csv": _write_csv, ".npz": _write_npz, ".parquet": _write_parquet}
-"""Writers by suffix, of a path and columns."""
+"""Writers by suffix: of columns [rows] by name to a path."""

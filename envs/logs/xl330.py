@@ -1,4 +1,7 @@
-"""Runs of a Dynamixel XL330 that turns a pendulum, as github.com/Rhoban/bam records them."""
+"""Reads recordings of a Dynamixel XL330 that turns a pendulum, in the JSON files of github.com/Rhoban/bam.
+
+They are public measurements of one real motor, at several firmware gains.
+"""
 
 import json
 from pathlib import Path
@@ -9,9 +12,9 @@ from envs.logs.controller import Controller
 from envs.logs.format import JOINT_SIGNALS, Log, Run
 from envs.logs.tables import check_time, check_values
 
-KT, RESISTANCE_OHM = 0.38, 3.6  # Nm/A, Ohm: the published Coulomb-viscous fit
+KT, RESISTANCE_OHM = 0.38, 3.6  # Nm/A and Ohm, of the published Coulomb-viscous fit
 SPLIT_OF_GAIN = {100: "train", 800: "train", 200: "select", 400: "sealed"}
-"""By the firmware's gain: sealed lies within what was trained on."""
+"""Split by the firmware's gain; the sealed gain lies between gains that are trained on."""
 
 _MASS_KG, _LENGTH_M = 0.49, 0.1
 _COUNTS_PER_RAD = 4096 / (2 * np.pi)
@@ -29,7 +32,13 @@ _OTHER = ("load", "temp")
 
 
 def read_xl330(folder: Path) -> Log:
-    """Reads a folder of these JSON files as a log of the `pendulum`; a firmware gain is a condition.
+    """Reads a folder of such JSON files as a log of the robot `pendulum`.
+
+    A file is a run, a firmware gain is a condition, and gains decide the split (`SPLIT_OF_GAIN`). The controller is a
+    servo whose gain follows from the firmware's.
+
+    Args:
+      folder: with the *.json files.
 
     Raises:
       ValueError: names the file, the row and the key that is missing, no number, or other than expected.
@@ -66,6 +75,7 @@ def _run(path: Path) -> Run:
             raise ValueError(f"entries: got {len(entries)}, expected 2 or more")
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{path}: {type(error).__name__}: {error}") from error
+    # Everything is checked before the first value is used.
     columns = {key: _column(path, entries, key) for key in ("timestamp", *_SIGNALS.values(), *_OTHER)}
     check_time(path, "timestamp", columns["timestamp"])
     for ours, theirs in _SIGNALS.items():

@@ -1,7 +1,7 @@
-"""BITeno in PyBullet: another engine, its body written from the compiled MJCF.
+"""A target in PyBullet, an engine with its own contacts and solver; its body is written from the compiled MJCF.
 
 PyBullet has neither rotor inertia (`joint_armature`) nor the solver's time constant (`contact_time_constant`); a target
-that needs them says so. Its frictions multiply, so the floor's is one.
+whose parameters change them is refused. PyBullet multiplies the frictions of two bodies, so the floor's is set to one.
 """
 
 import tempfile
@@ -28,10 +28,13 @@ _ITERATIONS = 100
 
 
 def urdf(model: mujoco.MjModel) -> str:
-    """The robot as URDF: masses, inertias, axes, limits and feet of a compiled model.
+    """Writes a compiled model as URDF: masses, inertias, joint axes and limits, and the feet's spheres.
+
+    Args:
+      model: BITeno's, parameters applied.
 
     Raises:
-      ValueError: a body's principal axes are not its own, which PyBullet would ignore.
+      ValueError: a body's inertia is not diagonal in its own frame; PyBullet would ignore the rest.
     """
     robot = ElementTree.Element("robot", name="biteno")
     for body in range(1, model.nbody):
@@ -42,7 +45,7 @@ def urdf(model: mujoco.MjModel) -> str:
         ElementTree.SubElement(inertial, "mass", value=repr(float(model.body_mass[body])))
         inertia = _inertia(model, body)
         if np.abs(inertia - np.diag(np.diag(inertia))).max() > 1e-9:
-            raise ValueError(f"inertia of '{name}': {inertia.tolist()} is not diagonal")
+            raise ValueError(f"inertia of '{name}': got {inertia.tolist()}, expected a diagonal matrix")
         moments = dict(zip(("ixx", "iyy", "izz"), (repr(float(moment)) for moment in np.diag(inertia)), strict=True))
         ElementTree.SubElement(inertial, "inertia", ixy="0", ixz="0", iyz="0", **moments)
         for geom in range(model.ngeom):
@@ -65,6 +68,7 @@ def urdf(model: mujoco.MjModel) -> str:
 
 
 def _inertia(model: mujoco.MjModel, body: int) -> np.ndarray:
+    """Inertia matrix [3, 3] of a body in its own frame."""
     turn = np.zeros(9)
     mujoco.mju_quat2Mat(turn, model.body_iquat[body])
     turn = turn.reshape(3, 3)
@@ -76,12 +80,20 @@ def _words(vector) -> str:
 
 
 class Bullet:
-    """The engine: one world for each robot."""
+    """PyBullet as an engine for `HostTarget`, with a world of its own for each robot.
+
+    Args:
+      robot: task and robot.
+      params: true physical values by name.
+
+    Raises:
+      ValueError: a parameter needs physics that PyBullet does not have.
+    """
 
     def __init__(self, robot: Biteno, params: Mapping[str, float]):
         for name in _MISSING:
             if params.get(name, 1.0) != 1.0:
-                raise ValueError(f"params['{name}']: got {params[name]}, but PyBullet has no such thing")
+                raise ValueError(f"params['{name}']: got {params[name]}, expected 1: PyBullet cannot simulate it")
         model = parameters.apply_mujoco(robot.mj_model, params, robot.entries)
         self._model = model
         self._dt = model.opt.timestep
@@ -94,7 +106,7 @@ class Bullet:
         self._worlds = []
 
     def start(self, state: State) -> None:
-        """Puts every robot into a world of its own."""
+        """Puts every robot into its own world, at its first state."""
         while len(self._worlds) < len(state.qpos):
             self._worlds.append(self._world())
         self._last_qvel = np.asarray(state.qvel)
@@ -107,12 +119,13 @@ class Bullet:
             self._set_base_velocity(world, turn, qvel)
 
     def move(self, state: State, drive: Drive) -> Motion:
-        """Moves every robot on by a policy step."""
+        """Moves every robot by one policy step; see `envs.targets.host.Engine`."""
         pushed = np.asarray(state.qvel)
         targets = np.asarray(drive.targets, float)
         rows = []
         for row in range(len(pushed)):
             world = self._worlds[row]
+            # Only a push changes a velocity between two steps; else the engine keeps its own, which is more exact.
             if np.any(pushed[row] != self._last_qvel[row]):
                 self._set_base_velocity(world, _rotation(np.asarray(state.qpos[row], float)[3:7]), pushed[row])
             rows.append(self._move(world, targets[row]))
@@ -139,7 +152,7 @@ class Bullet:
             client.changeDynamics(
                 body, joint, linearDamping=0.0, angularDamping=0.0, jointDamping=self._model.dof_damping[dof]
             )
-            # PyBullet brakes every joint until it is told not to; what it is left with is dry friction.
+            # PyBullet brakes every joint by default; the force that is left to the brake is dry friction.
             client.setJointMotorControl2(
                 body, joint, pybullet.VELOCITY_CONTROL, force=float(self._model.dof_frictionloss[dof])
             )
@@ -166,7 +179,7 @@ class Bullet:
         return qpos, qvel, torque, np.stack([self._force(client, body, foot) for foot in feet])
 
     def _read(self, world) -> tuple[np.ndarray, np.ndarray]:
-        """Positions and velocities as MuJoCo has them: of the trunk's origin, not of its centre of mass."""
+        """Reads positions and velocities as MuJoCo defines them: of the trunk's origin, not of its centre of mass."""
         client, body, joints, _ = world
         position, turned = client.getBasePositionAndOrientation(body)
         quat = np.roll(turned, 1)
@@ -182,6 +195,7 @@ class Bullet:
 
     @staticmethod
     def _force(client, body: int, foot: int) -> np.ndarray:
+        """Sums the contact forces on a foot, normal and both tangential ones, [3] N in the world."""
         total = np.zeros(3)
         for point in client.getContactPoints(bodyA=body, linkIndexA=foot):
             normal, press = np.array(point[7]), point[9]
@@ -196,5 +210,13 @@ def _rotation(quat: np.ndarray) -> np.ndarray:
 
 
 def target(robot: Biteno, params: Mapping[str, float]) -> HostTarget:
-    """A robot in PyBullet with these physical values."""
+    """Makes a target in PyBullet.
+
+    Args:
+      robot: task and robot.
+      params: true physical values by name.
+
+    Raises:
+      ValueError: a parameter needs physics that PyBullet does not have.
+    """
     return HostTarget(robot, params, Bullet(robot, params))

@@ -1,4 +1,4 @@
-"""Episodes in engines that are not JAX: the physics is theirs, everything else the same code."""
+"""Episodes in engines outside JAX: they simulate the physics, everything else is the same code as in MJX."""
 
 from collections.abc import Mapping
 from typing import Protocol
@@ -14,22 +14,30 @@ from jaxtune.types import Trajectory
 
 
 class Engine(Protocol):
-    """Physics of many robots of one model."""
+    """A physics engine that simulates many robots of one model, one policy step at a time."""
 
     def start(self, state: State) -> None:
-        """Puts robots [episodes] where they begin."""
+        """Puts robots [episodes] into their first states, before the first call of `move`."""
 
     def move(self, state: State, drive: Drive) -> Motion:
-        """Moves every robot [episodes] on by a policy step; a state may differ from where the last motion ended."""
+        """Moves every robot [episodes] by one policy step.
+
+        Args:
+          state: before the step. Its velocity may differ from where the last motion ended, because robots are pushed.
+          drive: joint targets of every sub-step.
+        """
 
 
 class HostTarget:
-    """A robot in an engine of the host.
+    """A target whose physics is simulated outside JAX, by MuJoCo C or PyBullet.
+
+    Observation, reward, termination and commands are the functions of `Biteno`, so a target differs from the tuner's
+    simulator in its physics alone.
 
     Args:
       robot: task and robot; its MJX model is not used.
-      params: true physical values by name; only a report may read them.
-      engine: what moves it.
+      params: true physical values by name; only tests and reports may read them.
+      engine: simulates the robots.
 
     Raises:
       ValueError: the robot has effects that only MJX can give it.
@@ -47,13 +55,14 @@ class HostTarget:
         self._settle = jax.jit(jax.vmap(robot.settle))
 
     def episodes(self, key: jax.Array, act: Act, count: int, steps: int) -> Trajectory:
-        """Measures `count` episodes of `steps` policy steps."""
+        """Measures episodes under a policy; see `envs.targets.protocol.Target`."""
         return self.record(key, act, count, steps)[0]
 
     def record(
         self, key: jax.Array, act: Act, count: int, steps: int, commands: Commands | None = None
     ) -> tuple[Trajectory, Recording]:
-        """The same with the motion behind it."""
+        """Measures episodes and records the motion behind them; see `envs.targets.protocol.Target`."""
+        # As a pytree a policy is an argument of one compiled program, not a constant of a new one.
         act = act if isinstance(act, jax.tree_util.Partial) else jax.tree_util.Partial(act)
         keys = jax.vmap(jax.random.split)(jax.random.split(key, count))
         step_keys = np.asarray(jax.vmap(lambda key: jax.random.split(key, steps))(keys[:, 1]))
@@ -77,6 +86,7 @@ class HostTarget:
             records.append(jax.tree.map(np.asarray, record))
             alive &= np.asarray(following.done) == 0
             not_finite |= broke
+            # Also after a fall: masked steps cost little, and the batch keeps its shape.
             state = following
         stacked = jax.tree.map(lambda *leaves: np.stack(leaves, axis=1), *records)
         (obs, action, valid, score), recording = jax.tree.map(jnp.asarray, stacked)

@@ -1,4 +1,4 @@
-"""Episodes of BITeno in MJX: the simulated ones, and those of a target in the same engine."""
+"""Episodes of BITeno in MJX: those that the tuner simulates, and those of a target in the same engine."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from envs.targets.protocol import Act, Commands, Recording, watch
 from jaxtune.mjx import parameters
 from jaxtune.types import Coords, Trajectory
 
-_CHUNK = 256  # small batches are fastest on a CPU; larger ones are worked off in turn
+_CHUNK = 256  # small batches are fastest on a CPU; larger ones are simulated in turn
 
 
 def rollout(
@@ -24,30 +24,30 @@ def rollout(
     commands: Commands | None = None,
     watch: Callable[..., Any] = lambda before, after, motion: (),
 ) -> tuple[Trajectory, Any]:
-    """Plays one episode for every parameter draw.
+    """Simulates one episode for every draw of the parameters.
 
-    An episode ends where the robot falls or the simulation breaks; the broken step is counted and masked.
+    An episode ends where the robot falls or a number is not finite; that step is counted in `not_finite` and masked.
 
     Args:
       robot: robot and task.
       key: random key; commands, resets and noise depend on it alone.
       act: the policy.
       params: physical values by name, each [episodes].
-      steps: length of an episode.
-      commands: commands, and starts of the gait clock, in the stead of those that are drawn.
+      steps: length of an episode in policy steps.
+      commands: commands and starts of the gait clock, in place of those that the task would draw.
       watch: what is recorded of a step, `(state before, state after, motion) -> pytree`.
 
     Returns:
       The episodes, and what was recorded of them, [episodes, time, ...].
     """
-    # Constant parameters would have the compiler work out every derived field of every model by itself, for minutes.
+    # From constant parameters the compiler would compute the derived fields of every model itself, for minutes.
     params = jax.lax.optimization_barrier(dict(params))
     count = next(iter(params.values())).shape[0]
     episode = jax.vmap(lambda *drawn: _episode(robot, act, steps, watch, *drawn))
     inputs = (jax.random.split(key, count), params) + (() if commands is None else (commands,))
     if count <= _CHUNK:
         return episode(*inputs)
-    # Chunks of equal size; the last one is filled up with repetitions.
+    # Chunks of equal size need one compilation; the last one is filled up with repetitions.
     chunks = -(-count // _CHUNK)
     size = -(-count // chunks)
     fill = jnp.arange(chunks * size) % count
@@ -81,20 +81,20 @@ def _episode(robot, act, steps, watch, key, params, commands=None) -> tuple[Traj
 
 @dataclass(frozen=True, kw_only=True)
 class MjxTarget:
-    """A robot in MJX, pure: `episodes` and `record` may be jitted."""
+    """A target in the tuner's own engine: only its parameters are hidden. Its methods are pure and may be jitted."""
 
     robot: Biteno
     params: Mapping[str, float]
-    """True physical values by name; only a report may read them."""
+    """True physical values by name; only tests and reports may read them."""
 
     def episodes(self, key: jax.Array, act: Act, count: int, steps: int) -> Trajectory:
-        """Measures `count` episodes of `steps` policy steps."""
+        """Measures episodes under a policy; see `envs.targets.protocol.Target`."""
         return rollout(self.robot, key, act, self._params(count), steps)[0]
 
     def record(
         self, key: jax.Array, act: Act, count: int, steps: int, commands: Commands | None = None
     ) -> tuple[Trajectory, Recording]:
-        """The same with the motion behind it."""
+        """Measures episodes and records the motion behind them; see `envs.targets.protocol.Target`."""
         return rollout(self.robot, key, act, self._params(count), steps, commands, watch)
 
     def _params(self, count: int) -> dict:
@@ -104,5 +104,14 @@ class MjxTarget:
 def simulate(
     robot: Biteno, key: jax.Array, act: Act, coords: Coords, steps: int, commands: Commands | None = None
 ) -> Trajectory:
-    """Plays one episode for every draw of the tuner's distribution, [episodes] by name in search coordinates."""
+    """Simulates one episode for every draw of the tuner's distribution: the `simulate` that a tuner is given.
+
+    Args:
+      robot: robot and task; its table translates coordinates into physical values.
+      key: random key.
+      act: the policy.
+      coords: draws in search coordinates by name, each [episodes].
+      steps: length of an episode in policy steps.
+      commands: in place of those that the task would draw.
+    """
     return rollout(robot, key, act, parameters.from_coords(robot.entries, coords), steps, commands)[0]

@@ -1,4 +1,4 @@
-"""BITeno in MuJoCo C, many robots over the machine's cores."""
+"""A target in MuJoCo C: many robots in parallel on the machine's cores."""
 
 import os
 from collections.abc import Mapping
@@ -12,12 +12,25 @@ from envs.biteno import Biteno, Drive, Motion, State, constants
 from envs.targets.host import HostTarget
 from jaxtune.mjx import parameters
 
-_NET_FORCE = 3  # the sensor's way to reduce contacts to one
-_ITERATIONS = 100  # until it has converged, as MuJoCo does on its own
+_NET_FORCE = 3  # the contact sensor's code for the sum over contacts
+_ITERATIONS = 100  # MuJoCo's own default, with which its solver converges
 
 
 class MujocoC:
-    """The engine. Options of MuJoCo by name (`cone`, `integrator`, `timestep`, ...) make it differ from MJX."""
+    """MuJoCo C as an engine for `HostTarget`.
+
+    With other options than MJX (elliptic cones, another integrator, half the time step) it stands for a robot whose
+    physics the tuner's simulator does not have.
+
+    Args:
+      robot: task and robot; its table of parameters is used.
+      params: true physical values by name.
+      threads: number of threads; all cores where None.
+      options: fields of `mujoco.MjOption` by name (`cone`, `integrator`, `timestep`, ...).
+
+    Raises:
+      ValueError: the time step does not divide the task's, or a parameter is unknown.
+    """
 
     def __init__(self, robot: Biteno, params: Mapping[str, float], threads: int | None = None, **options):
         spec = mujoco.MjSpec.from_file(str(constants.MODEL_PATH))
@@ -39,15 +52,16 @@ class MujocoC:
         if self._repeats < 1 or abs(ratio - self._repeats) > 1e-6:
             raise ValueError(f"timestep: got {model.opt.timestep}, which does not divide {robot.mj_model.opt.timestep}")
         self._model = parameters.apply_mujoco(model, params, robot.entries)
+        # One workspace for each thread; robots are distributed over them.
         threads = os.cpu_count() if threads is None else threads
         self._data = [mujoco.MjData(self._model) for _ in range(threads)]
         self._pool = rollout.Rollout(nthread=threads)
 
     def start(self, state: State) -> None:
-        """A state says all."""
+        """Does nothing: every step starts from the given state."""
 
     def move(self, state: State, drive: Drive) -> Motion:
-        """Moves every robot on by a policy step."""
+        """Moves every robot by one policy step; see `envs.targets.host.Engine`."""
         count = len(state.qpos)
         start = np.concatenate([np.zeros((count, 1)), state.qpos, state.qvel], axis=1)
         control = np.repeat(np.asarray(drive.targets, float), self._repeats, axis=1)
@@ -62,11 +76,17 @@ class MujocoC:
             qvel=jnp.asarray(qvel, jnp.float32),
             qacc_warmstart=jnp.zeros((count, self._model.nv)),
             torque=jnp.asarray(torque, jnp.float32),
-            # The sensor tells what the foot does to the floor.
+            # The sensor gives the force of the foot on the floor.
             foot_force=jnp.asarray(-force.reshape(count, 2, 3), jnp.float32),
         )
 
 
 def target(robot: Biteno, params: Mapping[str, float], **options) -> HostTarget:
-    """A robot in MuJoCo C with these physical values."""
+    """Makes a target in MuJoCo C.
+
+    Args:
+      robot: task and robot.
+      params: true physical values by name.
+      options: `threads` and fields of `mujoco.MjOption`, as `MujocoC` takes them.
+    """
     return HostTarget(robot, params, MujocoC(robot, params, **options))

@@ -1,4 +1,4 @@
-"""What a target is: it lets a policy walk and answers with episodes, and hides its parameters."""
+"""The interface of a target: a robot that walks under a policy, returns episodes and hides its parameters."""
 
 from collections.abc import Callable, Mapping
 from typing import Protocol
@@ -10,20 +10,27 @@ from envs.biteno import Motion, State
 from jaxtune.types import Trajectory
 
 Act = Callable[[jax.Array, jax.Array], tuple[jax.Array, dict]]
-"""A policy: `(observation [obs], key) -> (action [act], extras)`."""
+"""A policy: `(observation [obs], key) -> (action [act], extras)`. Extras are what PPO wants recorded; targets ignore
+them."""
 
 
 @chex.dataclass(frozen=True)
 class Commands:
-    """Velocity commands and gait clocks of episodes, in place of those that the task would draw."""
+    """Velocity commands and gait clocks of episodes, in place of those that the task would draw.
+
+    Use them to simulate what a robot was commanded in measured episodes, or to walk a fixed grid of commands.
+    """
 
     command: jax.Array  # [episodes, time, 3] m/s, m/s, rad/s
-    phase: jax.Array | None = None  # [episodes, 2] cycles, where the gait clock starts; drawn where None
+    phase: jax.Array | None = None  # [episodes, 2] cycles, at the start; drawn by the task where None
 
 
 @chex.dataclass(frozen=True)
 class Recording:
-    """Motion behind the steps of a `Trajectory`, [episodes, time, ...]; what it says of a step is its end."""
+    """The motion behind the steps of a `Trajectory`, [episodes, time, ...], at the end of each step.
+
+    Measures of a gait (`envs.biteno.gait.quality`) need it; the tuner does not see it.
+    """
 
     qpos: jax.Array  # [13]
     qvel: jax.Array  # [12]
@@ -34,7 +41,7 @@ class Recording:
 
 
 def watch(before: State, after: State, motion: Motion) -> Recording:
-    """What is recorded of a step."""
+    """Makes the `Recording` of one step from the states before and after it and the engine's motion."""
     return Recording(
         qpos=after.qpos,
         qvel=after.qvel,
@@ -46,14 +53,39 @@ def watch(before: State, after: State, motion: Motion) -> Recording:
 
 
 class Target(Protocol):
-    """A robot to be tuned to. Only a report may read its parameters."""
+    """A robot to be tuned to, real or hidden in another simulator.
+
+    A target knows nothing of the tuner: it only walks under policies. Tests and reports alone may read `params`.
+    """
 
     params: Mapping[str, float]
+    """True physical values by name, where they are known."""
 
     def episodes(self, key: jax.Array, act: Act, count: int, steps: int) -> Trajectory:
-        """Measures `count` episodes of `steps` policy steps."""
+        """Measures episodes under a policy.
+
+        Args:
+          key: random key of resets, commands, noise and the policy.
+          act: the policy.
+          count: number of episodes.
+          steps: length of an episode in policy steps of 10 ms.
+
+        Returns:
+          The episodes; steps after a fall are masked.
+        """
 
     def record(
         self, key: jax.Array, act: Act, count: int, steps: int, commands: Commands | None = None
     ) -> tuple[Trajectory, Recording]:
-        """The same with the motion behind it."""
+        """Measures episodes and records the motion behind them.
+
+        Args:
+          key: random key, as in `episodes`.
+          act: the policy.
+          count: number of episodes.
+          steps: length of an episode in policy steps.
+          commands: in place of those that the task would draw.
+
+        Returns:
+          The episodes, and their motion.
+        """

@@ -1,9 +1,9 @@
-"""Episodes from measured logs: what a policy saw and did, at its own ticks, as the simulator would have told it.
+"""Makes episodes from measured logs: what a policy observed and did at its own ticks, in the simulator's form.
 
 A run is cut where the robot falls and where its rows have a hole. Motors that are switched off under a walking policy
-are a fall: that is how most robots fall. So is a trunk that sinks; where nobody measured how high it is, its legs say
-it. Of every piece the first tick is left out, because nobody knows what was done before it, and so is the last one of a
-piece that does not end in a fall, because nobody knows what came of it.
+count as a fall, because most robots are switched off when they fall. So does a trunk that sinks; where its height was
+not measured, it is estimated from the legs. The first tick of every piece is left out, because the action before it is
+unknown. So is the last tick of a piece that does not end in a fall, because its outcome is unknown.
 """
 
 from functools import partial
@@ -23,42 +23,50 @@ from jaxtune.types import Trajectory
 
 _NEEDED = ("q", "dq", "target", "action", "phase", "cmd", "gyro", "gravity", "vel")
 _READINGS = {"velocity": "vel", "gyro": "gyro", "gravity": "gravity", "joint": "q", "joint_velocity": "dq"}
-_SAME_RATE = 0.02  # rows and ticks are one where their periods differ by a smaller share
-_FASTER = 1.5  # times as fast as ticks are rows between which ticks can be found
-_SILENCE = 10.5  # periods of the policy
-_HOLE = 1.5  # periods of the policy
-_UP_S = 0.5  # after a fall, for which it must stand to have got up
-_STEADY = 0.95  # share of ticks that are equally many rows apart, where rows and ticks keep step
+_SAME_RATE = 0.02  # a row is a tick where the two periods differ by a smaller share
+_FASTER = 1.5  # rows must be faster than ticks by this factor, so that ticks can be found among them
+_SILENCE = 10.5  # periods of the policy without a new action, after which it has stopped
+_HOLE = 1.5  # periods of the policy between two ticks, from which on rows are missing
+_UP_S = 0.5  # time for which a robot must be up after a fall to count as standing again
+_STEADY = 0.95  # share of ticks that are equally many rows apart where rows and ticks are synchronous
 
 
 @chex.dataclass(frozen=True)
 class Recorded:
-    """Measured episodes, and what a simulation needs to repeat them."""
+    """Measured episodes, and what a simulation needs to repeat them.
+
+    Commands begin `lead` steps before the trajectory: one or two ticks of the run that are no steps of the trajectory,
+    but that a simulation walks through.
+    """
 
     trajectory: Trajectory
-    commands: Commands  # from the run's first step on, a few before the trajectory's
-    power: jax.Array  # [episodes, time] W, mechanical, braking not regained
-    run: jax.Array  # [episodes] of the log, from 0; in order, and every run has one episode or more
-    begin: jax.Array  # [episodes] policy steps between the first one of the run and that of the episode
+    commands: Commands  # from the run's first tick on, one or two steps before the trajectory
+    power: jax.Array  # [episodes, time] W, mechanical; braking is not regained
+    run: jax.Array  # [episodes] index of the run, in order; every run has one episode or more
+    begin: jax.Array  # [episodes] policy steps from the run's first step to the episode's
 
 
 def episodes(log: Log, steps: int) -> Recorded:
     """Turns a log of a walking BITeno into episodes of `steps` policy steps.
 
-    A longer piece of a run becomes several episodes; a shorter one is filled up with steps that are not alive.
+    A longer piece of a run becomes several episodes; a shorter one is filled up with steps that are not alive. Without
+    measured torques the controller's commanded ones are used.
 
     Args:
       log: of one or more runs.
-      steps: length of an episode.
+      steps: length of an episode in policy steps.
+
+    Returns:
+      The episodes, with observations and scores as the simulator would have computed them.
 
     Raises:
-      ValueError: the log is of another robot or policy, or of one that hangs, or lacks a signal; or a run has no two
-        ticks in a row with the robot on its feet.
+      ValueError: the log is of another robot or policy, its base is fixed, or a signal is missing; or a run has no two
+        consecutive ticks with the robot on its feet.
     """
     if log.robot != "biteno" or set(log.joints) != set(constants.JOINTS):
         raise ValueError(f"robot: got '{log.robot}' with {', '.join(log.joints)}, expected biteno with all its joints")
     if log.base != "free":
-        raise ValueError(f"base: got {log.base}, expected free, of a robot that walks")
+        raise ValueError(f"base: got {log.base}, expected free: the robot must walk")
     rate = (log.policy or {}).get("rate_hz", 1.0 / constants.POLICY_DT_S)
     if abs(rate * constants.POLICY_DT_S - 1.0) > 1e-6:
         raise ValueError(f"policy.rate_hz: got {rate:g}, expected {1.0 / constants.POLICY_DT_S:g}")
@@ -68,23 +76,23 @@ def episodes(log: Log, steps: int) -> Recorded:
         ticks = _at_ticks(run, order)
         pieces = _pieces(ticks)
         if not pieces:
-            raise ValueError(f"{run.name}: got no two ticks in a row on its feet, expected a robot that walks")
+            raise ValueError(f"{run.name}: got no two consecutive ticks with the robot on its feet, expected a walk")
         begins = np.round((ticks["time"] - ticks["time"][pieces[0][0][0]]) / constants.POLICY_DT_S).astype(int)
         for rows, fell in pieces:
             found += [one | {"run": index} for one in _chunks(_steps(ticks, rows, fell), steps, begins[rows[0]])]
-        # A first action that does not change is not heard.
-        unheard = 0.5 < (ticks["time"][0] - run.time[0]) / constants.POLICY_DT_S < 1.5
-        leads.append(2 if unheard else 1)
+        # Among faster rows ticks are found by changes of the action, so the run's first tick is not among them.
+        first_missing = 0.5 < (ticks["time"][0] - run.time[0]) / constants.POLICY_DT_S < 1.5
+        leads.append(2 if first_missing else 1)
     return _as_simulated(jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *found), max(leads))
 
 
 def beginning(recorded: Recorded, steps: int) -> Recorded:
-    """The first `steps` of every run's first episode."""
+    """Cuts to the first `steps` of every run's first episode, which simulations repeat from the start of the walk."""
     first = np.unique(np.asarray(recorded.run), return_index=True)[1]
     one = jax.tree.map(lambda leaf: leaf[first], recorded)
     trajectory, commands = one.trajectory, one.commands
     lead = commands.command.shape[1] - trajectory.alive.shape[1]
-    # Who still stands when the cut comes has not fallen before it.
+    # A fall after the cut does not count: the robot was still up.
     fell = trajectory.fell & ~trajectory.alive[:, steps:].any(axis=1)
     cut = {name: trajectory[name][:, :steps] for name in ("obs", "action", "alive", "score")}
     return one.replace(
@@ -95,12 +103,17 @@ def beginning(recorded: Recorded, steps: int) -> Recorded:
 
 
 def whole(recorded: Recorded, steps: int) -> tuple[Trajectory, np.ndarray]:
-    """The first `steps` of every run as one episode, and its power: for what came of a walk, not for windows.
+    """Joins the episodes of every run into one, to summarise a walk: its falls, score and power.
 
-    Not alive is it where nothing is known, also in between, and from its first fall on.
+    A step is not alive where nothing was recorded, also in the middle of a run, and from the first fall on. Windows for
+    the tuner must not be cut from such episodes, because steps may be missing between two that are alive.
+
+    Args:
+      recorded: as `episodes` makes it.
+      steps: length of the joined episodes in policy steps.
 
     Returns:
-      Of shapes [runs, steps, ...] and [runs, steps] W.
+      Episodes [runs, steps, ...], and mechanical power [runs, steps] W.
     """
     run, begin, trajectory = np.asarray(recorded.run), np.asarray(recorded.begin), recorded.trajectory
     alive = np.asarray(trajectory.alive)
@@ -121,7 +134,7 @@ def whole(recorded: Recorded, steps: int) -> tuple[Trajectory, np.ndarray]:
 
 
 def _at_ticks(run: Run, order: list[int]) -> dict[str, np.ndarray]:
-    """Signals [ticks, ...] by name when the policy looked, joints in the model's order, and `time` and `up`."""
+    """Signals [ticks, ...] by name when the policy observed, joints in the model's order, with `time` and `up`."""
     signals = dict(run.signals)
     if "quat" in signals and "gravity" not in signals:
         signals["gravity"] = np.asarray(jax.vmap(sensing.projected_gravity)(signals["quat"]))
@@ -135,12 +148,12 @@ def _at_ticks(run: Run, order: list[int]) -> dict[str, np.ndarray]:
     height = signals["pos"][:, 2] if "pos" in signals else by_legs()
     down = np.asarray(env.fallen(signals["gravity"], height)) | (signals.get("enabled", np.ones(len(height))) == 0)
     rows, aligned = _ticks(run.name, run.time, signals["action"])
-    # Who has fallen may be asked for no more actions.
+    # After a fall the policy may send no more actions, so the fall itself is made a tick.
     rows = np.union1d(rows, 1 + np.flatnonzero(down[1:] & ~down[:-1]))
     if aligned:
         seen = {name: values[rows] for name, values in signals.items()} | {"time": run.time[rows]}
     else:
-        # The policy looked some time after the row before.
+        # The policy observed some time between the row before and this one.
         at = 0.5 * (run.time[rows] + run.time[np.maximum(rows - 1, 0)])
         seen = {name: values[rows] for name, values in signals.items() if name in HELD} | {"time": at}
         for name in signals.keys() - set(HELD):
@@ -151,7 +164,7 @@ def _at_ticks(run: Run, order: list[int]) -> dict[str, np.ndarray]:
 
 
 def _ticks(name: str, time: np.ndarray, action: np.ndarray) -> tuple[np.ndarray, bool]:
-    """Rows in which the policy spoke, and whether they are when it looked."""
+    """Rows in which the policy sent an action, and whether it observed the robot in these very rows."""
     period, width = constants.POLICY_DT_S, float(np.median(np.diff(time)))
     changes = 1 + np.flatnonzero((np.diff(action, axis=0) != 0).any(axis=1))
     if abs(width / period - 1.0) < _SAME_RATE:
@@ -167,28 +180,29 @@ def _ticks(name: str, time: np.ndarray, action: np.ndarray) -> tuple[np.ndarray,
     if len(rows) < 2 or abs(np.median(apart) / period - 1.0) > 0.25:
         every = f"every {np.median(apart):.3g} s" if len(rows) > 1 else f"{len(rows)} time(s)"
         raise ValueError(f"{name}: 'action' changes {every}, expected every {period:g} s")
-    # A policy that says the same twice is not heard the second time; one that is silent for long has stopped.
-    unheard = [
+    # Where two actions are equal, the second is no change: its tick is filled in. After a long silence the policy has
+    # stopped.
+    unchanged = [
         np.searchsorted(time, time[row] + np.arange(1, round(gap / period)) * period - 0.5 * width)
         for row, gap in zip(rows, apart, strict=False)
         if gap < _SILENCE * period
     ]
-    rows = np.unique(np.concatenate([rows, *unheard]))
+    rows = np.unique(np.concatenate([rows, *unchanged]))
     steady = np.diff(rows) == round(period / width)
     return rows, bool(steady.mean() >= _STEADY)
 
 
 def _wanted_torque(run: Run, seen: dict[str, np.ndarray], order: list[int]) -> np.ndarray:
-    """What the joints' controller has asked for, [ticks, joints] Nm, where nobody measured what came of it."""
+    """Torque that the joints' controller commanded, [ticks, joints] Nm, for logs without measured torques."""
     if run.controller.kind != "pd":
-        raise ValueError(f"{run.name}: there is no 'tau', expected it beside a controller of type servo")
-    # Until now the target was that of the tick before.
+        raise ValueError(f"{run.name}: there is no 'tau', which a controller of type servo needs")
+    # Up to a tick the target of the tick before has acted.
     target = np.concatenate([seen["target"][:1], seen["target"][:-1]])
     return run.controller.impedance()[order].torque(target, seen["q"], seen["dq"])
 
 
 def _pieces(ticks: dict[str, np.ndarray]) -> list[tuple[np.ndarray, bool]]:
-    """Ticks [ticks] that follow on each other with the robot on its feet, and whether it fell after them."""
+    """Finds pieces of consecutive ticks with the robot on its feet, and whether each ends in a fall."""
     up = ticks["up"]
     hole = np.append(False, np.diff(ticks["time"]) > _HOLE * constants.POLICY_DT_S)
     found, down = [], False
@@ -196,14 +210,14 @@ def _pieces(ticks: dict[str, np.ndarray]) -> list[tuple[np.ndarray, bool]]:
         stands = up[rows[0]] and len(rows) >= (round(_UP_S / constants.POLICY_DT_S) if down else 3)
         if stands:
             after = rows[-1] + 1
-            # Where nobody saw it fall it is enough to see it lie.
+            # The robot may have fallen in a hole of the rows: then it lies in the next one.
             found.append((rows, bool(after < len(up) and not up[after])))
         down = not up[rows[0]] or (down and not stands)
     return found
 
 
 def _steps(ticks: dict[str, np.ndarray], rows: np.ndarray, fell: bool) -> dict:
-    """What was before, at and after every step [steps] of a piece, by name."""
+    """Takes the signals before, at and after every step [steps] of a piece, by name."""
     last = None if fell else -1
     places = {"before": rows[:-1][:last], "now": rows[1:][:last], "after": rows[1:][:last] + 1}
     moments = {
@@ -216,7 +230,7 @@ def _steps(ticks: dict[str, np.ndarray], rows: np.ndarray, fell: bool) -> dict:
 
 
 def _chunks(steps: dict, length: int, begin: int) -> list[dict]:
-    """Episodes of a length, of a piece that begins so many steps after its run."""
+    """Divides a piece into episodes of a length; `begin` is the piece's first step in its run."""
     count = len(steps["alive"])
 
     def cut(start: int) -> dict:
@@ -229,7 +243,7 @@ def _chunks(steps: dict, length: int, begin: int) -> list[dict]:
 
 @partial(jax.jit, static_argnums=1)
 def _as_simulated(steps: dict, lead: int) -> Recorded:
-    """What the simulator would have told of steps [episodes, time] before which the robot has walked a few."""
+    """Computes observations, scores and commands as the simulator would, `lead` steps after the commands begin."""
     before, now, after = (steps[moment] for moment in ("before", "now", "after"))
     each = lambda function: jax.vmap(jax.vmap(function))  # noqa: E731
     obs = each(partial(sensing.observe, stand=jnp.asarray(constants.STAND_RAD)))(
@@ -249,7 +263,7 @@ def _as_simulated(steps: dict, lead: int) -> Recorded:
         joint_reference=each(gait.joint_reference)(now["phase"], now["cmd"]),
     )
     alive, fell = steps["alive"], steps["fell"].any(axis=1)
-    # Who repeats an episode may stay up for longer.
+    # A simulation that repeats an episode may stay up for longer than the robot did.
     held = jnp.clip(jnp.arange(-lead, alive.shape[1]), 0, alive.sum(axis=1, keepdims=True) - 1)
     return Recorded(
         trajectory=Trajectory(

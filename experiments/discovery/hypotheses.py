@@ -35,6 +35,19 @@ def place_sets(places: Sequence[str]) -> list[tuple[str, ...]]:
     return sets if len(places) < 2 or tuple(places) in sets else [*sets, tuple(places)]
 
 
+def timing_directions(axes: Sequence[Axis], control_hz: float) -> np.ndarray:
+    """Returns half a period of the controller as a delay of all readings, and as one of all targets, [2, axes].
+
+    Nobody knows when the controller looked and acted within its period, so discovery leaves both free everywhere.
+
+    Args:
+      axes: coordinates of the rig.
+      control_hz: rate of the controller.
+    """
+    late = [[axis.effect == effect for axis in axes] for effect in ("sensor_delay", "command_delay")]
+    return np.array(late, float) * 0.5 / control_hz
+
+
 def _hypothesis(axes: Sequence[Axis], index: Mapping, row: Effect, places: tuple[str, ...]) -> Hypothesis:
     directions = np.zeros((len(row.parameters), len(axes)))
     bounds = np.array([parameter.bounds for parameter in row.parameters], float)

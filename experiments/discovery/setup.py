@@ -3,25 +3,24 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
-import jax
 import mujoco
 import numpy as np
 
-from envs import models, regimes, segments
+from envs import models, segments
 from envs.effects import LIBRARY, RESIDUAL
 from envs.logs import Log, read, read_xl330, splits
 from envs.null_logs import simulate_null_log
+from envs.regimes import REGIMES
 from envs.rig import Rig
-from experiments.discovery.hypotheses import hypotheses
-from jaxtune.discovery.problem import Problem, Segments
+from envs.scales import measure_scales
+from experiments.discovery.cutting import BIN_S, cut_log
+from experiments.discovery.hypotheses import hypotheses, timing_directions
+from jaxtune.discovery.problem import Problem
 
 HORIZONS_S = (0.05, 0.15, 0.45)
 """Lengths of the segments that are simulated, by default."""
 
-_BIN_S = 0.01
-_LEAST_SEGMENTS = 3
 _LATE_S = 0.004  # a velocity that lags its position by more was filtered, and would pass for a sensor's lag
 
 
@@ -49,14 +48,14 @@ class _Simulator:
         return {name: read[name] for name in self.signals}
 
 
-def read_logs(folders: Sequence[Path]) -> Log:
-    """Reads the logs of one robot as a single log.
+def read_logs(folders: Sequence[Path]) -> tuple[Log, mujoco.MjSpec]:
+    """Reads the logs of one robot as a single log, and the robot's nominal model.
 
     Args:
       folders: of logs, or of the XL330 pendulum's JSON files.
 
     Returns:
-      A log with the runs of all folders; of several, a run's name ends in the number of its folder.
+      A log with the runs of all folders (of several, a run's name ends in the number of its folder), and the model.
 
     Raises:
       ValueError: a log cannot be read, the logs are not of one robot, or its base is free.
@@ -68,17 +67,18 @@ def read_logs(folders: Sequence[Path]) -> Log:
     if not logs:
         raise ValueError("logs: got none, expected one or more")
     first = logs[0]
+    spec = models.spec(first.robot)
     for folder, log in zip(folders, logs, strict=True):
         if log.base != "fixed":
             raise ValueError(f"{folder}: base: got '{log.base}', expected 'fixed': suspend or clamp the robot")
         if log.joints != first.joints:
             raise ValueError(f"{folder}: joints: got {log.joints}, expected {first.joints}")
-        if models.spec(log.robot).to_xml() != models.spec(first.robot).to_xml():
+        if models.spec(log.robot).to_xml() != spec.to_xml():
             raise ValueError(f"{folder}: robot: got {log.robot}, expected the same model as {first.robot}")
     if len(logs) == 1:
-        return first
+        return first, spec
     runs = tuple(replace(run, name=f"{run.name}_{number}") for number, log in enumerate(logs) for run in log.runs)
-    return replace(first, runs=runs)
+    return replace(first, runs=runs), spec
 
 
 def build_question(
@@ -104,28 +104,31 @@ def build_question(
     """
     rate = _checked_rate(log, segments.HISTORY_S + min(horizons))
     log, notes = drop_filtered(log)
+    unsealed = without_sealed(log).runs
     plain = plain or Rig(spec, log.joints, rate)
-    _check_rig(plain, log, rate)
-    rig = plain.scaled(measure_scales(plain, unsealed(log)))
+    plain.check_matches(log.joints, rate)
+    rig = plain.scaled(measure_scales(plain, unsealed))
     signals = tuple(name for name in ("dq", "gravity", "q") if all(name in run.signals for run in log.runs))
-    index = {(axis.effect, axis.place): number for number, axis in enumerate(rig.axes)}
+    axes = {(axis.effect, axis.place): number for number, axis in enumerate(rig.axes)}
     library = {name: row for name, row in rig.effects.items() if name in LIBRARY}
+    every = hypotheses(rig.axes, rig.places, library)
     residual = hypotheses(rig.axes, rig.places, {RESIDUAL.name: RESIDUAL})
+    timing = timing_directions(rig.axes, rig.control_hz)
     simulated = [simulate_null_log(log, spec, seed + number) for number in range(null_logs)]
-    measured, *nulls = (_cut(one, rig.dt, signals, horizons) for one in (log, *simulated))
+    measured, *nulls = (cut_log(one, rig.dt, signals, horizons) for one in (log, *simulated))
     problem = Problem(
         simulate=_Simulator(plain, signals),
         values=rig.inner,
         axes=len(rig.axes),
-        hypotheses=hypotheses(rig.axes, rig.places, library),
+        hypotheses=every,
         prior=np.array([axis.prior_sd for axis in rig.axes]),
-        timing=_timing(rig),
+        timing=timing,
         data=measured,
         null_logs=nulls,
-        bin_rows=segments.rows_together(1.0 / log.rate_hz, _BIN_S),
-        regimes=regimes.REGIMES,
+        bin_rows=segments.rows_together(1.0 / log.rate_hz, BIN_S),
+        regimes=REGIMES,
         components={name: tuple("xyz") if name == "gravity" else rig.joints for name in signals},
-        push={joint: index["constant_push", joint] for joint in rig.joints},
+        push={joint: axes["constant_push", joint] for joint in rig.joints},
         residual={one.places[0]: one for one in residual if len(one.places) == 1},
     )
     names = {split: tuple(run.name for run in runs) for split, runs in splits(log).items()}
@@ -147,14 +150,7 @@ def _checked_rate(log: Log, least_s: float) -> float:
     return rate
 
 
-def _check_rig(rig: Rig, log: Log, rate: float) -> None:
-    if (rig.joints, rig.control_hz) != (tuple(log.joints), rate):
-        raise ValueError(f"plain: got {rig.joints} at {rig.control_hz:g} Hz, expected {log.joints} at {rate:g} Hz")
-    if rig.others:
-        raise ValueError(f"joints: {', '.join(rig.others)} may move too, and the log does not have them")
-
-
-def unsealed(log: Log) -> Log:
+def without_sealed(log: Log) -> Log:
     """Returns the log without its sealed runs, which nothing but the proof may see."""
     parts = splits(log)
     return replace(log, runs=(*parts["train"], *parts["select"]))
@@ -167,76 +163,10 @@ def drop_filtered(log: Log) -> tuple[Log, tuple[str, ...]]:
       The log, with the rate that its time stamps have, and a note for every signal that was left out.
     """
     notes = []
-    late = [segments.velocity_lag(run) for run in unsealed(log).runs if "dq" in run.signals]
+    late = [segments.velocity_lag(run) for run in without_sealed(log).runs if "dq" in run.signals]
     if late and np.median(late) > _LATE_S:
         notes.append(f"dq lags q by {1e3 * np.median(late):.0f} ms: it is filtered, and not used")
         runs = [replace(run, signals={k: v for k, v in run.signals.items() if k != "dq"}) for run in log.runs]
         log = replace(log, runs=tuple(runs))
     rate = 1.0 / float(np.median([np.median(np.diff(run.time)) for run in log.runs]))
     return replace(log, rate_hz=rate), tuple(notes)
-
-
-def measure_scales(rig: Rig, log: Log) -> dict[str, np.ndarray]:
-    """Measures what one unit of a coordinate stands for, from what the robot did in a log.
-
-    A unit of friction is then the torque that the joint had, a unit of inertia what it felt, and so on: effects of one
-    unit matter about equally, whatever the robot's size.
-
-    Returns:
-      [places] by the name of the scale (`jaxtune.types.Scale`).
-    """
-    torque, speed, limit, pose = [], [], [], []
-    for run in log.runs:
-        position, velocity = np.moveaxis(segments.smoothed(run), 1, 0)
-        wanted, most = regimes.control_torque(run, position, velocity)
-        torque.append(wanted)
-        speed.append(velocity)
-        limit.append(np.where(np.isfinite(most), most, 0.0))
-        pose.append(position)
-    mass, inertia = rig.inertias(np.concatenate(pose).mean(axis=0))
-    return {
-        "torque": _rms(torque),
-        "damping": _rms(torque) / _rms(speed),
-        "stiffness": _rms(torque) / 0.02,
-        "inertia": inertia,
-        "mass": mass,
-        "drag": mass * 9.81,  # N s/m that weigh as much as the link at 1 m/s
-        "speed": _rms(speed),
-        "slow": 0.1 * _rms(speed),
-        "motor": np.maximum(np.concatenate(limit).max(axis=0), 1e-6) / _rms(speed),
-    }
-
-
-def _rms(values: Sequence[np.ndarray]) -> np.ndarray:
-    return np.sqrt((np.concatenate(values) ** 2).mean(axis=0)) + 1e-6
-
-
-def _timing(rig: Rig) -> np.ndarray:
-    """Half a period of the controller, as the delay of all readings and as that of all targets, [2, axes]."""
-    late = [[axis.effect == effect for axis in rig.axes] for effect in ("sensor_delay", "command_delay")]
-    return np.array(late, float) * 0.5 / rig.control_hz
-
-
-def _cut(log: Log, dt: float, signals: Sequence[str], horizons: Sequence[float]) -> dict[str, dict[float, Segments]]:
-    """Cuts a log into segments by split and horizon, each row with the regime of its joints."""
-    names = {split: {run.name for run in runs} for split, runs in splits(log).items()}
-    labels = [regimes.regimes(run) for run in log.runs]
-    data: dict[str, dict[float, Any]] = {split: {} for split in names}
-    for horizon in horizons:
-        # All runs at once, so that segments have one shape and programs compile once.
-        cut = segments.cut(log.runs, horizon, dt, _BIN_S)
-        label = np.stack([labels[run][rows] for run, rows in zip(cut.run, cut.row, strict=True)])
-        for split in names:
-            mine = np.array([log.runs[run].name in names[split] for run in cut.run])
-            if mine.sum() < _LEAST_SEGMENTS:
-                raise ValueError(
-                    f"runs: '{split}' has {mine.sum()} segment(s) of {horizon:g} s, expected {_LEAST_SEGMENTS} or "
-                    "more: record longer runs, more of them, or ask for shorter horizons"
-                )
-            data[split][horizon] = Segments(
-                inputs=jax.tree.map(lambda leaf, mine=mine: leaf[mine], cut.segments),
-                signals={name: cut.signals[name][mine] for name in signals},
-                run=cut.run[mine],
-                regimes=label[mine],
-            )
-    return data

@@ -51,7 +51,7 @@ def test_an_arm_without_effects_moves_as_in_mujoco(arm, plain):
     np.testing.assert_array_equal(read["tau"].reshape(-1, 5, 2), read["tau"][::5, None] * np.ones((5, 1)))
 
 
-def test_a_hanging_biteno_moves_as_in_mujoco():
+def test_a_suspended_biteno_moves_as_in_mujoco():
     rig = Rig(models.spec("biteno"), constants.JOINTS, rigs.CONTROL_HZ)
     start = np.array([0.0, -0.35, 0.7] * 2)
     target = start + np.array([0.2, 0.3, -0.4, -0.1, -0.2, 0.3])
@@ -304,7 +304,7 @@ def test_links_show_in_the_joints_that_carry_them(arm):
 # Hanging.
 
 
-def test_a_hung_robot_has_its_joints_and_no_base():
+def test_a_suspended_robot_has_its_joints_and_no_base():
     model = suspended(models.spec("biteno"))
     assert (model.nq, model.nv, model.nkey) == (6, 6, 0)
     assert model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT

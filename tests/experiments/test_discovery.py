@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from envs.logs import Controller, read, splits, write
+from envs.scales import measure_scales
 from envs.segments import noise
 from experiments import discover
 from experiments.discovery.blind_bench import Bench
@@ -16,7 +17,7 @@ from experiments.discovery.blind_robots import OUTSIDE, Truth, record
 from experiments.discovery.excitation import excitation
 from experiments.discovery.hypotheses import hypotheses, place_sets
 from experiments.discovery.scores import score, tally, wilson
-from experiments.discovery.setup import build_question, drop_filtered, measure_scales, read_logs
+from experiments.discovery.setup import build_question, drop_filtered, read_logs
 
 JOINTS = ("shoulder", "elbow")
 GAINS = {"kp": np.array([40.0, 20.0]), "kd": np.array([2.0, 0.8]), "torque_limit_nm": np.array([15.0, 15.0])}
@@ -137,7 +138,7 @@ def test_a_size_at_two_places_is_the_same_physical_size(spec, plain):
     from envs.rig import Rig
 
     rig = Rig(spec, JOINTS, 1000.0)
-    rig = rig.scaled(measure_scales(rig, plain))
+    rig = rig.scaled(measure_scales(rig, plain.runs))
     rows = {name: rig.effects[name] for name in ("coulomb", "torque_limit", "torque_scale")}
     for hypothesis in hypotheses(rig.axes, rig.places, rows):
         row = rig.effects[hypothesis.name]

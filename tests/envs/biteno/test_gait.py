@@ -59,7 +59,7 @@ def test_legs_stay_half_a_cycle_apart(fresh):
     assert np.all((phase >= 0) & (phase < 1))
 
 
-def test_told_to_stand_it_steps_on_the_spot():
+def test_at_zero_command_it_steps_on_the_spot():
     # Phases of stance, of a quarter and of the middle of the swing.
     feet = np.stack([gait.foot_reference(jnp.array([a, b]), STANDING) for a, b in ((0.1, 0.4), (0.625, 0.75))])
     np.testing.assert_allclose(feet[..., :2], 0.0, atol=1e-7)
@@ -77,7 +77,7 @@ def test_the_swing_lifts_by_eight_centimetres_and_no_more():
     assert np.all(lift[(phase > 0.5025) & (phase < 0.9975)] > 0)
 
 
-def test_told_to_stand_the_stance_leg_is_that_of_the_standing_pose():
+def test_at_zero_command_the_stance_leg_is_that_of_the_standing_pose():
     # The depth of 0.582 m against the pose's 0.5824: 0.4 mm, which the knee takes up by 0.004 rad.
     reference = gait.joint_reference(jnp.array([0.2, 0.3]), STANDING)
     np.testing.assert_allclose(reference, constants.STAND_RAD, atol=0.005)

@@ -31,7 +31,7 @@ def expect(values, **expected):
         np.testing.assert_allclose(values[name], value, rtol=1e-5, atol=1e-9, err_msg=name)
 
 
-def test_standing_still_as_told_pays_tracking_alone():
+def test_standing_still_at_zero_command_pays_tracking_alone():
     expect(terms())
 
 

@@ -231,7 +231,7 @@ def cell(name, row, value):
         ({k: v for k, v in columns().items() if not k.startswith("q.")}, "column 'q.left_hip': is missing"),
         (
             {k: v for k, v in columns().items() if k != "dq.left_knee"},
-            "column 'dq.left_knee': is missing, where 'dq.left_hip'",
+            "column 'dq.left_knee': is missing, although 'dq.left_hip' is there",
         ),
         ({k: v for k, v in columns().items() if k[:2] != "ta"}, "neither 'target.left_hip' nor 'tau'"),
         (

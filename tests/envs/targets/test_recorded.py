@@ -278,7 +278,7 @@ def test_a_walk_ends_with_its_first_fall(simulated):
     assert (power[0, 59:] == 0).all()
 
 
-def test_a_fall_that_nobody_saw_is_one(simulated):
+def test_a_fall_in_a_hole_of_the_rows_is_a_fall(simulated):
     """It stands, nothing is known for a while, it lies, and it is put on its feet again."""
     _, log = simulated
     run = log.runs[0]
@@ -293,7 +293,7 @@ def test_a_fall_that_nobody_saw_is_one(simulated):
     np.testing.assert_array_equal(walked.alive.sum(axis=1), [79])
 
 
-def test_a_trunk_that_sinks_has_fallen_whoever_measured_it(simulated):
+def test_a_trunk_that_sinks_has_fallen_whether_its_height_was_measured_or_not(simulated):
     """Its knees give way, its trunk stays upright, its motors stay on."""
     _, log = simulated
     run = log.runs[0]
@@ -369,7 +369,7 @@ def without(log, *names):
         (lambda log: replace(log, runs=(faster(log.runs[0], 1.2),)), "run_000: got 120 rows a second, expected"),
         (
             lambda log: replace(log, runs=(*log.runs, lying(log.runs[1]))),
-            "run_001: got no two ticks in a row on its feet",
+            "run_001: got no two consecutive ticks with the robot on its feet",
         ),
         (lambda log: replace(log, base="fixed"), "base: got fixed, expected free"),
     ],

@@ -1,0 +1,120 @@
+"""Measures how much a run disagrees with itself and with the model of its robot."""
+
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+
+from envs.logs import Run
+from envs.segments import smoothed
+
+_MOST = 2.0  # disagreement of two signals that have opposite signs
+_ROWS = 250  # at which inverse dynamics are evaluated, at most
+
+
+class Disagreement:
+    """A measure of how much a run disagrees with itself and with the model; repairs are judged by how much it falls.
+
+    It is the sum over joints of these parts, each from 0 to 2:
+
+        velocity   dq against the slope of q
+        torque     tau against the controller's torque
+        target     target against q, weighted by half because joints lag behind
+        range      share of rows outside the joint's range, times 2
+        dynamics   the controller's (or the measured) torque against the model's inverse dynamics
+
+    Make it once for a run and call it with every repaired version of it.
+
+    Args:
+      run: as it was read. Parts whose signals it lacks are left out.
+      joints: names of the joints, in the log's order.
+      model: of the robot.
+      dynamics: whether torques are compared with the model's inverse dynamics.
+    """
+
+    def __init__(self, run: Run, joints: tuple[str, ...], model: mujoco.MjModel, dynamics: bool):
+        self._model, self._data, self.dynamics = model, mujoco.MjData(model), dynamics
+        self._driven = "target" in run.signals and run.controller.kind == "pd"
+        places = [model.joint(name) for name in joints]
+        self._qpos = np.array([place.qposadr[0] for place in places])
+        self._dof = np.array([place.dofadr[0] for place in places])
+        limited = np.array([bool(model.jnt_limited[place.id]) for place in places])
+        span = np.array([place.range for place in places])
+        self._range = np.where(limited[:, None], span, [-np.inf, np.inf]).T
+
+    def __call__(self, run: Run) -> float:
+        """Sums all parts over all joints, of a run with the same signals as the first one."""
+        return float(sum(part.sum() for part in self.parts(run).values()))
+
+    def parts(self, run: Run) -> dict[str, np.ndarray]:
+        """Computes the parts by name, [joints] each, those of them whose signals the run has."""
+        position, slope = np.moveaxis(smoothed(replace(run, signals={"q": run.signals["q"]})), 1, 0)
+        found = {}
+        if "dq" in run.signals:
+            found["velocity"] = relative_difference(run.signals["dq"], slope)
+        commanded = self.commanded(run)
+        if commanded is not None and "tau" in run.signals:
+            found["torque"] = relative_difference(run.signals["tau"], commanded)
+        if "target" in run.signals:
+            found["target"] = 0.5 * relative_difference(run.signals["target"], position)
+        low, high = self._range
+        found["range"] = _MOST * ((position < low - 0.1) | (position > high + 0.1)).mean(axis=0)
+        given = commanded if commanded is not None else run.signals.get("tau")
+        if self.dynamics and given is not None:
+            needed, rows = self.needed(run, position, slope)
+            found["dynamics"] = relative_difference(_together(given)[rows], needed)
+        return found
+
+    def commanded(self, run: Run) -> np.ndarray | None:
+        """Computes the torque that the controller commanded, by its law and the readings of the log.
+
+        Returns:
+          [rows, joints] Nm; None for a servo, or where the log has no targets.
+        """
+        if not self._driven:
+            return None
+        speed = run.signals["dq"] if "dq" in run.signals else smoothed(run)[:, 1]
+        return run.impedance().torque(run.signals["target"], run.signals["q"], speed)
+
+    def needed(self, run: Run, position: np.ndarray, slope: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Computes the torque that the model needs for the measured motion, by MuJoCo's inverse dynamics.
+
+        Args:
+          run: for its time stamps.
+          position: smoothed, [rows, joints] rad.
+          slope: of the positions, smoothed, [rows, joints] rad/s.
+
+        Returns:
+          Torques [some rows, joints] Nm, and the indices of these rows.
+        """
+        acceleration = np.gradient(_together(slope), run.time, axis=0)
+        # At the ends the fit behind the smoothed states is one-sided.
+        rows = np.unique(np.linspace(10, len(run.time) - 11, _ROWS).astype(int))
+        found = np.empty((len(rows), len(self._dof)))
+        for index, row in enumerate(rows):
+            self._data.qpos[self._qpos], self._data.qvel[self._dof] = position[row], slope[row]
+            self._data.qacc[self._dof] = acceleration[row]
+            mujoco.mj_inverse(self._model, self._data)
+            found[index] = self._data.qfrc_inverse[self._dof]
+        return found, rows
+
+
+def _together(values: np.ndarray) -> np.ndarray:
+    """Moving mean over seven rows, [rows, joints]."""
+    kernel = np.ones(7) / 7.0
+    return np.stack([np.convolve(column, kernel, "same") for column in values.T], axis=1)
+
+
+def relative_difference(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Rms difference of two signals, over the mean of their own rms, at most 2: the form of every part.
+
+    Args:
+      one: [rows, joints].
+      other: [rows, joints].
+
+    Returns:
+      [joints]: 0 where the signals are equal, 2 where they are opposite.
+    """
+    difference = np.sqrt(((one - other) ** 2).mean(axis=0))
+    size = 0.5 * (np.sqrt((one**2).mean(axis=0)) + np.sqrt((other**2).mean(axis=0)))
+    return np.minimum(difference / np.maximum(size, 1e-9), _MOST)
