@@ -1,4 +1,4 @@
-"""Looks up the model of a robot by the name that a log gives it."""
+"""The model of a robot, by the name that a log gives it, and the same robot suspended: without its free base."""
 
 from pathlib import Path
 
@@ -22,3 +22,22 @@ def spec(robot: str) -> mujoco.MjSpec:
     """
     path = BUILT_IN[robot][0] if robot in BUILT_IN else Path(robot)
     return mujoco.MjSpec.from_file(str(path))
+
+
+def suspended(spec: mujoco.MjSpec) -> mujoco.MjModel:
+    """Compiles a robot as it hangs on a test rig: without its free joints and without contacts.
+
+    Args:
+      spec: of the robot; it is copied. Keyframes are dropped where a free joint is, because they contain its pose.
+    """
+    spec = spec.copy()
+    free = [joint for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_FREE]
+    if free:
+        # Keyframes would have the wrong size without the base.
+        for key in spec.keys:
+            spec.delete(key)
+    for joint in free:
+        spec.delete(joint)
+    model = spec.compile()
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+    return model

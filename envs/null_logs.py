@@ -15,7 +15,7 @@ import numpy as np
 
 from envs import sensing
 from envs.logs import Log, Run
-from envs.rig import suspended
+from envs.models import suspended
 from envs.segments import noise, quantum_of, smoothed
 
 _STEP_S = 0.0005

@@ -21,6 +21,7 @@ from envs import sensing
 from envs.chain import MIN_FRICTION_NM, Chain
 from envs.effects import EVERY
 from envs.effects.memory import LONGEST_S
+from envs.models import suspended
 from envs.segments import Segment
 from jaxtune.mjx import parameters
 from jaxtune.types import Effect, Parameter
@@ -325,22 +326,3 @@ class Rig:
         read = jax.tree.map(lambda x: x[step] + share * (x[following] - x[step]), read)
         gravity, _ = chain.stage("gravity", values, self._gravity, None, {})
         return read | {"gravity": jnp.broadcast_to(gravity, (len(step), 3))}
-
-
-def suspended(spec: mujoco.MjSpec) -> mujoco.MjModel:
-    """Compiles a robot as it hangs on a test rig: without its free joints and without contacts.
-
-    Args:
-      spec: of the robot; it is copied. Keyframes are dropped where a free joint is, because they contain its pose.
-    """
-    spec = spec.copy()
-    free = [joint for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_FREE]
-    if free:
-        # Keyframes would have the wrong size without the base.
-        for key in spec.keys:
-            spec.delete(key)
-    for joint in free:
-        spec.delete(joint)
-    model = spec.compile()
-    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
-    return model

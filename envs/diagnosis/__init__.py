@@ -23,7 +23,7 @@ from envs.diagnosis.finding import Finding
 from envs.diagnosis.physics import physics
 from envs.diagnosis.structure import structure
 from envs.logs import Log, Run
-from envs.rig import suspended
+from envs.models import suspended
 
 __all__ = ["Finding", "diagnose", "diagnose_log", "shared_findings"]
 

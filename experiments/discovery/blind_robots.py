@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 
 from envs.logs import Controller, Log, Run
-from envs.rig import suspended
+from envs.models import suspended
 from experiments.discovery.excitation import TargetRun, scaled
 
 _STEP_S = 0.0004

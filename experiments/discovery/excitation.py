@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 
 from envs.logs import Controller
-from envs.rig import suspended
+from envs.models import suspended
 
 _CHIRP_HZ = (0.5, 10.0)
 _SHARES = {"triangle": 0.35, "chirp": 0.3, "steps": 0.2, "swing": 0.15}

@@ -12,7 +12,7 @@ import numpy as np
 
 from envs.biteno import TaskConfig, constants, env
 from envs.logs import Controller, Run
-from envs.rig import suspended as fixed_base
+from envs.models import suspended as fixed_base
 from experiments.robot.player import Player
 
 _STEP_S = 0.0005

@@ -9,7 +9,7 @@ import pytest
 from envs import models
 from envs.diagnosis import Finding, diagnose, shared_findings
 from envs.logs import Controller
-from envs.rig import suspended
+from envs.models import suspended
 from experiments.discovery.blind_cases import ARM
 from experiments.discovery.blind_robots import Truth, record
 from experiments.discovery.excitation import excitation

@@ -9,7 +9,8 @@ import rigs
 from envs import models
 from envs.biteno import constants
 from envs.effects import LIBRARY
-from envs.rig import Rig, suspended
+from envs.models import suspended
+from envs.rig import Rig
 
 START = np.array([0.5, -0.7])
 
