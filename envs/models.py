@@ -19,8 +19,13 @@ def spec(robot: str) -> mujoco.MjSpec:
 
     Args:
       robot: the name of a built-in robot, or the path of an MJCF file, as in a log's `meta.yaml`.
+
+    Raises:
+      ValueError: it is neither, or the file is no MJCF.
     """
     path = BUILT_IN[robot][0] if robot in BUILT_IN else Path(robot)
+    if not path.is_file():
+        raise ValueError(f"robot: got '{robot}', expected {', '.join(BUILT_IN)} or the path of an MJCF file")
     return mujoco.MjSpec.from_file(str(path))
 
 

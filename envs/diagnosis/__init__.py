@@ -75,7 +75,7 @@ def diagnose(run: Run, joints: tuple[str, ...], model: mujoco.MjModel, base: str
     Args:
       run: as it was read.
       joints: names of the joints, in the log's order.
-      model: of the robot, suspended (`envs.rig.suspended`) where the base is fixed.
+      model: of the robot, suspended (`envs.models.suspended`) where the base is fixed.
       base: `fixed` or `free`. On a free base torques are not compared with the model's, because they depend on ground
         forces that were not measured.
 
