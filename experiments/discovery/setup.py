@@ -67,14 +67,16 @@ def read_logs(folders: Sequence[Path]) -> tuple[Log, mujoco.MjSpec]:
     if not logs:
         raise ValueError("logs: got none, expected one or more")
     first = logs[0]
-    spec = models.spec(first.robot)
+    model = models.spec(first.robot).to_xml()
     for folder, log in zip(folders, logs, strict=True):
         if log.base != "fixed":
             raise ValueError(f"{folder}: base: got '{log.base}', expected 'fixed': suspend or clamp the robot")
         if log.joints != first.joints:
             raise ValueError(f"{folder}: joints: got {log.joints}, expected {first.joints}")
-        if models.spec(log.robot).to_xml() != spec.to_xml():
+        if models.spec(log.robot).to_xml() != model:
             raise ValueError(f"{folder}: robot: got {log.robot}, expected the same model as {first.robot}")
+    # Loaded anew, because writing a specification compiles it, and a compiled one is saved with other geom masses.
+    spec = models.spec(first.robot)
     if len(logs) == 1:
         return first, spec
     runs = tuple(replace(run, name=f"{run.name}_{number}") for number, log in enumerate(logs) for run in log.runs)
