@@ -10,7 +10,6 @@ from itertools import combinations
 
 import numpy as np
 
-from jaxtune.discovery.evaluate import residuals_on
 from jaxtune.discovery.fit import (
     Fit,
     Free,
@@ -18,6 +17,7 @@ from jaxtune.discovery.fit import (
     evaluate_groups,
     hand_over,
     polish,
+    probing_step,
     refine,
     taken_over,
 )
@@ -91,16 +91,13 @@ def compete(
 
     Args:
       settings: rounds, and how many become finalists.
-      problem: the simulator and the segments.
+      problem: names the main horizon.
       floor: the noise floor.
       bases: the model without them, by horizon.
       starts: the hypotheses and where they begin.
     """
-    if not starts:
-        return Contest((), {}, ())
-    main = problem.main_horizon
-    evaluate = residuals_on(problem, floor, main, "train")
-    fits = refine(begin(bases[main], starts, evaluate), evaluate, settings.rounds)
+    main, evaluate = problem.main_horizon, floor[problem.main_horizon].residuals["train"]
+    fits = fit_beside(bases[main], starts, evaluate, settings.rounds) if starts else []
     found = {start.hypothesis.key: fit for start, fit in zip(starts, fits, strict=True) if fit.finite}
     finite = [start.hypothesis for start in starts if start.hypothesis.key in found]
     not_finite = tuple(start.hypothesis.key for start in starts if start.hypothesis.key not in found)
@@ -112,12 +109,27 @@ def compete(
     finalists.sort(key=lambda h: best[h.key].linear.loss)
     everywhere = {main: {h.key: best[h.key] for h in finalists}}
     again = [Start(h, [best[h.key].own(h)], absolute=True, like=best[h.key]) for h in finalists]
-    for horizon in problem.horizons:
+    for horizon, base in bases.items():
         if horizon != main:
-            there = residuals_on(problem, floor, horizon, "train")
-            fits = refine(begin(bases[horizon], again, there), there, _ROUNDS_MORE)
+            fits = fit_beside(base, again, floor[horizon].residuals["train"], _ROUNDS_MORE)
             everywhere[horizon] = {h.key: fit for h, fit in zip(finalists, fits, strict=True)}
     return Contest(tuple(finalists), everywhere, not_finite)
+
+
+def fit_beside(base: Fit, starts: Sequence[Start], evaluate: Evaluate, rounds: int) -> list[Fit]:
+    """Fits each hypothesis with everything that is free in a model, each in a model of its own.
+
+    Args:
+      base: the model without them.
+      starts: the hypotheses and where they begin.
+      evaluate: residuals of vectors.
+      rounds: of refinement.
+
+    Returns:
+      A fit for every start. Its last coordinates are the hypothesis' own.
+    """
+    begun = begin(base, starts, evaluate)
+    return refine(begun, evaluate, rounds)
 
 
 def begin(base: Fit, starts: Sequence[Start], evaluate: Evaluate) -> list[Fit]:
@@ -147,7 +159,7 @@ def begin(base: Fit, starts: Sequence[Start], evaluate: Evaluate) -> list[Fit]:
     found = evaluate_groups(evaluate, [[fit.vector + p @ h.directions for p in group] for fit, h, group in places])
     best = [best_point(fit, residuals) for fit, residuals in zip(kept, found, strict=True)]
     at = [(group[index], residuals[index]) for group, residuals, index in zip(points, found, best, strict=True)]
-    steps = [_probing_step(hypothesis, point) for hypothesis, (point, _) in zip(hypotheses, at, strict=True)]
+    steps = [probing_step(hypothesis, point) for hypothesis, (point, _) in zip(hypotheses, at, strict=True)]
     moved = evaluate_groups(
         evaluate,
         [
@@ -166,9 +178,3 @@ def begin(base: Fit, starts: Sequence[Start], evaluate: Evaluate) -> list[Fit]:
         )
         for fit, h, (point, residual), size, shifted in zip(kept, hypotheses, at, steps, moved, strict=True)
     ]
-
-
-def _probing_step(hypothesis: Hypothesis, point: np.ndarray) -> np.ndarray:
-    """How far to go from a point for secants, [parameters], inwards from an upper bound."""
-    size = 0.2 * np.abs(point) + 0.2 * hypothesis.probes.max(axis=0) + 0.02 * (hypothesis.probes == 0).all(axis=0)
-    return np.where(point + size > hypothesis.bounds[:, 1], -size, size)

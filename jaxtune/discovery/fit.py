@@ -23,6 +23,7 @@ _SCALES = (1.0, 0.35)  # shares of the Gauss-Newton step that are tried side by 
 _DAMPING = 1e-3
 _IDLE = 0.5  # fall of the loss that chance gives: about a half for a squared unit residual
 _PATIENCE = 2  # rounds without more than that
+_PRIOR_ROUNDS = 6  # a tenth off in the parameters, one step would leave so much that it passed for an engine gap
 _SHORTEST = 0.03  # length of a step, in coordinates, below which rounding hides what it could teach
 
 
@@ -146,6 +147,21 @@ def polish(fits: Sequence[Fit], evaluate: Evaluate, rounds: int) -> list[Fit]:
     return refine(fresh, evaluate, rounds)
 
 
+def fit_prior(prior: Free, evaluate: Evaluate, slopes: np.ndarray, weight: float) -> Fit:
+    """Fits the prior directions alone to a log, from the nominal model on.
+
+    Args:
+      prior: the directions that are free under every hypothesis.
+      evaluate: residuals of vectors on the log.
+      slopes: [segments, bins, components, directions] at the nominal model, in floor units. They may be another log's
+        of the same motion: a fit corrects them as it goes.
+      weight: share of the features that count as independent.
+    """
+    zero = np.zeros(len(prior.sd))
+    residual = evaluate((zero @ prior.directions)[None])[0]
+    return refine([Fit(prior, zero, residual, slopes.reshape(-1, len(zero)), weight)], evaluate, _PRIOR_ROUNDS)[0]
+
+
 def fit_at(free: Free, coordinates: np.ndarray, weight: float, evaluate: Evaluate) -> Fit:
     """Makes a fit of which only the coordinates are known: simulates its residuals and takes its slopes.
 
@@ -164,6 +180,12 @@ def evaluate_groups(evaluate: Evaluate, groups: Sequence[Sequence[np.ndarray]]) 
     """Evaluates the vectors of all groups in one batch; returns residuals [vectors of the group, features] by group."""
     found = evaluate(np.stack([vector for group in groups for vector in group]))
     return np.split(found, np.cumsum([len(group) for group in groups])[:-1])
+
+
+def probing_step(hypothesis: Hypothesis, point: np.ndarray) -> np.ndarray:
+    """Says how far to go from a point for a hypothesis' first secants, [parameters], inwards from an upper bound."""
+    size = 0.2 * np.abs(point) + 0.2 * hypothesis.probes.max(axis=0) + 0.02 * (hypothesis.probes == 0).all(axis=0)
+    return np.where(point + size > hypothesis.bounds[:, 1], -size, size)
 
 
 def best_point(fit: Fit, residuals: np.ndarray) -> int:

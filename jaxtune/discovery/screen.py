@@ -11,10 +11,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from jaxtune.discovery.evaluate import residuals_on
 from jaxtune.discovery.fit import Fit, taken_over
 from jaxtune.discovery.least_squares import Linear, complement
-from jaxtune.discovery.noise_floor import NoiseFloor, Say
+from jaxtune.discovery.noise_floor import Floor, NoiseFloor, Say
 from jaxtune.discovery.problem import Hypothesis, Problem
 from jaxtune.discovery.result import Settings
 from jaxtune.discovery.state import Columns, State
@@ -63,7 +62,7 @@ def screen(
     """
     base = state.fits[problem.main_horizon]
     hypotheses = untried(problem, state)
-    columns = secant_columns(problem, floor, base, hypotheses, say)
+    columns = secant_columns(floor[problem.main_horizon], base, hypotheses, say)
     state = replace(state, columns=columns)
     if state.screened:
         (found,) = scores(base, columns, hypotheses, [base])
@@ -88,30 +87,26 @@ def untried(problem: Problem, state: State) -> list[Hypothesis]:
     return [hypothesis for hypothesis in problem.hypotheses if hypothesis.key not in taken]
 
 
-def secant_columns(
-    problem: Problem, floor: NoiseFloor, fit: Fit, hypotheses: Sequence[Hypothesis], say: Say
-) -> Columns:
+def secant_columns(at: Floor, fit: Fit, hypotheses: Sequence[Hypothesis], say: Say) -> Columns:
     """Takes the secants of the residuals that the hypotheses are made of, one simulation for each.
 
     Args:
-      problem: the simulator.
-      floor: the noise floor.
-      fit: where the model stands at the main horizon.
+      at: the floor at the main horizon.
+      fit: where the model stands there.
       hypotheses: what is asked about.
       say: told about progress.
 
     Returns:
       [features] by (axis, size), per unit of the coordinate; zero where a simulation is not finite.
     """
-    evaluate = residuals_on(problem, floor, problem.main_horizon, "train")
     asked = probes(hypotheses)
-    steps = np.zeros((len(asked), problem.axes))
+    steps = np.zeros((len(asked), len(fit.vector)))
     for row, (axis, size) in enumerate(asked):
         steps[row, axis] = size
     columns = {}
     for start in range(0, len(asked), _BATCH):
         say(f"screen {start}/{len(asked)}")
-        found = evaluate(fit.vector + steps[start : start + _BATCH])
+        found = at.residuals["train"](fit.vector + steps[start : start + _BATCH])
         for key, moved in zip(asked[start : start + _BATCH], found, strict=True):
             columns[key] = np.nan_to_num((moved - fit.residual) / key[1], posinf=0.0, neginf=0.0)
     return columns

@@ -68,10 +68,14 @@ def evaluator(problem: Problem, segments: Segments, scale: np.ndarray) -> Evalua
     return lambda vectors: (residuals(problem, vectors, segments) / scale).reshape(len(vectors), -1)
 
 
-def secants(problem: Problem, vector: np.ndarray, directions: np.ndarray, segments: Segments) -> np.ndarray:
-    """Takes secants of the residuals along directions [k, axes], from a vector [axes]; one simulation for each.
+def secants(problem: Problem, segments: Segments, vector: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Takes secants of the residuals, one simulation for each; delays, limits and backlash have no derivative at zero.
 
-    Secants and not derivatives: delays, limits and backlash have no derivative at zero.
+    Args:
+      problem: the simulator.
+      segments: what was measured.
+      vector: [axes] where the secants begin.
+      directions: [k, axes] how far they go.
 
     Returns:
       Differences r(vector + direction) - r(vector), [segments, bins, components, k].

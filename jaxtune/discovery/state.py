@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from jaxtune.discovery.decide import Evidence, Thresholds
-from jaxtune.discovery.evaluate import stand_at
+from jaxtune.discovery.evaluate import fit_null, stand_at
 from jaxtune.discovery.fit import Fit, Free
-from jaxtune.discovery.noise_floor import NoiseFloor
+from jaxtune.discovery.noise_floor import Calibration, Floor, NoiseFloor
 from jaxtune.discovery.problem import Hypothesis, Problem
 
 Columns = Mapping[tuple[int, float], np.ndarray]
@@ -80,6 +80,24 @@ class State:
         return replace(self, fits=fits, columns=None, **changes)
 
 
+def begin(problem: Problem, floor: NoiseFloor, calibration: Calibration | None) -> State:
+    """Makes the first state: the null is fitted, and nothing was accepted yet.
+
+    Args:
+      problem: names the main horizon.
+      floor: the noise floor.
+      calibration: thresholds that are known already.
+
+    Raises:
+      ValueError: the nominal model cannot be simulated on these logs.
+    """
+    null = fit_null(floor[problem.main_horizon])
+    state = State(fits={problem.main_horizon: null}, null=null)
+    if calibration is None:
+        return state
+    return replace(state, least_gain=calibration.gain, penalty=calibration.penalty)
+
+
 def to_json(problem: Problem, state: State) -> dict[str, Any]:
     """Turns a state into numbers, texts, lists and dictionaries of them.
 
@@ -113,8 +131,8 @@ def from_json(problem: Problem, floor: NoiseFloor, saved: Mapping[str, Any]) -> 
     by_key = {hypothesis.key: hypothesis for hypothesis in problem.hypotheses}
     fits = zip(problem.horizons, saved["fits"], strict=True)
     return State(
-        fits={horizon: _fit_from_json(problem, floor, horizon, fit) for horizon, fit in fits},
-        null=_fit_from_json(problem, floor, problem.main_horizon, saved["null"]),
+        fits={horizon: _fit_from_json(floor[horizon], fit) for horizon, fit in fits},
+        null=_fit_from_json(floor[problem.main_horizon], saved["null"]),
         terms=tuple(_term_from_json(by_key, term) for term in saved["rungs"]),
         least_gain=saved["healthy_gain"],
         penalty=saved["penalty"],
@@ -133,9 +151,9 @@ def _fit_to_json(fit: Fit) -> dict[str, Any]:
     return {"free": free, "coordinates": fit.coordinates.tolist()}
 
 
-def _fit_from_json(problem: Problem, floor: NoiseFloor, horizon: float, saved: Mapping[str, Any]) -> Fit:
+def _fit_from_json(at: Floor, saved: Mapping[str, Any]) -> Fit:
     free = Free(**{name: np.array(values) for name, values in saved["free"].items()})
-    return stand_at(problem, floor, horizon, free, np.array(saved["coordinates"]))
+    return stand_at(at, free, np.array(saved["coordinates"]))
 
 
 def _term_from_json(by_key: Mapping[str, Hypothesis], saved: Mapping[str, Any]) -> AcceptedTerm:
