@@ -12,16 +12,17 @@ import numpy as np
 from jaxtune.discovery.fit import Fit
 from jaxtune.discovery.problem import Hypothesis
 from jaxtune.discovery.resample import (
+    alike,
     bagged,
     blocks,
-    in_blocks,
+    confirmed,
+    losses,
     max_t,
-    standard_error,
+    paired,
     standard_errors,
     t_statistic,
 )
 
-_TIE = 0.03  # of what is left: less is nobody's victory, however significant
 _EQUAL = 2.0  # standard errors within which two hypotheses are not distinguishable
 _ABOUT_BEST = 1.0  # standard errors within which the simplest hypothesis is taken
 _PAYS = 1.0  # t below which an effect that was accepted earlier may go
@@ -115,15 +116,17 @@ def decide(comparison: Comparison, least_gain: float, level: float, same: float)
       level: probability of accepting any finalist where nothing is missing.
       same: share of the best gain from which on another name may as well be right.
     """
-    lost = _lost_everywhere(comparison)
-    draws = blocks(np.concatenate([comparison.run_of_train, comparison.runs[comparison.main]]))
+    main, lost = comparison.main, _lost_everywhere(comparison)
+    draws = blocks(np.concatenate([comparison.run_of_train, comparison.runs[main]]))
     about_best, equal = alike(lost, draws, _ABOUT_BEST), alike(lost, draws, _EQUAL)
     simplest = [h for h in comparison.hypotheses if h.key in about_best]
     chosen = min(simplest, key=lambda h: (len(h.directions), comparison.fits[h.key].linear.loss))
+    gains = {key: paired(comparison.before[main], after) for key, after in comparison.after[main].items()}
+    # Each part of a pair must gain what chance gives.
+    least = Thresholds(t=max_t(gains, comparison.runs[main], level), gain=len(chosen.singles) * least_gain)
     evidence = weigh_evidence(comparison, chosen, equal)
-    thresholds = set_thresholds(comparison, chosen, least_gain, level)
     confusable = confusable_names(comparison, chosen, equal, same)
-    return Decision(chosen, evidence, thresholds, passes(evidence, thresholds), confusable)
+    return Decision(chosen, evidence, least, passes(evidence, least), confusable)
 
 
 def weigh_evidence(comparison: Comparison, chosen: Hypothesis, equal: Sequence[str]) -> Evidence:
@@ -132,12 +135,15 @@ def weigh_evidence(comparison: Comparison, chosen: Hypothesis, equal: Sequence[s
     A bagged refit that chooses an equally good hypothesis, or the same name at some of the same places, counts for it:
     it would be the same answer.
     """
-    main = comparison.main
+    main, fit = comparison.main, comparison.fits[chosen.key]
     before, after, run = comparison.before[main], comparison.after[main][chosen.key], comparison.runs[main]
-    fit = comparison.fits[chosen.key]
+    share = bagged({key: one.linear for key, one in comparison.fits.items()}, comparison.run_of_train)
+    about_best = {
+        horizon: alike({key: losses(one) for key, one in found.items()}, blocks(comparison.runs[horizon]), _ABOUT_BEST)
+        for horizon, found in comparison.after.items()
+    }
     own, (low, high) = fit.own(chosen), chosen.bounds.T
     errors = standard_errors(fit, comparison.run_of_train)[-len(own) :]
-    share = bagged({key: one.linear for key, one in comparison.fits.items()}, comparison.run_of_train)
     return Evidence(
         gain=comparison.base.linear.loss - fit.linear.loss,
         t=t_statistic(paired(before, after), run),
@@ -145,23 +151,9 @@ def weigh_evidence(comparison: Comparison, chosen: Hypothesis, equal: Sequence[s
         floors=_largest_fall(before, after),
         interval=_interval(chosen, own, errors),
         inside=bool(((low < own) & (own < high)).all()),
-        horizons=sum(_is_about_best(comparison, horizon, chosen) for horizon in comparison.after),
+        horizons=sum(chosen.key in best for best in about_best.values()),
         chosen=sum(share[h.key] for h in comparison.hypotheses if h.key in equal or _same_answer(h, chosen)),
     )
-
-
-def set_thresholds(comparison: Comparison, chosen: Hypothesis, least_gain: float, level: float) -> Thresholds:
-    """Computes what the evidence has to exceed; a pair must gain what chance gives for each of its parts.
-
-    Args:
-      comparison: the finalists on `select`.
-      chosen: the hypothesis that is tested.
-      least_gain: gain that chance gives a single hypothesis.
-      level: probability of accepting any finalist where nothing is missing.
-    """
-    main = comparison.main
-    gains = {key: paired(comparison.before[main], after) for key, after in comparison.after[main].items()}
-    return Thresholds(t=max_t(gains, comparison.runs[main], level), gain=len(chosen.singles) * least_gain)
 
 
 def confusable_names(comparison: Comparison, chosen: Hypothesis, equal: Sequence[str], same: float) -> tuple[str, ...]:
@@ -210,49 +202,6 @@ def no_longer_pays(without: np.ndarray, now: np.ndarray, run: np.ndarray, weight
     return t < _PAYS and not confirmed(without, now, run, weight) > least_gain
 
 
-def paired(before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Returns how much better every segment is, [segments], from residuals [segments, bins, components]."""
-    return losses(before) - losses(after)
-
-
-def losses(residual: np.ndarray) -> np.ndarray:
-    """Returns what a segment's residuals [segments, bins, components] count for: their root mean square, [segments].
-
-    Squares would let the few segments in which everything is far off drown the others; logarithms would hide what an
-    effect explains where another one is missing too.
-    """
-    return np.sqrt((residual**2).mean(axis=(1, 2)))
-
-
-def confirmed(before: np.ndarray, after: np.ndarray, run: np.ndarray, weight: float) -> float:
-    """Returns the fall of the loss where nothing was fitted, without the block of segments that gains most.
-
-    It is in units of what is left, where that is more than the floor: among large residuals chance is large too.
-
-    Args:
-      before: [segments, bins, components] residuals without the hypothesis.
-      after: the same with it.
-      run: [segments] index of each segment's run.
-      weight: share of the bins that count as independent.
-    """
-    gains = in_blocks(weight * (before**2 - after**2).sum(axis=(1, 2)), run)
-    return float((gains.sum() - max(gains.max(), 0.0)) / max((after**2).mean(), 1.0))
-
-
-def alike(lost: Mapping[str, np.ndarray], draws: np.ndarray, errors: float) -> list[str]:
-    """Lists the hypotheses that are not distinguishable from the best, best first.
-
-    Args:
-      lost: what every segment counts for, [segments] by hypothesis.
-      draws: [draws, segments] of `resample.blocks`.
-      errors: how many standard errors of the paired difference count as a difference.
-    """
-    order = sorted(lost, key=lambda key: lost[key].mean())
-    worse = {key: lost[key] - lost[order[0]] for key in order}
-    tie = _TIE * lost[order[0]].mean()
-    return [key for key in order if worse[key].mean() <= max(errors * standard_error(worse[key], draws), tie)]
-
-
 def _lost_everywhere(comparison: Comparison) -> dict[str, np.ndarray]:
     """What every segment of `train` and `select` counts for at the main horizon, [segments] by key."""
     shape = comparison.before[comparison.main].shape[1:]
@@ -260,12 +209,6 @@ def _lost_everywhere(comparison: Comparison) -> dict[str, np.ndarray]:
         key: np.concatenate([losses(comparison.fits[key].residual.reshape(-1, *shape)), losses(on_select)])
         for key, on_select in comparison.after[comparison.main].items()
     }
-
-
-def _is_about_best(comparison: Comparison, horizon: float, chosen: Hypothesis) -> bool:
-    """Whether a hypothesis is best on `select` at a horizon, or within a standard error of the best."""
-    lost = {key: losses(residual) for key, residual in comparison.after[horizon].items()}
-    return chosen.key in alike(lost, blocks(comparison.runs[horizon]), _ABOUT_BEST)
 
 
 def _same_answer(one: Hypothesis, chosen: Hypothesis) -> bool:

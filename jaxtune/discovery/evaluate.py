@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from jaxtune.discovery.fit import Fit, Free, fit_at, fit_prior, refine
+from jaxtune.discovery.fit import Fit, fit_at, fit_prior, refine
 from jaxtune.discovery.noise_floor import Floor, NoiseFloor
 from jaxtune.discovery.problem import Hypothesis, Problem
 
@@ -28,11 +28,6 @@ def fit_null(at: Floor) -> Fit:
     return null
 
 
-def stand_at(at: Floor, free: Free, coordinates: np.ndarray) -> Fit:
-    """Makes the fit of a model of which only the coordinates [coordinates] are known, as after loading a state."""
-    return fit_at(free, coordinates, at.weight, at.residuals["train"])
-
-
 def refit(at: Floor, fit: Fit, rounds: int) -> Fit:
     """Fits a model again with fresh slopes, at a horizon that may not be the one it was fitted at.
 
@@ -42,7 +37,8 @@ def refit(at: Floor, fit: Fit, rounds: int) -> Fit:
     Raises:
       ValueError: the model cannot be simulated on these segments.
     """
-    (found,) = refine([stand_at(at, fit.free, fit.coordinates)], at.residuals["train"], rounds)
+    fresh = fit_at(fit.free, fit.coordinates, at.weight, at.residuals["train"])
+    (found,) = refine([fresh], at.residuals["train"], rounds)
     if not np.isfinite(found.residual).all():
         raise ValueError(f"model: it breaks within {at.horizon:g} s of these logs")
     return found

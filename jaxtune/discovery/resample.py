@@ -14,6 +14,7 @@ from jaxtune.discovery.least_squares import Linear
 LENGTH = 3
 """Segments of a block."""
 _REFITS = 200
+_TIE = 0.03  # of what is left: less is nobody's victory, however significant
 
 
 def blocks(run: np.ndarray, draws: int = 1000, seed: int = 0) -> np.ndarray:
@@ -56,6 +57,20 @@ def in_blocks(values: np.ndarray, run: np.ndarray) -> np.ndarray:
     return np.add.reduceat(values, np.concatenate(starts), axis=0)
 
 
+def losses(residual: np.ndarray) -> np.ndarray:
+    """Returns what a segment's residuals [segments, bins, components] count for: their root mean square, [segments].
+
+    Squares would let the few segments in which everything is far off drown the others; logarithms would hide what an
+    effect explains where another one is missing too.
+    """
+    return np.sqrt((residual**2).mean(axis=(1, 2)))
+
+
+def paired(before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """Returns how much better every segment is, [segments], from residuals [segments, bins, components]."""
+    return losses(before) - losses(after)
+
+
 def t_statistic(gains: np.ndarray, run: np.ndarray) -> float:
     """Returns the mean of gains [segments] over its standard error, which is bootstrapped in blocks."""
     return float(gains.mean() / standard_error(gains, blocks(run)))
@@ -77,6 +92,35 @@ def max_t(gains: Mapping[str, np.ndarray], run: np.ndarray, level: float) -> flo
     for values in gains.values():
         found.append((values[draws].mean(axis=1) - values.mean()) / standard_error(values, draws))
     return float(np.quantile(np.max(found, axis=0), 1.0 - level))
+
+
+def confirmed(before: np.ndarray, after: np.ndarray, run: np.ndarray, weight: float) -> float:
+    """Returns the fall of the loss where nothing was fitted, without the block of segments that gains most.
+
+    It is in units of what is left, where that is more than the floor: among large residuals chance is large too.
+
+    Args:
+      before: [segments, bins, components] residuals without the hypothesis.
+      after: the same with it.
+      run: [segments] index of each segment's run.
+      weight: share of the bins that count as independent.
+    """
+    gains = in_blocks(weight * (before**2 - after**2).sum(axis=(1, 2)), run)
+    return float((gains.sum() - max(gains.max(), 0.0)) / max((after**2).mean(), 1.0))
+
+
+def alike(lost: Mapping[str, np.ndarray], draws: np.ndarray, errors: float) -> list[str]:
+    """Lists the hypotheses that are not distinguishable from the best, best first.
+
+    Args:
+      lost: what every segment counts for, [segments] by hypothesis.
+      draws: [draws, segments] of `resample.blocks`.
+      errors: how many standard errors of the paired difference count as a difference.
+    """
+    order = sorted(lost, key=lambda key: lost[key].mean())
+    worse = {key: lost[key] - lost[order[0]] for key in order}
+    tie = _TIE * lost[order[0]].mean()
+    return [key for key in order if worse[key].mean() <= max(errors * standard_error(worse[key], draws), tie)]
 
 
 def bagged(fits: Mapping[str, Linear], run: np.ndarray) -> dict[str, float]:

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from jaxtune.discovery.decide import Evidence, Thresholds
-from jaxtune.discovery.evaluate import fit_null, stand_at
-from jaxtune.discovery.fit import Fit, Free
+from jaxtune.discovery.evaluate import fit_null
+from jaxtune.discovery.fit import Fit, Free, fit_at
 from jaxtune.discovery.noise_floor import Calibration, Floor, NoiseFloor
 from jaxtune.discovery.problem import Hypothesis, Problem
 
@@ -129,11 +129,12 @@ def to_json(problem: Problem, state: State) -> dict[str, Any]:
 def from_json(problem: Problem, floor: NoiseFloor, saved: Mapping[str, Any]) -> State:
     """Restores the state that `to_json` turned into `saved`, for the same problem and noise floor."""
     by_key = {hypothesis.key: hypothesis for hypothesis in problem.hypotheses}
+    terms = tuple(_term_from_json(by_key, term) for term in saved["rungs"])
     fits = zip(problem.horizons, saved["fits"], strict=True)
     return State(
         fits={horizon: _fit_from_json(floor[horizon], fit) for horizon, fit in fits},
         null=_fit_from_json(floor[problem.main_horizon], saved["null"]),
-        terms=tuple(_term_from_json(by_key, term) for term in saved["rungs"]),
+        terms=terms,
         least_gain=saved["healthy_gain"],
         penalty=saved["penalty"],
         promise=saved["promise"],
@@ -153,7 +154,7 @@ def _fit_to_json(fit: Fit) -> dict[str, Any]:
 
 def _fit_from_json(at: Floor, saved: Mapping[str, Any]) -> Fit:
     free = Free(**{name: np.array(values) for name, values in saved["free"].items()})
-    return stand_at(at, free, np.array(saved["coordinates"]))
+    return fit_at(free, np.array(saved["coordinates"]), at.weight, at.residuals["train"])
 
 
 def _term_from_json(by_key: Mapping[str, Hypothesis], saved: Mapping[str, Any]) -> AcceptedTerm:

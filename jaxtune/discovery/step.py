@@ -77,7 +77,8 @@ def step(
         return replace(state, finished=True), Info()
     say(f"fit {len(chosen)}")
     before = replace(state, fits=refit_others(floor, state.fits, main, 2 * settings.rounds))
-    contest = compete(settings, problem, floor, before.fits, starts_of_singles(chosen, scores))
+    singles = starts_of_singles(chosen, scores)
+    contest = compete(settings, problem, floor, before.fits, singles)
     state, decisions = accept(settings, problem, floor, before, contest)
     if not state.terms and not at_floor:
         pairs = starts_of_pairs(settings, problem, contest)

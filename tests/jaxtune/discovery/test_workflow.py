@@ -152,10 +152,11 @@ def test_a_step_changes_nothing_that_it_is_given():
     asked = problem({"coulomb": 0.6, "push": 0.8})
     floor = measured_floor(asked)
     before = state.begin(asked, floor, None)
-    kept = pickle.dumps((floor, before))
+    arrays = lambda: pickle.dumps([(at.scale, at.slopes, at.null_fits) for at in floor.values()])  # noqa: E731
+    kept = pickle.dumps(before), arrays()
     first, info = step.step(Settings(), asked, floor, before)
     assert info.accepted
-    assert pickle.dumps((floor, before)) == kept
+    assert (pickle.dumps(before), arrays()) == kept
     # The same step from the same state is the same step.
     again, _ = step.step(Settings(), asked, floor, before)
     assert state.to_json(asked, again) == state.to_json(asked, first)
