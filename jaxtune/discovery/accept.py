@@ -34,6 +34,7 @@ def accept(
       a finalist.
     """
     state = replace(state, not_finite=(*state.not_finite, *contest.not_finite))
+    # All of the shortlist may have broken the simulation.
     if not contest.hypotheses:
         return state, ()
     comparison = compare(problem, floor, state, contest)
@@ -55,6 +56,7 @@ def compare(problem: Problem, floor: NoiseFloor, state: State, contest: Contest)
     """
     main, before, after = problem.main_horizon, {}, {}
     for horizon, fits in contest.fits.items():
+        # The model and all finalists in one batch: a program is compiled for any number of vectors.
         vectors = np.stack([state.fits[horizon].vector, *(fits[h.key].vector for h in contest.hypotheses)])
         found = floor[horizon].residuals["select"](vectors)
         before[horizon], *others = (floor[horizon].unflatten(one) for one in found)
@@ -72,7 +74,10 @@ def compare(problem: Problem, floor: NoiseFloor, state: State, contest: Contest)
 
 
 def extend(state: State, contest: Contest, decision: Decision) -> State:
-    """Adds an accepted hypothesis to the model: the finalist's fits become the model's."""
+    """Adds an accepted hypothesis to the model: the finalist's fits, at all horizons, become the model's.
+
+    Of a pair each part is a term of its own, so that each can be ablated and dropped alone.
+    """
     terms = [
         AcceptedTerm(part, decision.evidence, decision.thresholds, decision.confusable_with)
         for part in decision.hypothesis.singles
@@ -92,6 +97,7 @@ def drop_unpaid(problem: Problem, floor: NoiseFloor, state: State) -> State:
       state: right after an acceptance.
     """
     at, run = floor[problem.main_horizon], problem.data["select"][problem.main_horizon].run
+    # The parts of a pair were accepted by the same evidence, and neither is older than the other.
     newest = state.terms[-1].evidence
     for term in [term for term in state.terms if term.evidence is not newest]:
         without = {horizon: ablate(floor[horizon], fit, term.hypothesis) for horizon, fit in state.fits.items()}

@@ -27,12 +27,12 @@ from jaxtune.discovery.result import Settings
 from jaxtune.discovery.screen import Score
 from jaxtune.discovery.simulation import Evaluate
 
-_ROUNDS_MORE = 2  # of a fit that starts from the one at the main horizon
+_ROUNDS_MORE = 2  # of a fit that starts from the one at the main horizon: it is nearly there
 
 
 @dataclass(frozen=True)
 class Contest:
-    """Finalists, best first, and their fits."""
+    """The outcome of a contest: the finalists, best first, their fits at all horizons, and who broke the simulation."""
 
     hypotheses: tuple[Hypothesis, ...]
     fits: Mapping[float, Mapping[str, Fit]]
@@ -43,7 +43,10 @@ class Contest:
 
 @dataclass(frozen=True)
 class Start:
-    """Where the fit of a hypothesis begins."""
+    """Where the fit of a hypothesis begins.
+
+    Losses of delays, limits and play have several minima, so that a fit tries several points and starts at the best.
+    """
 
     hypothesis: Hypothesis
     points: Sequence[np.ndarray]
@@ -104,6 +107,7 @@ def compete(
     finalists = sorted(finite, key=lambda h: found[h.key].linear.loss)[: settings.finalists]
     if not finalists:
         return Contest((), {}, not_finite)
+    # Learnt slopes are good enough to choose finalists; intervals and bagged refits need secants.
     polished = polish([found[h.key] for h in finalists], evaluate, settings.rounds)
     best = {h.key: fit for h, fit in zip(finalists, polished, strict=True)}
     finalists.sort(key=lambda h: best[h.key].linear.loss)
@@ -148,6 +152,7 @@ def begin(base: Fit, starts: Sequence[Start], evaluate: Evaluate) -> list[Fit]:
     kept, points = [], []
     for start in starts:
         hypothesis = start.hypothesis
+        # Beside the nominal coordinate for the same parameter, the hypothesis' own would be the same direction twice.
         fit, stood = hand_over(base, taken_over(base.free, hypothesis), hypothesis)
         if start.like:
             fit = replace(fit, coordinates=start.like.coordinates[: len(fit.coordinates)])

@@ -30,7 +30,7 @@ _PAYS = 1.0  # t below which an effect that was accepted earlier may go
 
 @dataclass(frozen=True)
 class Evidence:
-    """What speaks for a hypothesis against the model without it."""
+    """What speaks for a hypothesis against the model without it: one number or interval for each test of `passes`."""
 
     gain: float
     """Fall of the loss of the fit, on `train`."""
@@ -53,7 +53,7 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Thresholds:
-    """What the evidence has to exceed, or to reach."""
+    """What the evidence has to exceed (`t`, `gain`) or to reach (the others) for a hypothesis to be accepted."""
 
     t: float
     """Max-t threshold over all hypotheses that are compared on `select`, at once."""
@@ -66,7 +66,10 @@ class Thresholds:
 
 @dataclass(frozen=True, kw_only=True)
 class Comparison:
-    """Finalists side by side, on segments that they were not fitted to."""
+    """Finalists side by side, on segments that they were not fitted to; all that a decision needs.
+
+    The model without any of them is compared too: it is what they have to beat.
+    """
 
     hypotheses: Sequence[Hypothesis]
     """The finalists, best on `train` first."""
@@ -88,7 +91,7 @@ class Comparison:
 
 @dataclass(frozen=True)
 class Decision:
-    """What became of the best finalist."""
+    """What became of the best finalist: the chosen hypothesis, its evidence and whether it passed every test."""
 
     hypothesis: Hypothesis
     evidence: Evidence
@@ -100,7 +103,7 @@ class Decision:
 
     @property
     def accepted(self) -> bool:
-        """True if it passed every test."""
+        """True if the hypothesis passed every test, and thus joins the model."""
         return all(self.tests.values())
 
 
@@ -142,6 +145,7 @@ def weigh_evidence(comparison: Comparison, chosen: Hypothesis, equal: Sequence[s
         horizon: alike({key: losses(one) for key, one in found.items()}, blocks(comparison.runs[horizon]), _ABOUT_BEST)
         for horizon, found in comparison.after.items()
     }
+    # The prior directions come first, the hypothesis' own coordinates last.
     own, (low, high) = fit.own(chosen), chosen.bounds.T
     errors = standard_errors(fit, comparison.run_of_train)[-len(own) :]
     return Evidence(
@@ -179,10 +183,13 @@ def passes(evidence: Evidence, thresholds: Thresholds) -> dict[str, bool]:
         # What shows in few segments alone has a large standard error however clear it is in those: it is enough if it
         # gains more where it was not fitted than anything gains on null logs where it was.
         "significant": evidence.t > thresholds.t or evidence.confirmed > thresholds.gain,
+        # Significant is not enough: with thousands of residuals every mimic of an engine gap is.
         "beyond_healthy": evidence.gain > thresholds.gain,
         "floor_unit": evidence.floors >= thresholds.floors,
+        # A fit that ran into a bound stands in for another effect.
         "inside_bounds": evidence.inside,
         "clear_of_zero": low > 0 or high < 0,
+        # Long segments let a wrong effect compensate, short ones are blind to slow bias: two must agree.
         "horizons": evidence.horizons >= thresholds.horizons,
         "bagged": evidence.chosen >= thresholds.chosen,
     }

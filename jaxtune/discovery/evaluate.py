@@ -37,6 +37,7 @@ def refit(at: Floor, fit: Fit, rounds: int) -> Fit:
     Raises:
       ValueError: the model cannot be simulated on these segments.
     """
+    # Of the old fit no residual and no slope is kept: both may be another horizon's, or many steps old.
     fresh = fit_at(fit.free, fit.coordinates, at.weight, at.residuals["train"])
     (found,) = refine([fresh], at.residuals["train"], rounds)
     if not np.isfinite(found.residual).all():
@@ -67,6 +68,7 @@ def ablate(at: Floor, fit: Fit, hypothesis: Hypothesis) -> Fit:
     own = fit.along(hypothesis)
     slopes = at.slopes.reshape(len(fit.residual), -1)
     kept = fit.free.directions[fit.free.nominal & ~own]
+    # Directions of the prior that the model has not: the effect had taken them over.
     back = np.array([not any((row == mine).all() for mine in kept) for row in at.prior.directions])
     start = replace(
         fit,

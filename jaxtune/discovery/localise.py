@@ -72,6 +72,7 @@ def cells(
     joints = [joint for signal, joint in components if signal == "q"]
     found = []
     for index, (signal, joint) in enumerate(components):
+        # Components that belong to no joint, as of the gravity vector, go by the first joint's regime.
         column = regimes[..., joints.index(joint) if joint in joints else 0]
         for number, name in enumerate(regime_names):
             there = (column == number).astype(float)
@@ -133,6 +134,7 @@ def free_torque(residual: np.ndarray, slopes: np.ndarray, penalty: float) -> np.
     """
     slopes = _unit_length(slopes)
     torque = np.zeros((len(residual), slopes.shape[-1]))
+    # The step of proximal gradient descent: one over the largest curvature.
     rate = 1.0 / max(np.linalg.eigvalsh(np.einsum("sfi,sfj->sij", slopes, slopes)).max(), 1e-12)
     for _ in range(_LASSO_ROUNDS):
         left = residual + np.einsum("sfj,sj->sf", slopes, torque)

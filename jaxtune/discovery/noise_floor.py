@@ -16,7 +16,7 @@ import numpy as np
 from jaxtune.discovery.fit import Fit, Free, fit_prior
 from jaxtune.discovery.least_squares import Linear
 from jaxtune.discovery.problem import Problem
-from jaxtune.discovery.simulation import Evaluate, evaluator, residuals, secants
+from jaxtune.discovery.simulation import Evaluate, flat_residuals, residuals, secants
 
 _FURTHEST = 9.0  # prior deviations: with a spread of a tenth, further down a positive parameter would be negative
 _LATEST = 2.0  # timing directions are half a controller period, and nothing is later than a whole one
@@ -53,7 +53,7 @@ class Floor:
     """The prior directions fitted to `train` of every null log; empty where the floor came from a `Calibration`."""
 
     def unflatten(self, flat: np.ndarray) -> np.ndarray:
-        """Reshapes flat residuals [features, ...] to [segments, bins, components, ...]."""
+        """Reshapes flat residuals [features, ...], which fits work on, to [segments, bins, components, ...]."""
         return flat.reshape(-1, *self.scale["train"].shape, *flat.shape[1:])
 
 
@@ -96,13 +96,13 @@ def measure_at(problem: Problem, horizon: float, known: tuple[Mapping[str, np.nd
     """Measures the noise floor at one horizon from the problem's null logs, unless its scale and weight are known."""
     prior, slopes = prior_directions(problem), prior_slopes(problem, horizon)
     scale, weight, null_fits = (*known, ()) if known else _from_null_logs(problem, horizon, prior, slopes)
-    of_split = {split: data[horizon] for split, data in problem.data.items()}
+    segments = {split: data[horizon] for split, data in problem.data.items()}
     return Floor(
         horizon=horizon,
         scale=scale,
         weight=weight,
-        residuals={split: evaluator(problem, segments, scale[split]) for split, segments in of_split.items()},
-        secants=partial(secants, problem, of_split["train"]),
+        residuals={split: partial(flat_residuals, problem, segments[split], scale[split]) for split in segments},
+        secants=partial(secants, problem, segments["train"]),
         prior=prior,
         slopes=slopes / scale["train"][..., None],
         null_fits=null_fits,
@@ -115,6 +115,7 @@ def prior_directions(problem: Problem) -> Free:
     Every direction is one standard deviation of its prior. A null whose nominal parameters could not move would call
     every ordinary tolerance of a mass or a gain a missing effect.
     """
+    # Entries of the prior that are zero are axes of effects, which the nominal model has not.
     directions = np.concatenate([np.diag(problem.prior)[problem.prior > 0], problem.timing])
     count = len(directions)
     bounds = np.tile([-_FURTHEST, _FURTHEST], (count, 1))
@@ -156,12 +157,15 @@ def _from_null_logs(
     train = [log["train"][horizon] for log in problem.null_logs]
     raw = [simulate(np.zeros(problem.axes), log)[0] for log in train]
     unit, weight = np.sqrt((np.concatenate(raw) ** 2).mean(axis=0)), 1.0
+    # The first unit holds what the nominal parameters are off, which the second no longer does.
     for _ in range(2):
         left = np.stack([left_by_prior(log / unit, slopes / unit[..., None], weight) for log in raw])
         unit, weight = _rms_floor(unit, left), _independent_share(left)
-    fits = [fit_prior(prior, evaluator(problem, log, unit), slopes / unit[..., None], weight) for log in train]
+    evaluate = [partial(flat_residuals, problem, log, unit) for log in train]
+    fits = [fit_prior(prior, residuals_of, slopes / unit[..., None], weight) for residuals_of in evaluate]
     left = np.stack([fit.residual.reshape(raw[0].shape) for fit in fits])
     scale, weight = {"train": _rms_floor(unit, left)}, _independent_share(left)
+    # Nothing is fitted there: the fit to `train` is taken as it is.
     for split in problem.data.keys() - scale.keys():
         logs = zip(fits, problem.null_logs, strict=True)
         there = [simulate(fit.vector, log[split][horizon])[0] for fit, log in logs]

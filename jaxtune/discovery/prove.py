@@ -21,7 +21,7 @@ _PERFECT = 1.0  # floor units
 
 @dataclass(frozen=True)
 class Conclusion:
-    """The verdict and what it stands on; the fields are those of `Result`."""
+    """The verdict and what it stands on, before any sealed segment was looked at; the fields are those of `Result`."""
 
     verdict: str
     errors: np.ndarray
@@ -51,6 +51,7 @@ def conclude(settings: Settings, problem: Problem, floor: NoiseFloor, state: Sta
         return Conclusion("unnamed", errors, changed={}, changed_alike={}, residual=learned)
     changed = _changed_parameters(settings, problem, fit, errors)
     alike = _mistaken_for(settings, problem, at, state, tuple(changed), say)
+    # A term about a nominal parameter is a change, however large: the model has the parameter.
     if any(not problem.is_nominal(term.hypothesis) for term in state.terms):
         verdict = "named"
     else:
@@ -121,6 +122,7 @@ def _mistaken_for(
     settings: Settings, problem: Problem, at: Floor, state: State, axes: Sequence[int], say: Say
 ) -> dict[int, tuple[str, ...]]:
     """Names of the effects that look like the change of each of these nominal axes."""
+    # The screen's secants may be gone, and to take them anew is as long as a screen.
     if not axes:
         return {}
     fit = state.fits[at.horizon]

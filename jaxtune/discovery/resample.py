@@ -38,6 +38,7 @@ def blocks(run: np.ndarray, draws: int = 1000, seed: int = 0) -> np.ndarray:
     if len(np.unique(run)) != 1 + np.count_nonzero(np.diff(run)):
         raise ValueError("run: got segments of a run apart from each other, expected them to follow on each other")
     _, first, length = np.unique(run, return_index=True, return_counts=True)
+    # For every segment, where its run begins and how long it is.
     which = np.searchsorted(np.sort(first), np.arange(count), side="right") - 1
     first, length = (values[np.argsort(first)][which] for values in (first, length))
     start = np.random.default_rng(seed).integers(count, size=(draws, -(-count // LENGTH)))[..., None]
@@ -51,7 +52,11 @@ def standard_error(values: np.ndarray, draws: np.ndarray) -> float:
 
 
 def in_blocks(values: np.ndarray, run: np.ndarray) -> np.ndarray:
-    """Sums values [segments, ...] over consecutive blocks that do not overlap; returns [blocks, ...]."""
+    """Sums values [segments, ...] over consecutive blocks that do not overlap, for sums that must be independent.
+
+    Returns [blocks, ...].
+    """
+    # A block ends where its run does.
     first = np.flatnonzero(np.diff(run, prepend=run[0] - 1))
     starts = [np.arange(a, b, LENGTH) for a, b in zip(first, [*first[1:], len(run)], strict=True)]
     return np.add.reduceat(values, np.concatenate(starts), axis=0)
@@ -67,7 +72,7 @@ def losses(residual: np.ndarray) -> np.ndarray:
 
 
 def paired(before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Returns how much better every segment is, [segments], from residuals [segments, bins, components]."""
+    """Returns how much better every segment [segments] is, from two residuals [segments, bins, components]."""
     return losses(before) - losses(after)
 
 
@@ -155,6 +160,7 @@ def bagged(fits: Mapping[str, Linear], run: np.ndarray) -> dict[str, float]:
             (fit.weight * (times - 1) @ pull)[..., None],
         )[..., 0]
         there = square + 2 * steps @ pull.T + np.einsum("di,sij,dj->ds", steps, normal, steps, optimize=True)
+        # Only segments that were not drawn count: the others were fitted.
         lost.append(np.where(times == 0, np.sqrt(np.maximum(there, 0.0)), 0.0).sum(axis=1))
     winners = np.argmin(lost, axis=0)
     return {key: float((winners == index).mean()) for index, key in enumerate(fits)}

@@ -57,15 +57,19 @@ def residuals(problem: Problem, vectors: np.ndarray, segments: Segments, width: 
     return measured[None] - predicted
 
 
-def evaluator(problem: Problem, segments: Segments, scale: np.ndarray) -> Evaluate:
-    """Makes the function that fits and tests call: flat residuals of vectors on these segments, over a scale.
+def flat_residuals(problem: Problem, segments: Segments, scale: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """Simulates vectors and returns residuals over a scale, flat; with all but the vectors given it is an `Evaluate`.
 
     Args:
       problem: the simulator.
       segments: what was measured.
       scale: [bins, components] the noise floor that residuals are divided by.
+      vectors: [n, axes] coordinates.
+
+    Returns:
+      [n, features] in floor units.
     """
-    return lambda vectors: (residuals(problem, vectors, segments) / scale).reshape(len(vectors), -1)
+    return (residuals(problem, vectors, segments) / scale).reshape(len(vectors), -1)
 
 
 def secants(problem: Problem, segments: Segments, vector: np.ndarray, directions: np.ndarray) -> np.ndarray:

@@ -72,11 +72,11 @@ class State:
 
     @property
     def screened(self) -> bool:
-        """True once the library was screened, which settles the second group of fields."""
+        """True once the library was screened: the second group of fields is settled, and the first look was taken."""
         return bool(self.promise)
 
     def with_model(self, fits: Mapping[float, Fit], **changes: Any) -> "State":
-        """Replaces the model, and other fields; the screen's secants belonged to the old one."""
+        """Replaces the model and other fields, and forgets the screen's secants, which are the old model's."""
         return replace(self, fits=fits, columns=None, **changes)
 
 
@@ -103,6 +103,7 @@ def to_json(problem: Problem, state: State) -> dict[str, Any]:
 
     Of fits only the coordinates are kept: their residuals and slopes are found by simulating again.
     """
+    # The keys are those of files that were written before; they stay.
     return {
         "rungs": [
             {
@@ -158,5 +159,6 @@ def _fit_from_json(at: Floor, saved: Mapping[str, Any]) -> Fit:
 
 
 def _term_from_json(by_key: Mapping[str, Hypothesis], saved: Mapping[str, Any]) -> AcceptedTerm:
+    # JSON has no tuples.
     evidence = Evidence(**{**saved["evidence"], "interval": tuple(saved["evidence"]["interval"])})
     return AcceptedTerm(by_key[saved["key"]], evidence, Thresholds(**saved["thresholds"]), tuple(saved["alike"]))

@@ -1,6 +1,6 @@
 """One step of forward selection: look for one more effect, and add it to the model if it passes.
 
-    refit -> localise -> screen -> compete -> accept (alone, else in pairs) -> drop
+    refit -> localise -> screen -> shortlist -> compete -> accept (alone, else in pairs) -> drop
 
 Each arrow is a pure function from a state to the next. The screen is taken anew in every step, since an effect may show
 only once another one is in the model.
@@ -16,13 +16,14 @@ from jaxtune.discovery.localise import localise
 from jaxtune.discovery.noise_floor import NoiseFloor, Say
 from jaxtune.discovery.problem import Problem
 from jaxtune.discovery.result import Settings
-from jaxtune.discovery.screen import candidates, screen
+from jaxtune.discovery.screen import screen
+from jaxtune.discovery.shortlist import candidates
 from jaxtune.discovery.state import State
 
 
 @dataclass(frozen=True)
 class Info:
-    """What a step decided, for progress and reports."""
+    """What a step decided: nothing that the next step needs, but what a progress bar or a report shows."""
 
     decisions: tuple[Decision, ...] = ()
     """About the best single hypothesis and, where that failed, about the best pair."""
@@ -31,11 +32,11 @@ class Info:
 
     @property
     def accepted(self) -> bool:
-        """True if the model has an effect that it had not before."""
+        """True if the model has an effect that it had not before the step; the driver saves then."""
         return any(decision.accepted for decision in self.decisions)
 
     def lines(self) -> list[str]:
-        """Says in a line each what was decided and why."""
+        """Says in a line each what was decided and with which evidence, and what was dropped."""
         lines = []
         for decision in self.decisions:
             failed = [name for name, passed in decision.tests.items() if not passed]
