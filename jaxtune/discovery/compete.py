@@ -10,7 +10,6 @@ from itertools import combinations
 
 import numpy as np
 
-from jaxtune.discovery.evaluate import residuals_on
 from jaxtune.discovery.fit import (
     Fit,
     Free,
@@ -18,6 +17,7 @@ from jaxtune.discovery.fit import (
     evaluate_groups,
     hand_over,
     polish,
+    probing_step,
     refine,
     taken_over,
 )
@@ -27,12 +27,12 @@ from jaxtune.discovery.result import Settings
 from jaxtune.discovery.screen import Score
 from jaxtune.discovery.simulation import Evaluate
 
-_ROUNDS_MORE = 2  # of a fit that starts from the one at the main horizon
+_ROUNDS_MORE = 2  # of a fit that starts from the one at the main horizon: it is nearly there
 
 
 @dataclass(frozen=True)
 class Contest:
-    """Finalists, best first, and their fits."""
+    """The outcome of a contest: the finalists, best first, their fits at all horizons, and who broke the simulation."""
 
     hypotheses: tuple[Hypothesis, ...]
     fits: Mapping[float, Mapping[str, Fit]]
@@ -43,7 +43,10 @@ class Contest:
 
 @dataclass(frozen=True)
 class Start:
-    """Where the fit of a hypothesis begins."""
+    """Where the fit of a hypothesis begins.
+
+    Losses of delays, limits and play have several minima, so that a fit tries several points and starts at the best.
+    """
 
     hypothesis: Hypothesis
     points: Sequence[np.ndarray]
@@ -91,33 +94,46 @@ def compete(
 
     Args:
       settings: rounds, and how many become finalists.
-      problem: the simulator and the segments.
+      problem: names the main horizon.
       floor: the noise floor.
       bases: the model without them, by horizon.
       starts: the hypotheses and where they begin.
     """
-    if not starts:
-        return Contest((), {}, ())
-    main = problem.main_horizon
-    evaluate = residuals_on(problem, floor, main, "train")
-    fits = refine(begin(bases[main], starts, evaluate), evaluate, settings.rounds)
+    main, evaluate = problem.main_horizon, floor[problem.main_horizon].residuals["train"]
+    fits = fit_beside(bases[main], starts, evaluate, settings.rounds) if starts else []
     found = {start.hypothesis.key: fit for start, fit in zip(starts, fits, strict=True) if fit.finite}
     finite = [start.hypothesis for start in starts if start.hypothesis.key in found]
     not_finite = tuple(start.hypothesis.key for start in starts if start.hypothesis.key not in found)
     finalists = sorted(finite, key=lambda h: found[h.key].linear.loss)[: settings.finalists]
     if not finalists:
         return Contest((), {}, not_finite)
+    # Learnt slopes are good enough to choose finalists; intervals and bagged refits need secants.
     polished = polish([found[h.key] for h in finalists], evaluate, settings.rounds)
     best = {h.key: fit for h, fit in zip(finalists, polished, strict=True)}
     finalists.sort(key=lambda h: best[h.key].linear.loss)
     everywhere = {main: {h.key: best[h.key] for h in finalists}}
     again = [Start(h, [best[h.key].own(h)], absolute=True, like=best[h.key]) for h in finalists]
-    for horizon in problem.horizons:
+    for horizon, base in bases.items():
         if horizon != main:
-            there = residuals_on(problem, floor, horizon, "train")
-            fits = refine(begin(bases[horizon], again, there), there, _ROUNDS_MORE)
+            fits = fit_beside(base, again, floor[horizon].residuals["train"], _ROUNDS_MORE)
             everywhere[horizon] = {h.key: fit for h, fit in zip(finalists, fits, strict=True)}
     return Contest(tuple(finalists), everywhere, not_finite)
+
+
+def fit_beside(base: Fit, starts: Sequence[Start], evaluate: Evaluate, rounds: int) -> list[Fit]:
+    """Fits each hypothesis with everything that is free in a model, each in a model of its own.
+
+    Args:
+      base: the model without them.
+      starts: the hypotheses and where they begin.
+      evaluate: residuals of vectors.
+      rounds: of refinement.
+
+    Returns:
+      A fit for every start. Its last coordinates are the hypothesis' own.
+    """
+    begun = begin(base, starts, evaluate)
+    return refine(begun, evaluate, rounds)
 
 
 def begin(base: Fit, starts: Sequence[Start], evaluate: Evaluate) -> list[Fit]:
@@ -136,6 +152,7 @@ def begin(base: Fit, starts: Sequence[Start], evaluate: Evaluate) -> list[Fit]:
     kept, points = [], []
     for start in starts:
         hypothesis = start.hypothesis
+        # Beside the nominal coordinate for the same parameter, the hypothesis' own would be the same direction twice.
         fit, stood = hand_over(base, taken_over(base.free, hypothesis), hypothesis)
         if start.like:
             fit = replace(fit, coordinates=start.like.coordinates[: len(fit.coordinates)])
@@ -147,7 +164,7 @@ def begin(base: Fit, starts: Sequence[Start], evaluate: Evaluate) -> list[Fit]:
     found = evaluate_groups(evaluate, [[fit.vector + p @ h.directions for p in group] for fit, h, group in places])
     best = [best_point(fit, residuals) for fit, residuals in zip(kept, found, strict=True)]
     at = [(group[index], residuals[index]) for group, residuals, index in zip(points, found, best, strict=True)]
-    steps = [_probing_step(hypothesis, point) for hypothesis, (point, _) in zip(hypotheses, at, strict=True)]
+    steps = [probing_step(hypothesis, point) for hypothesis, (point, _) in zip(hypotheses, at, strict=True)]
     moved = evaluate_groups(
         evaluate,
         [
@@ -166,9 +183,3 @@ def begin(base: Fit, starts: Sequence[Start], evaluate: Evaluate) -> list[Fit]:
         )
         for fit, h, (point, residual), size, shifted in zip(kept, hypotheses, at, steps, moved, strict=True)
     ]
-
-
-def _probing_step(hypothesis: Hypothesis, point: np.ndarray) -> np.ndarray:
-    """How far to go from a point for secants, [parameters], inwards from an upper bound."""
-    size = 0.2 * np.abs(point) + 0.2 * hypothesis.probes.max(axis=0) + 0.02 * (hypothesis.probes == 0).all(axis=0)
-    return np.where(point + size > hypothesis.bounds[:, 1], -size, size)

@@ -23,6 +23,7 @@ _SCALES = (1.0, 0.35)  # shares of the Gauss-Newton step that are tried side by 
 _DAMPING = 1e-3
 _IDLE = 0.5  # fall of the loss that chance gives: about a half for a squared unit residual
 _PATIENCE = 2  # rounds without more than that
+_PRIOR_ROUNDS = 6  # a tenth off in the parameters, one step would leave so much that it passed for an engine gap
 _SHORTEST = 0.03  # length of a step, in coordinates, below which rounding hides what it could teach
 
 
@@ -44,11 +45,11 @@ class Free:
     """[coordinates]: True for the prior directions, which are free under every hypothesis."""
 
     def and_then(self, other: "Free") -> "Free":
-        """Joins two sets of coordinates, those of the other one last."""
+        """Joins two sets of coordinates, those of the other one last; a model grows by it when a hypothesis joins."""
         return Free(*(np.concatenate(pair) for pair in zip(self.parts(), other.parts(), strict=True)))
 
     def only(self, kept: np.ndarray) -> "Free":
-        """Keeps the coordinates for which `kept` [coordinates] is True."""
+        """Keeps the coordinates for which `kept` [coordinates] is True, such as all but an ablated effect's."""
         return Free(*(part[kept] for part in self.parts()))
 
     def parts(self) -> tuple[np.ndarray, ...]:
@@ -77,15 +78,15 @@ class Fit:
 
     @property
     def vector(self) -> np.ndarray:
-        """The model as the simulator's vector, [axes]."""
+        """The model as the vector [axes] that the simulator is given: `coordinates @ directions`."""
         return self.coordinates @ self.free.directions
 
     def own(self, hypothesis: Hypothesis) -> np.ndarray:
-        """Coordinates [parameters] of the hypothesis that joined last."""
+        """Coordinates [parameters] of the hypothesis that joined last, which are the model's last ones."""
         return self.coordinates[-len(hypothesis.directions) :]
 
     def along(self, hypothesis: Hypothesis) -> np.ndarray:
-        """Mask [coordinates] of a hypothesis that is part of the model, whenever it joined."""
+        """Finds a hypothesis that is part of the model, whenever it joined, by its directions; a mask [coordinates]."""
         return np.array([any((row == mine).all() for mine in hypothesis.directions) for row in self.free.directions])
 
     @property
@@ -94,7 +95,7 @@ class Fit:
         return Linear(self.residual, self.jacobian, self.coordinates, self.free.sd, self.weight)
 
     def moved(self, scale: float) -> np.ndarray:
-        """Coordinates after a share of the Gauss-Newton step, within the bounds."""
+        """Coordinates after a share `scale` of the damped Gauss-Newton step; they never leave the bounds."""
         step = self.linear.step(_DAMPING, self.free.bounds)
         return np.clip(self.coordinates + scale * step, self.free.bounds[:, 0], self.free.bounds[:, 1])
 
@@ -117,6 +118,7 @@ def refine(fits: Sequence[Fit], evaluate: Evaluate, rounds: int) -> list[Fit]:
         active = [index for index, count in enumerate(idle) if count < _PATIENCE]
         if not active:
             break
+        # All trials of all fits go into one batch, since a device simulates many as fast as one.
         trials = [[fits[index].moved(scale) for scale in _SCALES] for index in active]
         vectors = [p @ fits[index].free.directions for index, pair in zip(active, trials, strict=True) for p in pair]
         found = evaluate(np.stack(vectors)).reshape(len(active), len(_SCALES), -1)
@@ -146,6 +148,21 @@ def polish(fits: Sequence[Fit], evaluate: Evaluate, rounds: int) -> list[Fit]:
     return refine(fresh, evaluate, rounds)
 
 
+def fit_prior(prior: Free, evaluate: Evaluate, slopes: np.ndarray, weight: float) -> Fit:
+    """Fits the prior directions alone to a log, from the nominal model on.
+
+    Args:
+      prior: the directions that are free under every hypothesis.
+      evaluate: residuals of vectors on the log.
+      slopes: [segments, bins, components, directions] at the nominal model, in floor units. They may be another log's
+        of the same motion: a fit corrects them as it goes.
+      weight: share of the features that count as independent.
+    """
+    zero = np.zeros(len(prior.sd))
+    residual = evaluate((zero @ prior.directions)[None])[0]
+    return refine([Fit(prior, zero, residual, slopes.reshape(-1, len(zero)), weight)], evaluate, _PRIOR_ROUNDS)[0]
+
+
 def fit_at(free: Free, coordinates: np.ndarray, weight: float, evaluate: Evaluate) -> Fit:
     """Makes a fit of which only the coordinates are known: simulates its residuals and takes its slopes.
 
@@ -156,6 +173,7 @@ def fit_at(free: Free, coordinates: np.ndarray, weight: float, evaluate: Evaluat
       evaluate: residuals of vectors.
     """
     residual = evaluate((coordinates @ free.directions)[None])[0]
+    # Polishing with no rounds fills them in.
     slopes = np.zeros((len(residual), len(coordinates)))
     return polish([Fit(free, coordinates, residual, slopes, weight)], evaluate, 0)[0]
 
@@ -164,6 +182,12 @@ def evaluate_groups(evaluate: Evaluate, groups: Sequence[Sequence[np.ndarray]]) 
     """Evaluates the vectors of all groups in one batch; returns residuals [vectors of the group, features] by group."""
     found = evaluate(np.stack([vector for group in groups for vector in group]))
     return np.split(found, np.cumsum([len(group) for group in groups])[:-1])
+
+
+def probing_step(hypothesis: Hypothesis, point: np.ndarray) -> np.ndarray:
+    """Says how far to go from a point for a hypothesis' first secants, [parameters], inwards from an upper bound."""
+    size = 0.2 * np.abs(point) + 0.2 * hypothesis.probes.max(axis=0) + 0.02 * (hypothesis.probes == 0).all(axis=0)
+    return np.where(point + size > hypothesis.bounds[:, 1], -size, size)
 
 
 def best_point(fit: Fit, residuals: np.ndarray) -> int:
@@ -191,6 +215,7 @@ def hand_over(fit: Fit, own: np.ndarray, hypothesis: Hypothesis) -> tuple[Fit, n
       The fit without them, and where they stood in the hypothesis' coordinates, [parameters].
     """
     stood, start = np.zeros(len(hypothesis.directions)), 0
+    # The first coordinate of a part is the one that a nominal parameter stands for.
     for part in hypothesis.singles:
         mine, direction = own & _taken_by_single(fit.free, part), part.directions[0]
         vector = fit.coordinates[mine] @ fit.free.directions[mine]
@@ -211,6 +236,7 @@ def _taken_by_single(free: Free, hypothesis: Hypothesis) -> np.ndarray:
 
 def _secant_step(fit: Fit) -> np.ndarray:
     """How far to go for a secant along each coordinate, [coordinates], inwards from an upper bound."""
+    # Nominal parameters stay within a deviation or so; an effect's prior is wide, and its own size says more.
     size = np.maximum(0.3 * fit.free.sd * np.where(fit.free.nominal, 1.0, 0.1), 0.1 * np.abs(fit.coordinates))
     return np.where(fit.coordinates + size > fit.free.bounds[:, 1], -size, size)
 
@@ -219,6 +245,7 @@ def _best_trial(fit: Fit, points: Sequence[np.ndarray], residuals: np.ndarray) -
     """The best of the trials, if one is better than the fit; in any case with the slopes that all of them taught."""
     best, learnt = None, fit
     for point, residual in zip(points, residuals, strict=True):
+        # A trial may break the simulation, as a mass that goes negative does; the shorter step may not.
         if not np.isfinite(residual).all():
             continue
         learnt = _broyden(learnt, point, residual)

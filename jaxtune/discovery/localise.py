@@ -5,10 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from jaxtune.discovery.noise_floor import NoiseFloor
+from jaxtune.discovery.fit import Fit
+from jaxtune.discovery.noise_floor import Floor, NoiseFloor
 from jaxtune.discovery.problem import Problem
 from jaxtune.discovery.resample import blocks
-from jaxtune.discovery.simulation import secants
 from jaxtune.discovery.state import State
 
 _PUSH = 0.05  # coordinate of the torque that the slopes are secants of
@@ -30,19 +30,20 @@ def localise(problem: Problem, floor: NoiseFloor, state: State) -> State:
     Returns:
       The state with `where`, `needs_torque` and `penalty`.
     """
-    fit, segments = state.fits[problem.main_horizon], problem.data["train"][problem.main_horizon]
-    residual = floor[problem.main_horizon].unflatten(fit.residual)
-    if not state.where:
-        # The regime of a bin is that of its first row.
-        regimes = segments.regimes[:, :: problem.bin_rows][:, : residual.shape[1]]
-        where = cells(residual, regimes, problem.regimes, problem.cells, segments.run)
-        state = replace(state, where=tuple(where))
-    if not problem.push:
+    at, fit = floor[problem.main_horizon], state.fits[problem.main_horizon]
+    residual = at.unflatten(fit.residual)
+    if problem.push:
+        slopes = torque_slopes(problem, at, fit.vector)
+        penalty = state.penalty or null_penalty(at.null_fits, slopes)
+        need = free_torque(residual.reshape(len(residual), -1), slopes, penalty)
+        needs_torque = dict(zip(problem.push, need.tolist(), strict=True))
+        state = replace(state, penalty=penalty, needs_torque=needs_torque)
+    if state.where:
         return state
-    slopes = torque_slopes(problem, floor, fit.vector)
-    penalty = state.penalty or null_penalty(floor[problem.main_horizon].null_fits, slopes)
-    need = free_torque(residual.reshape(len(residual), -1), slopes, penalty)
-    return replace(state, penalty=penalty, needs_torque=dict(zip(problem.push, need.tolist(), strict=True)))
+    segments = problem.data["train"][problem.main_horizon]
+    # The regime of a bin is that of its first row.
+    regimes = segments.regimes[:, :: problem.bin_rows][:, : residual.shape[1]]
+    return replace(state, where=tuple(cells(residual, regimes, problem.regimes, problem.cells, segments.run)))
 
 
 def cells(
@@ -71,6 +72,7 @@ def cells(
     joints = [joint for signal, joint in components if signal == "q"]
     found = []
     for index, (signal, joint) in enumerate(components):
+        # Components that belong to no joint, as of the gravity vector, go by the first joint's regime.
         column = regimes[..., joints.index(joint) if joint in joints else 0]
         for number, name in enumerate(regime_names):
             there = (column == number).astype(float)
@@ -99,17 +101,15 @@ def excess(energy: float) -> float:
     return float(np.sqrt(max(energy - 1.0, 0.0)))
 
 
-def torque_slopes(problem: Problem, floor: NoiseFloor, vector: np.ndarray) -> np.ndarray:
+def torque_slopes(problem: Problem, at: Floor, vector: np.ndarray) -> np.ndarray:
     """Takes secants along a constant torque at every joint of `problem.push`, from a model [axes].
 
     Returns:
       [segments, features of a segment, joints] in floor units.
     """
-    horizon = problem.main_horizon
     directions = np.zeros((len(problem.push), problem.axes))
     directions[np.arange(len(directions)), list(problem.push.values())] = _PUSH
-    slopes = secants(problem, vector, directions, problem.data["train"][horizon])
-    slopes = slopes / floor[horizon].scale["train"][..., None]
+    slopes = at.secants(vector, directions) / at.scale["train"][..., None]
     return slopes.reshape(len(slopes), -1, len(directions))
 
 
@@ -134,6 +134,7 @@ def free_torque(residual: np.ndarray, slopes: np.ndarray, penalty: float) -> np.
     """
     slopes = _unit_length(slopes)
     torque = np.zeros((len(residual), slopes.shape[-1]))
+    # The step of proximal gradient descent: one over the largest curvature.
     rate = 1.0 / max(np.linalg.eigvalsh(np.einsum("sfi,sfj->sij", slopes, slopes)).max(), 1e-12)
     for _ in range(_LASSO_ROUNDS):
         left = residual + np.einsum("sfj,sj->sf", slopes, torque)
@@ -143,7 +144,7 @@ def free_torque(residual: np.ndarray, slopes: np.ndarray, penalty: float) -> np.
     return np.sqrt((torque**2).sum(axis=0))
 
 
-def null_penalty(null_fits: Sequence, slopes: np.ndarray) -> float:
+def null_penalty(null_fits: Sequence[Fit], slopes: np.ndarray) -> float:
     """Finds the smallest penalty under which no joint of any null log needs a torque.
 
     Args:

@@ -9,15 +9,15 @@ units"): one floor unit is as far off as a perfect model would be.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
-from jaxtune.discovery.fit import Fit, Free, refine
+from jaxtune.discovery.fit import Fit, Free, fit_prior
 from jaxtune.discovery.least_squares import Linear
 from jaxtune.discovery.problem import Problem
-from jaxtune.discovery.simulation import Evaluate, evaluator, residuals, secants
+from jaxtune.discovery.simulation import Evaluate, flat_residuals, residuals, secants
 
-_ROUNDS = 6  # of a fit: a tenth off in the parameters, one step would leave so much that it passed for an engine gap
 _FURTHEST = 9.0  # prior deviations: with a spread of a tenth, further down a positive parameter would be negative
 _LATEST = 2.0  # timing directions are half a controller period, and nothing is later than a whole one
 _LEAST_SHARE = 0.25  # of a component's mean floor: else the first rows of a segment would count without end
@@ -26,23 +26,34 @@ Say = Callable[[str], None]
 """Told what is being done, for a progress bar or a log file; it has no part in the results."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Floor:
-    """The noise floor at one horizon, and what else is known there before the first hypothesis is asked."""
+    """The measured log at one horizon in floor units: how to simulate it, and what is known before any hypothesis.
 
+    The steps of a discovery see the log and the simulator through it alone.
+    """
+
+    horizon: float
+    """Length of the segments in s."""
     scale: Mapping[str, np.ndarray]
     """[bins, components] by split: the rms residual where nothing is missing. Splits differ, since the same model is
     further off in some postures than in others."""
     weight: float
     """Share of the bins that count as independent; neighbours in time go together."""
+    residuals: Mapping[str, Evaluate]
+    """By split: simulates vectors [n, axes] and returns residuals [n, features] in floor units."""
+    secants: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    """`secants(vector [axes], directions [k, axes])`: differences of the residuals on `train`, [segments, bins,
+    components, k], in the signals' units."""
+    prior: Free
+    """The prior directions, which are free under every hypothesis."""
     slopes: np.ndarray
-    """[segments, bins, components, directions] secants of the measured log along the prior directions, at the nominal
-    model on `train`, in floor units."""
-    null_fits: tuple[Fit, ...]
+    """[segments, bins, components, directions]: secants along them from the nominal model, in floor units."""
+    null_fits: tuple[Fit, ...] = ()
     """The prior directions fitted to `train` of every null log; empty where the floor came from a `Calibration`."""
 
     def unflatten(self, flat: np.ndarray) -> np.ndarray:
-        """Reshapes flat residuals [features, ...] to [segments, bins, components, ...]."""
+        """Reshapes flat residuals [features, ...], which fits work on, to [segments, bins, components, ...]."""
         return flat.reshape(-1, *self.scale["train"].shape, *flat.shape[1:])
 
 
@@ -77,43 +88,40 @@ def measure(problem: Problem, calibration: Calibration | None, say: Say) -> Nois
     floor = {}
     for horizon in problem.horizons:
         say(f"noise floor at {horizon:g} s")
-        if calibration is None:
-            floor[horizon] = measure_at(problem, horizon)
-        else:
-            scale, weight = calibration.floors[horizon]
-            slopes = prior_slopes(problem, horizon) / scale["train"][..., None]
-            floor[horizon] = Floor(scale, weight, slopes, ())
+        floor[horizon] = measure_at(problem, horizon, calibration.floors[horizon] if calibration else None)
     return floor
 
 
-def measure_at(problem: Problem, horizon: float) -> Floor:
-    """Measures the noise floor at one horizon from the problem's null logs.
-
-    The unit in which a fit weighs residuals is the floor that is looked for. So two rounds with linearised fits find a
-    first floor, then full fits in its units find the one that counts. The other splits get theirs from what these fits
-    leave there, where nothing was fitted, as in the measured log.
-    """
-    slopes = prior_slopes(problem, horizon)
-    train = [log["train"][horizon] for log in problem.null_logs]
-    raw = [residuals(problem, np.zeros(problem.axes), log)[0] for log in train]
-    scale, weight = np.sqrt((np.concatenate(raw) ** 2).mean(axis=0)), 1.0
-    for _ in range(2):
-        left = np.stack([left_by_prior(log / scale, slopes / scale[..., None], weight) for log in raw])
-        scale, weight = _rms_floor(scale, left), _independent_share(left)
-    fits = [fit_prior(problem, evaluator(problem, log, scale), slopes / scale[..., None], weight) for log in train]
-    left = np.stack([fit.residual.reshape(raw[0].shape) for fit in fits])
-    fresh, weight = _rms_floor(scale, left), _independent_share(left)
-    scales = {"train": fresh}
-    for split in problem.data.keys() - scales.keys():
-        logs = zip(fits, problem.null_logs, strict=True)
-        there = [residuals(problem, fit.vector, log[split][horizon])[0] for fit, log in logs]
-        scales[split] = _rms_floor(np.ones_like(fresh), np.stack(there))
+def measure_at(problem: Problem, horizon: float, known: tuple[Mapping[str, np.ndarray], float] | None = None) -> Floor:
+    """Measures the noise floor at one horizon from the problem's null logs, unless its scale and weight are known."""
+    prior, slopes = prior_directions(problem), prior_slopes(problem, horizon)
+    scale, weight, null_fits = (*known, ()) if known else _from_null_logs(problem, horizon, prior, slopes)
+    segments = {split: data[horizon] for split, data in problem.data.items()}
     return Floor(
-        scale=scales,
+        horizon=horizon,
+        scale=scale,
         weight=weight,
-        slopes=slopes / fresh[..., None],
-        null_fits=tuple(_in_units(fit, (scale / fresh).ravel(), weight) for fit in fits),
+        residuals={split: partial(flat_residuals, problem, segments[split], scale[split]) for split in segments},
+        secants=partial(secants, problem, segments["train"]),
+        prior=prior,
+        slopes=slopes / scale["train"][..., None],
+        null_fits=null_fits,
     )
+
+
+def prior_directions(problem: Problem) -> Free:
+    """Lists what is free under every hypothesis: the nominal parameters, and the controller's timing.
+
+    Every direction is one standard deviation of its prior. A null whose nominal parameters could not move would call
+    every ordinary tolerance of a mass or a gain a missing effect.
+    """
+    # Entries of the prior that are zero are axes of effects, which the nominal model has not.
+    directions = np.concatenate([np.diag(problem.prior)[problem.prior > 0], problem.timing])
+    count = len(directions)
+    bounds = np.tile([-_FURTHEST, _FURTHEST], (count, 1))
+    # A controller does not act before it is time.
+    bounds[count - len(problem.timing) :] = [0.0, _LATEST]
+    return Free(directions, np.ones(count), bounds, np.ones(count, bool))
 
 
 def prior_slopes(problem: Problem, horizon: float) -> np.ndarray:
@@ -123,42 +131,7 @@ def prior_slopes(problem: Problem, horizon: float) -> np.ndarray:
       [segments, bins, components, directions], in the units of the signals.
     """
     directions = prior_directions(problem).directions
-    return secants(problem, np.zeros(problem.axes), directions, problem.data["train"][horizon])
-
-
-def prior_directions(problem: Problem) -> Free:
-    """Lists what is free under every hypothesis: the nominal parameters, and the controller's timing.
-
-    Every direction is one standard deviation of its prior. A null whose nominal parameters could not move would call
-    every ordinary tolerance of a mass or a gain a missing effect.
-    """
-    directions = np.concatenate([np.diag(problem.prior)[problem.prior > 0], problem.timing])
-    count = len(directions)
-    bounds = np.tile([-_FURTHEST, _FURTHEST], (count, 1))
-    # A controller does not act before it is time.
-    bounds[count - len(problem.timing) :] = [0.0, _LATEST]
-    return Free(directions, np.ones(count), bounds, np.ones(count, bool))
-
-
-def fit_prior(problem: Problem, evaluate: Evaluate, slopes: np.ndarray, weight: float) -> Fit:
-    """Fits the prior directions to a log, from the nominal model on.
-
-    Args:
-      problem: what is free.
-      evaluate: residuals of vectors on the log.
-      slopes: [segments, bins, components, directions] at the nominal model, in floor units. They may be another log's
-        of the same motion: a fit corrects them as it goes.
-      weight: share of the bins that count as independent.
-    """
-    free = prior_directions(problem)
-    start = Fit(
-        free=free,
-        coordinates=np.zeros(len(free.sd)),
-        residual=evaluate(np.zeros((1, problem.axes)))[0],
-        jacobian=slopes.reshape(-1, len(free.sd)),
-        weight=weight,
-    )
-    return refine([start], evaluate, _ROUNDS)[0]
+    return secants(problem, problem.data["train"][horizon], np.zeros(problem.axes), directions)
 
 
 def left_by_prior(residual: np.ndarray, slopes: np.ndarray, weight: float) -> np.ndarray:
@@ -169,6 +142,35 @@ def left_by_prior(residual: np.ndarray, slopes: np.ndarray, weight: float) -> np
     count = slopes.shape[-1]
     linear = Linear(residual.ravel(), slopes.reshape(-1, count), np.zeros(count), np.ones(count), weight)
     return residual + slopes @ linear.step()
+
+
+def _from_null_logs(
+    problem: Problem, horizon: float, prior: Free, slopes: np.ndarray
+) -> tuple[dict[str, np.ndarray], float, tuple[Fit, ...]]:
+    """Floor by split, independent share, and the fits to the null logs.
+
+    The unit in which a fit weighs residuals is the floor that is looked for. So two rounds with linearised fits find a
+    first floor, then full fits in its units find the one that counts. The other splits get theirs from what these fits
+    leave there, where nothing was fitted, as in the measured log.
+    """
+    simulate = partial(residuals, problem)
+    train = [log["train"][horizon] for log in problem.null_logs]
+    raw = [simulate(np.zeros(problem.axes), log)[0] for log in train]
+    unit, weight = np.sqrt((np.concatenate(raw) ** 2).mean(axis=0)), 1.0
+    # The first unit holds what the nominal parameters are off, which the second no longer does.
+    for _ in range(2):
+        left = np.stack([left_by_prior(log / unit, slopes / unit[..., None], weight) for log in raw])
+        unit, weight = _rms_floor(unit, left), _independent_share(left)
+    evaluate = [partial(flat_residuals, problem, log, unit) for log in train]
+    fits = [fit_prior(prior, residuals_of, slopes / unit[..., None], weight) for residuals_of in evaluate]
+    left = np.stack([fit.residual.reshape(raw[0].shape) for fit in fits])
+    scale, weight = {"train": _rms_floor(unit, left)}, _independent_share(left)
+    # Nothing is fitted there: the fit to `train` is taken as it is.
+    for split in problem.data.keys() - scale.keys():
+        logs = zip(fits, problem.null_logs, strict=True)
+        there = [simulate(fit.vector, log[split][horizon])[0] for fit, log in logs]
+        scale[split] = _rms_floor(np.ones_like(unit), np.stack(there))
+    return scale, weight, tuple(_in_units(fit, (unit / scale["train"]).ravel(), weight) for fit in fits)
 
 
 def _rms_floor(unit: np.ndarray, left: np.ndarray) -> np.ndarray:

@@ -47,12 +47,12 @@ class Hypothesis:
 
     @property
     def key(self) -> str:
-        """Name and places as one word, which identifies the hypothesis in messages and files."""
+        """Name and places as one word, such as `coulomb@elbow`; it identifies the hypothesis in messages and files."""
         return f"{self.name}@{'+'.join(self.places)}"
 
     @property
     def singles(self) -> tuple["Hypothesis", ...]:
-        """The single effects that it consists of: its parts, or itself."""
+        """The single effects that it consists of: the two parts of a pair, else the hypothesis itself."""
         return self.parts or (self,)
 
 
@@ -135,7 +135,7 @@ class Problem:
 
     @property
     def horizons(self) -> tuple[float, ...]:
-        """Lengths of the segments in s, rising."""
+        """Lengths of the segments in s, rising; the same for all splits."""
         return tuple(sorted(self.data["train"]))
 
     @property
@@ -145,7 +145,7 @@ class Problem:
 
     @property
     def cells(self) -> list[tuple[str, str]]:
-        """Signal and component of every column of the residuals, in their order."""
+        """Signal and component (such as a joint) of every column of the residuals, in the columns' order."""
         return [(signal, part) for signal in sorted(self.components) for part in self.components[signal]]
 
     def is_nominal(self, hypothesis: Hypothesis) -> bool:

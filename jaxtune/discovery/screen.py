@@ -11,24 +11,21 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from jaxtune.discovery.evaluate import residuals_on
 from jaxtune.discovery.fit import Fit, taken_over
 from jaxtune.discovery.least_squares import Linear, complement
-from jaxtune.discovery.noise_floor import NoiseFloor, Say
+from jaxtune.discovery.noise_floor import Floor, NoiseFloor, Say
 from jaxtune.discovery.problem import Hypothesis, Problem
 from jaxtune.discovery.result import Settings
 from jaxtune.discovery.state import Columns, State
 
 _VISIBLE = 4.0  # standard deviations
 _OUT_OF_SIZE = 3.0  # a secant speaks for sizes up to this multiple of its own
-_LEAST_GAIN = 4.0  # of the loss; two standard deviations of one coordinate
-_MOST_PLACES = 3  # of one name on the shortlist: they tell where; more would crowd out other names
 _BATCH = 32  # columns between two reports of progress
 
 
 @dataclass(frozen=True)
 class Score:
-    """What a score test says of a hypothesis."""
+    """What a score test says of a hypothesis: its gain, where its fit starts, and whether these logs could show it."""
 
     gain: float
     """By how much the loss would fall, if residuals were linear."""
@@ -39,7 +36,7 @@ class Score:
 
     @property
     def testable(self) -> bool:
-        """True if these logs could show the effect at the smallest size of interest."""
+        """True if these logs could show the effect at the smallest size of interest, above noise."""
         return self.visible >= _VISIBLE
 
 
@@ -63,7 +60,7 @@ def screen(
     """
     base = state.fits[problem.main_horizon]
     hypotheses = untried(problem, state)
-    columns = secant_columns(problem, floor, base, hypotheses, say)
+    columns = secant_columns(floor[problem.main_horizon], base, hypotheses, say)
     state = replace(state, columns=columns)
     if state.screened:
         (found,) = scores(base, columns, hypotheses, [base])
@@ -83,35 +80,31 @@ def screen(
 
 
 def untried(problem: Problem, state: State) -> list[Hypothesis]:
-    """Lists the hypotheses that were neither accepted nor dropped."""
+    """Lists the hypotheses that were neither accepted nor dropped so far: what a step may still look at."""
     taken = {term.hypothesis.key for term in state.terms} | set(state.dropped)
     return [hypothesis for hypothesis in problem.hypotheses if hypothesis.key not in taken]
 
 
-def secant_columns(
-    problem: Problem, floor: NoiseFloor, fit: Fit, hypotheses: Sequence[Hypothesis], say: Say
-) -> Columns:
+def secant_columns(at: Floor, fit: Fit, hypotheses: Sequence[Hypothesis], say: Say) -> Columns:
     """Takes the secants of the residuals that the hypotheses are made of, one simulation for each.
 
     Args:
-      problem: the simulator.
-      floor: the noise floor.
-      fit: where the model stands at the main horizon.
+      at: the floor at the main horizon.
+      fit: where the model stands there.
       hypotheses: what is asked about.
       say: told about progress.
 
     Returns:
       [features] by (axis, size), per unit of the coordinate; zero where a simulation is not finite.
     """
-    evaluate = residuals_on(problem, floor, problem.main_horizon, "train")
     asked = probes(hypotheses)
-    steps = np.zeros((len(asked), problem.axes))
+    steps = np.zeros((len(asked), len(fit.vector)))
     for row, (axis, size) in enumerate(asked):
         steps[row, axis] = size
     columns = {}
     for start in range(0, len(asked), _BATCH):
         say(f"screen {start}/{len(asked)}")
-        found = evaluate(fit.vector + steps[start : start + _BATCH])
+        found = at.residuals["train"](fit.vector + steps[start : start + _BATCH])
         for key, moved in zip(asked[start : start + _BATCH], found, strict=True):
             columns[key] = np.nan_to_num((moved - fit.residual) / key[1], posinf=0.0, neginf=0.0)
     return columns
@@ -159,44 +152,6 @@ def chance_gain(of_null_logs: Sequence[Mapping[str, Score]], level: float) -> fl
     """
     best = [max(score.gain for score in scores.values()) for scores in of_null_logs]
     return float(np.quantile(best, 1.0 - level, method="higher"))
-
-
-def candidates(settings: Settings, problem: Problem, state: State, scores: Mapping[str, Score]) -> list[Hypothesis]:
-    """Chooses the hypotheses that a round fits.
-
-    They sit beside a joint that needs a torque (or may show anywhere), could show in these logs, and promise a share
-    of the gain that acceptance takes. Of these the shortlist is taken.
-
-    Args:
-      settings: lengths and shares.
-      problem: the hypotheses.
-      state: the joints in need, and what chance gains.
-      scores: by hypothesis' key.
-    """
-    index = {joint: number for number, joint in enumerate(problem.push)}
-    needing = {index[joint] for joint, need in state.needs_torque.items() if need > 0}
-    near = [h for h in untried(problem, state) if not needing or not h.joints or needing & set(h.joints)]
-    # What is larger than the smallest size of interest may show where that would not.
-    near = [h for h in near if scores[h.key].testable or scores[h.key].gain > state.least_gain]
-    # A fit finds more than its first step does, but not many times as much.
-    near = [h for h in near if scores[h.key].gain > settings.promising * state.least_gain]
-    return shortlist(scores, near, settings.shortlist)
-
-
-def shortlist(scores: Mapping[str, Score], hypotheses: Sequence[Hypothesis], count: int) -> list[Hypothesis]:
-    """Takes the best `count` hypotheses and the best of each family, at most three places of one name, best first."""
-    ranked = sorted(hypotheses, key=lambda h: -scores[h.key].gain)
-    ranked = [h for h in ranked if scores[h.key].gain > _LEAST_GAIN]
-    chosen, seen, names = [], set(), {}
-    for hypothesis in ranked:
-        first = hypothesis.family not in seen
-        if names.get(hypothesis.name, 0) >= _MOST_PLACES:
-            continue
-        if first or len(chosen) < count:
-            chosen.append(hypothesis)
-            seen.add(hypothesis.family)
-            names[hypothesis.name] = names.get(hypothesis.name, 0) + 1
-    return chosen
 
 
 def looks_like(
@@ -266,7 +221,7 @@ def groups(hypothesis: Hypothesis) -> Iterator[tuple[np.ndarray, list[dict[tuple
 
 
 def probes(hypotheses: Sequence[Hypothesis]) -> list[tuple[int, float]]:
-    """Lists all (axis, size) whose secants the hypotheses need, each once, in order."""
+    """Lists all (axis, size) whose secants the hypotheses need, each once, in order; places share many of them."""
     return sorted(
         {key for hypothesis in hypotheses for _, group in groups(hypothesis) for keys in group for key in keys}
     )
@@ -295,11 +250,13 @@ def _score(
     low, high = hypothesis.bounds.T
     for sizes, group in groups(hypothesis):
         column = np.stack([_column(columns, keys) for keys in group], axis=1)
+        # The prior's rows do not depend on the hypothesis.
         padding = np.zeros((len(value) - len(column), column.shape[1]))
         slope = project(np.concatenate([np.sqrt(weight) * column, padding]))
         # Of the smallest size of interest, which comes first.
         visible = visible or float(np.abs(sizes * np.sqrt((slope**2).sum(axis=0))).max())
         normal = slope.T @ slope
+        # The free coordinates explain all that this effect does.
         if np.trace(normal) < 1e-12:
             continue
         found = -np.linalg.solve(normal + 1e-9 * np.trace(normal) * np.eye(len(normal)), slope.T @ value)

@@ -57,21 +57,29 @@ def residuals(problem: Problem, vectors: np.ndarray, segments: Segments, width: 
     return measured[None] - predicted
 
 
-def evaluator(problem: Problem, segments: Segments, scale: np.ndarray) -> Evaluate:
-    """Makes the function that fits and tests call: flat residuals of vectors on these segments, over a scale.
+def flat_residuals(problem: Problem, segments: Segments, scale: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """Simulates vectors and returns residuals over a scale, flat; with all but the vectors given it is an `Evaluate`.
 
     Args:
       problem: the simulator.
       segments: what was measured.
       scale: [bins, components] the noise floor that residuals are divided by.
+      vectors: [n, axes] coordinates.
+
+    Returns:
+      [n, features] in floor units.
     """
-    return lambda vectors: (residuals(problem, vectors, segments) / scale).reshape(len(vectors), -1)
+    return (residuals(problem, vectors, segments) / scale).reshape(len(vectors), -1)
 
 
-def secants(problem: Problem, vector: np.ndarray, directions: np.ndarray, segments: Segments) -> np.ndarray:
-    """Takes secants of the residuals along directions [k, axes], from a vector [axes]; one simulation for each.
+def secants(problem: Problem, segments: Segments, vector: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Takes secants of the residuals, one simulation for each; delays, limits and backlash have no derivative at zero.
 
-    Secants and not derivatives: delays, limits and backlash have no derivative at zero.
+    Args:
+      problem: the simulator.
+      segments: what was measured.
+      vector: [axes] where the secants begin.
+      directions: [k, axes] how far they go.
 
     Returns:
       Differences r(vector + direction) - r(vector), [segments, bins, components, k].

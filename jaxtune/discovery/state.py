@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from jaxtune.discovery.decide import Evidence, Thresholds
-from jaxtune.discovery.evaluate import stand_at
-from jaxtune.discovery.fit import Fit, Free
-from jaxtune.discovery.noise_floor import NoiseFloor
+from jaxtune.discovery.evaluate import fit_null
+from jaxtune.discovery.fit import Fit, Free, fit_at
+from jaxtune.discovery.noise_floor import Calibration, Floor, NoiseFloor
 from jaxtune.discovery.problem import Hypothesis, Problem
 
 Columns = Mapping[tuple[int, float], np.ndarray]
@@ -72,12 +72,30 @@ class State:
 
     @property
     def screened(self) -> bool:
-        """True once the library was screened, which settles the second group of fields."""
+        """True once the library was screened: the second group of fields is settled, and the first look was taken."""
         return bool(self.promise)
 
     def with_model(self, fits: Mapping[float, Fit], **changes: Any) -> "State":
-        """Replaces the model, and other fields; the screen's secants belonged to the old one."""
+        """Replaces the model and other fields, and forgets the screen's secants, which are the old model's."""
         return replace(self, fits=fits, columns=None, **changes)
+
+
+def begin(problem: Problem, floor: NoiseFloor, calibration: Calibration | None) -> State:
+    """Makes the first state: the null is fitted, and nothing was accepted yet.
+
+    Args:
+      problem: names the main horizon.
+      floor: the noise floor.
+      calibration: thresholds that are known already.
+
+    Raises:
+      ValueError: the nominal model cannot be simulated on these logs.
+    """
+    null = fit_null(floor[problem.main_horizon])
+    state = State(fits={problem.main_horizon: null}, null=null)
+    if calibration is None:
+        return state
+    return replace(state, least_gain=calibration.gain, penalty=calibration.penalty)
 
 
 def to_json(problem: Problem, state: State) -> dict[str, Any]:
@@ -85,6 +103,7 @@ def to_json(problem: Problem, state: State) -> dict[str, Any]:
 
     Of fits only the coordinates are kept: their residuals and slopes are found by simulating again.
     """
+    # The keys are those of files that were written before; they stay.
     return {
         "rungs": [
             {
@@ -111,11 +130,12 @@ def to_json(problem: Problem, state: State) -> dict[str, Any]:
 def from_json(problem: Problem, floor: NoiseFloor, saved: Mapping[str, Any]) -> State:
     """Restores the state that `to_json` turned into `saved`, for the same problem and noise floor."""
     by_key = {hypothesis.key: hypothesis for hypothesis in problem.hypotheses}
+    terms = tuple(_term_from_json(by_key, term) for term in saved["rungs"])
     fits = zip(problem.horizons, saved["fits"], strict=True)
     return State(
-        fits={horizon: _fit_from_json(problem, floor, horizon, fit) for horizon, fit in fits},
-        null=_fit_from_json(problem, floor, problem.main_horizon, saved["null"]),
-        terms=tuple(_term_from_json(by_key, term) for term in saved["rungs"]),
+        fits={horizon: _fit_from_json(floor[horizon], fit) for horizon, fit in fits},
+        null=_fit_from_json(floor[problem.main_horizon], saved["null"]),
+        terms=terms,
         least_gain=saved["healthy_gain"],
         penalty=saved["penalty"],
         promise=saved["promise"],
@@ -133,11 +153,12 @@ def _fit_to_json(fit: Fit) -> dict[str, Any]:
     return {"free": free, "coordinates": fit.coordinates.tolist()}
 
 
-def _fit_from_json(problem: Problem, floor: NoiseFloor, horizon: float, saved: Mapping[str, Any]) -> Fit:
+def _fit_from_json(at: Floor, saved: Mapping[str, Any]) -> Fit:
     free = Free(**{name: np.array(values) for name, values in saved["free"].items()})
-    return stand_at(problem, floor, horizon, free, np.array(saved["coordinates"]))
+    return fit_at(free, np.array(saved["coordinates"]), at.weight, at.residuals["train"])
 
 
 def _term_from_json(by_key: Mapping[str, Hypothesis], saved: Mapping[str, Any]) -> AcceptedTerm:
+    # JSON has no tuples.
     evidence = Evidence(**{**saved["evidence"], "interval": tuple(saved["evidence"]["interval"])})
     return AcceptedTerm(by_key[saved["key"]], evidence, Thresholds(**saved["thresholds"]), tuple(saved["alike"]))

@@ -1,28 +1,29 @@
 """One step of forward selection: look for one more effect, and add it to the model if it passes.
 
-    refit -> localise -> screen -> compete -> accept (alone, else in pairs) -> drop
+    refit -> localise -> screen -> shortlist -> compete -> accept (alone, else in pairs) -> drop
 
 Each arrow is a pure function from a state to the next. The screen is taken anew in every step, since an effect may show
 only once another one is in the model.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from jaxtune.discovery.accept import Decision, accept, drop_unpaid
-from jaxtune.discovery.compete import Contest, Start, compete, starts_of_pairs, starts_of_singles
-from jaxtune.discovery.evaluate import fit_null, refit, refit_others, worst
+from jaxtune.discovery.accept import accept, drop_unpaid
+from jaxtune.discovery.compete import compete, starts_of_pairs, starts_of_singles
+from jaxtune.discovery.decide import Decision
+from jaxtune.discovery.evaluate import refit, refit_others, worst
 from jaxtune.discovery.localise import localise
-from jaxtune.discovery.noise_floor import Calibration, NoiseFloor, Say
+from jaxtune.discovery.noise_floor import NoiseFloor, Say
 from jaxtune.discovery.problem import Problem
 from jaxtune.discovery.result import Settings
-from jaxtune.discovery.screen import candidates, screen
+from jaxtune.discovery.screen import screen
+from jaxtune.discovery.shortlist import candidates
 from jaxtune.discovery.state import State
 
 
 @dataclass(frozen=True)
 class Info:
-    """What a step decided, for progress and reports."""
+    """What a step decided: nothing that the next step needs, but what a progress bar or a report shows."""
 
     decisions: tuple[Decision, ...] = ()
     """About the best single hypothesis and, where that failed, about the best pair."""
@@ -31,21 +32,17 @@ class Info:
 
     @property
     def accepted(self) -> bool:
-        """True if the model has an effect that it had not before."""
+        """True if the model has an effect that it had not before the step; the driver saves then."""
         return any(decision.accepted for decision in self.decisions)
 
-
-def begin(problem: Problem, floor: NoiseFloor, calibration: Calibration | None) -> State:
-    """Makes the first state: the null is fitted, and nothing was accepted yet.
-
-    Raises:
-      ValueError: the nominal model cannot be simulated on these logs.
-    """
-    null = fit_null(problem, floor)
-    state = State(fits={problem.main_horizon: null}, null=null)
-    if calibration is None:
-        return state
-    return replace(state, least_gain=calibration.gain, penalty=calibration.penalty)
+    def lines(self) -> list[str]:
+        """Says in a line each what was decided and with which evidence, and what was dropped."""
+        lines = []
+        for decision in self.decisions:
+            failed = [name for name, passed in decision.tests.items() if not passed]
+            verdict = f"rejected, fails {', '.join(failed)}" if failed else "accepted"
+            lines.append(f"{decision.hypothesis.key} {verdict}: {decision.evidence} {decision.thresholds}")
+        return lines + [f"{key} dropped: it no longer pays" for key in self.dropped]
 
 
 def step(
@@ -60,14 +57,17 @@ def step(
       settings: how much is tried, and how much evidence is asked for.
       problem: the simulator, the hypotheses and the segments.
       floor: the noise floor.
-      state: from `begin`, from the last step, or loaded.
+      state: from `state.begin`, from the last step, or loaded.
       say: told about progress.
 
     Returns:
       The next state, and what was decided.
     """
-    state = _refitted(settings, problem, floor, state)
-    at_floor = worst(problem, floor, state.fits[problem.main_horizon].vector) <= settings.at_floor
+    main = problem.main_horizon
+    base = refit(floor[main], state.fits[main], 2 * settings.rounds)
+    at_floor = worst(floor[main], base.vector) <= settings.at_floor
+    # Before any acceptance the model is the null.
+    state = state.with_model({**state.fits, main: base}, null=state.null if state.terms else base)
     # The first look is taken in any case: it says what these logs could show.
     if len(state.terms) >= settings.most or (state.screened and at_floor):
         return replace(state, finished=True), Info()
@@ -77,33 +77,17 @@ def step(
     if not chosen:
         return replace(state, finished=True), Info()
     say(f"fit {len(chosen)}")
-    before = replace(state, fits=refit_others(problem, floor, state.fits, 2 * settings.rounds))
-    state, contest, decisions = _attempt(settings, problem, floor, before, starts_of_singles(chosen, scores))
+    before = replace(state, fits=refit_others(floor, state.fits, main, 2 * settings.rounds))
+    singles = starts_of_singles(chosen, scores)
+    contest = compete(settings, problem, floor, before.fits, singles)
+    state, decisions = accept(settings, problem, floor, before, contest)
     if not state.terms and not at_floor:
         pairs = starts_of_pairs(settings, problem, contest)
         say(f"fit {len(pairs)} pairs")
-        state, _, more = _attempt(settings, problem, floor, state, pairs)
-        decisions += more
+        contest = compete(settings, problem, floor, before.fits, pairs)
+        state, of_pairs = accept(settings, problem, floor, state, contest)
+        decisions += of_pairs
     if not any(decision.accepted for decision in decisions):
         return replace(state, finished=True), Info(decisions)
     state = drop_unpaid(problem, floor, state)
     return state, Info(decisions, dropped=state.dropped[len(before.dropped) :])
-
-
-def _refitted(settings: Settings, problem: Problem, floor: NoiseFloor, state: State) -> State:
-    """The state with its model fitted again at the main horizon; before any acceptance that is the null."""
-    main = problem.main_horizon
-    base = refit(problem, floor, main, state.fits[main], 2 * settings.rounds)
-    return state.with_model({**state.fits, main: base}, null=state.null if state.terms else base)
-
-
-def _attempt(
-    settings: Settings, problem: Problem, floor: NoiseFloor, state: State, starts: Sequence[Start]
-) -> tuple[State, Contest, tuple[Decision, ...]]:
-    """Fits hypotheses, compares the finalists and accepts the best if it passes; a decision if there is a finalist."""
-    contest = compete(settings, problem, floor, state.fits, starts)
-    state = replace(state, not_finite=(*state.not_finite, *contest.not_finite))
-    if not contest.hypotheses:
-        return state, contest, ()
-    state, decision = accept(settings, problem, floor, state, contest)
-    return state, contest, (decision,)

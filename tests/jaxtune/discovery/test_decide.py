@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from slider import HYPOTHESES
 
-from jaxtune.discovery import decide
+from jaxtune.discovery import decide, resample
 from jaxtune.discovery.least_squares import Linear
 from jaxtune.discovery.problem import pair_of
 from jaxtune.discovery.resample import blocks, standard_error
@@ -32,21 +32,21 @@ def test_the_standard_error_knows_that_neighbours_go_together():
     rng = np.random.default_rng(0)
     run = np.repeat(np.arange(20), 30)
     alone = rng.standard_normal(600)
-    assert standard_error(alone, run) == pytest.approx(1 / np.sqrt(600), rel=0.1)
+    assert standard_error(alone, blocks(run)) == pytest.approx(1 / np.sqrt(600), rel=0.1)
     # Three at a time alike: a third as many count, and blocks of three, which do not begin where these do, see
     # (1 + 2 x 2/3 x 2/3 + 2 x 1/3 x 1/3) / 3 of three times the variance.
     together = np.repeat(rng.standard_normal(200), 3)
-    assert standard_error(together, run) == pytest.approx(np.sqrt(1 + 8 / 9 + 2 / 9) / np.sqrt(600), rel=0.15)
+    assert standard_error(together, blocks(run)) == pytest.approx(np.sqrt(1 + 8 / 9 + 2 / 9) / np.sqrt(600), rel=0.15)
 
 
 def test_the_threshold_over_many_is_higher_than_over_one():
     rng = np.random.default_rng(1)
     run = np.repeat(np.arange(8), 25)
     gains = {str(i): rng.standard_normal(200) for i in range(12)}
-    one = decide.max_t({"0": gains["0"]}, run, 0.05)
+    one = resample.max_t({"0": gains["0"]}, run, 0.05)
     # One-sided: 1.64 for one normal, and 1 - 0.05 ** (1 / 12) of it, 2.63, for the largest of twelve.
     assert one == pytest.approx(1.64, abs=0.15)
-    assert decide.max_t(gains, run, 0.05) == pytest.approx(2.63, abs=0.25)
+    assert resample.max_t(gains, run, 0.05) == pytest.approx(2.63, abs=0.25)
 
 
 def test_a_difference_that_nobody_cares_for_is_none():
@@ -55,7 +55,7 @@ def test_a_difference_that_nobody_cares_for_is_none():
     loss = 1.0 + 0.2 * rng.uniform(size=40)
     lost = {"best": loss, "a hair worse": loss + 0.01, "worse": loss + 0.1}
     # No scatter at all in the differences: both are significant.
-    assert decide.alike(lost, run, 2.0) == ["best", "a hair worse"]
+    assert resample.alike(lost, blocks(run), 2.0) == ["best", "a hair worse"]
 
 
 def test_the_better_hypothesis_wins_when_it_is_fitted_again():
@@ -72,10 +72,10 @@ def test_the_better_hypothesis_wins_when_it_is_fitted_again():
     for name, fit in start.items():
         step = fit.step()
         fits[name] = Linear(fit.residual + fit.jacobian @ step, fit.jacobian, step, fit.sd, fit.weight)
-    assert decide.bagged(fits, run) == {"right": 1.0, "wrong": 0.0}
+    assert resample.bagged(fits, run) == {"right": 1.0, "wrong": 0.0}
     # Slopes that promise what a fit has not found are not believed.
-    assert decide.bagged({"found": fits["right"], "promised": start["right"]}, run) == {"found": 1.0, "promised": 0.0}
-    alike = decide.bagged({"one": fits["wrong"], "other": fits["wrong"]}, run)
+    assert resample.bagged({"found": fits["right"], "promised": start["right"]}, run) == {"found": 1.0, "promised": 0.0}
+    alike = resample.bagged({"one": fits["wrong"], "other": fits["wrong"]}, run)
     assert sum(alike.values()) == 1.0
 
 
@@ -96,15 +96,15 @@ def test_what_shows_in_few_segments_is_confirmed_there():
     after = before.copy()
     before[[2, 9, 20]] += 10.0
     # Three blocks gain 800 each or nearly, of which one does not count; a t of the same gains is low.
-    gain = decide.confirmed(before, after, run, 0.5)
+    gain = resample.confirmed(before, after, run, 0.5)
     expected = 0.5 * ((before[[2, 9, 20]] ** 2).sum() - (after[[2, 9, 20]] ** 2).sum())
     assert gain == pytest.approx(expected * 2 / 3, rel=0.1)
-    assert decide.t_statistic(decide.paired(before, after), run) < 2.0
+    assert resample.t_statistic(resample.paired(before, after), run) < 2.0
     # One block proves nothing, and what is worse elsewhere counts.
     lucky = after.copy()
     lucky[2] += 10.0
-    assert decide.confirmed(lucky, after, run, 0.5) == 0.0
-    assert decide.confirmed(lucky, after + 0.1 * np.sign(after), run, 0.5) < 0.0
+    assert resample.confirmed(lucky, after, run, 0.5) == 0.0
+    assert resample.confirmed(lucky, after + 0.1 * np.sign(after), run, 0.5) < 0.0
 
 
 def test_either_way_of_being_significant_is_enough():
