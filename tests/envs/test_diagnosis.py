@@ -199,7 +199,7 @@ def test_sizes_are_what_was_done():
             assert 1 + one.size == pytest.approx(run.time[-1] / undamaged(1).time[-1], rel=0.01)
 
 
-def test_a_suspicion_is_told_once_for_all_runs_that_share_it():
+def test_a_suspicion_is_reported_once_for_all_runs_that_share_it():
     hole = lambda row: Finding("missing rows", "t", (), 0.02, f"rows are missing behind row {row}")  # noqa: E731
     found = {"run_000": [hole(3), hole(9), hole(12)], "run_001": [], "run_002": [hole(5)]}
     assert shared_findings(found) == [(hole(3), ["run_000 (3 times)", "run_002"])]

@@ -59,7 +59,7 @@ def test_readme_is_short_enough_to_be_read():
     assert len(README.splitlines()) <= MOST_LINES
 
 
-def test_sentences_are_told_from_tables_code_and_headings():
+def test_sentences_are_separated_from_tables_code_and_headings():
     prose = "# A heading\nOne two\nthree. Four `x.y` five?\n\n- six\n  seven\n- eight\n"
     page = f"{prose}\n| a | b. C |\n```sh\nrun. This\n```\n"
     assert sentences(page) == ["One two three.", "Four `x.y` five?", "six seven", "eight"]

@@ -56,12 +56,12 @@ def test_bad_input_is_named(field, value, named, monkeypatch):
     assert named in str(error.value)
 
 
-def test_masses_start_where_they_are_told_to():
+def test_masses_start_where_the_options_say():
     _, entries, start = transfer.check(replace(ARGS, start=("trunk_mass=0.5", "shank_mass=2")))
     assert start == {name: {"trunk_mass": 0.5, "shank_mass": 2.0}.get(name, 1.0) for name in entries}
 
 
-def test_no_log_is_told_in_time(tmp_path):
+def test_a_log_that_does_not_come_is_named_when_time_is_up(tmp_path):
     with pytest.raises(ValueError, match=r"log: no log after 0 s, expected one as .*request\.json asks for"):
         exchange.wait(tmp_path, 0.0)
 
@@ -93,7 +93,7 @@ def test_a_log_counts_when_it_is_whole(tmp_path, monkeypatch):
     assert len(looks) == 7
 
 
-def test_a_log_that_never_rests_is_told(tmp_path, monkeypatch):
+def test_a_log_that_never_rests_is_refused(tmp_path, monkeypatch):
     log, looks = tmp_path / "log", []
 
     def sleep(seconds):
@@ -299,7 +299,7 @@ def first(programs, tmp_path):
     return lambda terms: Rounds(tmp_path, terms, programs, "ours", policy, start, 0.2)
 
 
-def test_who_would_fall_is_not_asked_to_walk(first, answered, tmp_path, monkeypatch):
+def test_a_robot_that_would_fall_is_not_asked_to_walk(first, answered, tmp_path, monkeypatch):
     prediction = Prediction(mean_return=0.0, fall_rate=0.25, power_w=1.0, episodes=4)
     monkeypatch.setattr(Rounds, "_predicted", lambda self, index, state: prediction)
     careful, place = replace(TERMS, force=False), tmp_path / "round_000"
@@ -310,7 +310,7 @@ def test_who_would_fall_is_not_asked_to_walk(first, answered, tmp_path, monkeypa
         first(careful).play(0, None)
     assert not (place / "request.json").exists()
     assert first(TERMS).play(0, None).expected_falls >= 0.25
-    # Who has walked already may be learnt from.
+    # A walk that was walked already may be learnt from.
     (place / "tuning.json").unlink()
     assert first(careful).play(0, None).tuning.verdicts
 
@@ -414,10 +414,10 @@ def test_simulated_episodes_repeat_what_the_log_says(first, answered, programs, 
     found = jax.jit(programs.learner.simulate)(jax.random.PRNGKey(5), state.policy, params)
     assert found.obs.shape == (4, steps, 40)
     for episode in range(4):
-        told = measured.obs[episode % 2]
+        recorded = measured.obs[episode % 2]
         # Commands, and the clock.
-        np.testing.assert_allclose(found.obs[episode, :, 3:6], told[:, 3:6], atol=1e-6)
-        np.testing.assert_allclose(found.obs[episode, :, 36:], told[:, 36:], atol=1e-4)
+        np.testing.assert_allclose(found.obs[episode, :, 3:6], recorded[:, 3:6], atol=1e-6)
+        np.testing.assert_allclose(found.obs[episode, :, 36:], recorded[:, 36:], atol=1e-4)
     # Both are on their way at the first step: they have done something before it.
     assert np.abs(found.obs[:, 0, 24:30]).min() > 0
     assert np.abs(measured.obs[:, 0, 24:30]).min() > 0

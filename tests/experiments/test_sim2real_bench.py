@@ -14,7 +14,7 @@ from experiments.robot import transfer
 from experiments.sim2real_bench import Args, evaluate, stand_in, transfer_of
 
 PACKAGE = Path(experiments.__file__).parent
-# What discovery wrote after the stand-in had hung.
+# What discovery wrote from the suspended stand-in's log.
 FOUND = PACKAGE / "results" / "stand_in" / "found" / "model"
 
 
