@@ -54,9 +54,10 @@ def main(args: Args) -> None:
             say=lambda text: progress.update(task, description=text[:100]),
         )
     summary, free = summarise(question, result), free_runs(log, question, result)
+    evidence = details(question, result, free)
     seconds = {"seconds": time.monotonic() - began, "versions": checkpoint.versions()}
     write_json(args.out / "summary.json", summary | seconds)
-    write_json(args.out / "details.json", details(question, result, free))
+    write_json(args.out / "details.json", evidence)
     corrected.save(args.out / "model", spec, question.rig, (result.residual or result.fit).vector)
     report.show(console, question, summary, free)
     report.write(args.out / "report.html", log, question, result, summary, free)

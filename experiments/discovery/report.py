@@ -47,7 +47,7 @@ def write(path: Path, log: Log, question: Question, result: Result, summary: dic
     pictures = {"where": plots.heat_map(result.where), "traces": plots.traces(free["runs"], log.joints)}
     if result.terms:
         pictures["terms"] = plots.accepted_terms(result.terms)
-    effects = question.rig.effects
+    presented, effects = _presented(summary, question), question.rig.effects
     page = report.render(
         _TEMPLATE,
         robot=log.robot,
@@ -55,7 +55,7 @@ def write(path: Path, log: Log, question: Question, result: Result, summary: dic
         meaning=VERDICTS[summary["verdict"]],
         advice=ADVICE[summary["verdict"]],
         summary=summary,
-        effects=_presented(summary, question),
+        effects=presented,
         notes=question.notes,
         not_testable=[
             (name, effects[name].excited_by if name in effects else "a free base") for name in summary["not_testable"]

@@ -9,7 +9,7 @@ units"): one floor unit is as far off as a perfect model would be.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -47,10 +47,20 @@ class Floor:
     components, k], in the signals' units."""
     prior: Free
     """The prior directions, which are free under every hypothesis."""
-    slopes: np.ndarray
-    """[segments, bins, components, directions]: secants along them from the nominal model, in floor units."""
     null_fits: tuple[Fit, ...] = ()
     """The prior directions fitted to `train` of every null log; empty where the floor came from a `Calibration`."""
+
+    @cached_property
+    def slopes(self) -> np.ndarray:
+        """Secants along the prior directions from the nominal model, in floor units.
+
+        They are simulated at the first use: with a calibration, most horizons never need them.
+
+        Returns:
+          [segments, bins, components, directions]
+        """
+        nominal = np.zeros(self.prior.directions.shape[1])
+        return self.secants(nominal, self.prior.directions) / self.scale["train"][..., None]
 
     def unflatten(self, flat: np.ndarray) -> np.ndarray:
         """Reshapes flat residuals [features, ...], which fits work on, to [segments, bins, components, ...]."""
@@ -94,8 +104,8 @@ def measure(problem: Problem, calibration: Calibration | None, say: Say) -> Nois
 
 def measure_at(problem: Problem, horizon: float, known: tuple[Mapping[str, np.ndarray], float] | None = None) -> Floor:
     """Measures the noise floor at one horizon from the problem's null logs, unless its scale and weight are known."""
-    prior, slopes = prior_directions(problem), prior_slopes(problem, horizon)
-    scale, weight, null_fits = (*known, ()) if known else _from_null_logs(problem, horizon, prior, slopes)
+    prior = prior_directions(problem)
+    scale, weight, null_fits = (*known, ()) if known else _from_null_logs(problem, horizon, prior)
     segments = {split: data[horizon] for split, data in problem.data.items()}
     return Floor(
         horizon=horizon,
@@ -104,7 +114,6 @@ def measure_at(problem: Problem, horizon: float, known: tuple[Mapping[str, np.nd
         residuals={split: partial(flat_residuals, problem, segments[split], scale[split]) for split in segments},
         secants=partial(secants, problem, segments["train"]),
         prior=prior,
-        slopes=slopes / scale["train"][..., None],
         null_fits=null_fits,
     )
 
@@ -145,7 +154,7 @@ def left_by_prior(residual: np.ndarray, slopes: np.ndarray, weight: float) -> np
 
 
 def _from_null_logs(
-    problem: Problem, horizon: float, prior: Free, slopes: np.ndarray
+    problem: Problem, horizon: float, prior: Free
 ) -> tuple[dict[str, np.ndarray], float, tuple[Fit, ...]]:
     """Floor by split, independent share, and the fits to the null logs.
 
@@ -153,7 +162,7 @@ def _from_null_logs(
     first floor, then full fits in its units find the one that counts. The other splits get theirs from what these fits
     leave there, where nothing was fitted, as in the measured log.
     """
-    simulate = partial(residuals, problem)
+    simulate, slopes = partial(residuals, problem), prior_slopes(problem, horizon)
     train = [log["train"][horizon] for log in problem.null_logs]
     raw = [simulate(np.zeros(problem.axes), log)[0] for log in train]
     unit, weight = np.sqrt((np.concatenate(raw) ** 2).mean(axis=0)), 1.0

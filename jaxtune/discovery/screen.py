@@ -59,7 +59,7 @@ def screen(
       The state with the secants, and a score by hypothesis' key.
     """
     base = state.fits[problem.main_horizon]
-    hypotheses = untried(problem, state)
+    hypotheses = _untried(problem, state)
     columns = secant_columns(floor[problem.main_horizon], base, hypotheses, say)
     state = replace(state, columns=columns)
     if state.screened:
@@ -77,12 +77,6 @@ def screen(
     )
     say(f"these logs cannot show: {', '.join(state.not_testable) or 'nothing is beyond them'}")
     return state, found
-
-
-def untried(problem: Problem, state: State) -> list[Hypothesis]:
-    """Lists the hypotheses that were neither accepted nor dropped so far: what a step may still look at."""
-    taken = {term.hypothesis.key for term in state.terms} | set(state.dropped)
-    return [hypothesis for hypothesis in problem.hypotheses if hypothesis.key not in taken]
 
 
 def secant_columns(at: Floor, fit: Fit, hypotheses: Sequence[Hypothesis], say: Say) -> Columns:
@@ -273,6 +267,12 @@ def _score(
 def _column(columns: Columns, shares: Mapping[tuple[int, float], float]) -> np.ndarray:
     """The secant [features] along a direction: a sum of columns by their shares."""
     return sum(share * columns[key] for key, share in shares.items())
+
+
+def _untried(problem: Problem, state: State) -> list[Hypothesis]:
+    """Lists the hypotheses that were neither accepted nor dropped so far: what a step may still look at."""
+    taken = {term.hypothesis.key for term in state.terms} | set(state.dropped)
+    return [hypothesis for hypothesis in problem.hypotheses if hypothesis.key not in taken]
 
 
 def _prior_and_slopes(fit: Fit, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

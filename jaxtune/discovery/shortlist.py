@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 
 from jaxtune.discovery.problem import Hypothesis, Problem
 from jaxtune.discovery.result import Settings
-from jaxtune.discovery.screen import Score, untried
+from jaxtune.discovery.screen import Score
 from jaxtune.discovery.state import State
 
 _LEAST_GAIN = 4.0  # of the loss; two standard deviations of one coordinate
@@ -21,11 +21,12 @@ def candidates(settings: Settings, problem: Problem, state: State, scores: Mappi
       settings: lengths and shares.
       problem: the hypotheses.
       state: the joints in need, and what chance gains.
-      scores: by hypothesis' key.
+      scores: by the key of every hypothesis that the step screened.
     """
     index = {joint: number for number, joint in enumerate(problem.push)}
     needing = {index[joint] for joint, need in state.needs_torque.items() if need > 0}
-    near = [h for h in untried(problem, state) if not needing or not h.joints or needing & set(h.joints)]
+    screened = [h for h in problem.hypotheses if h.key in scores]
+    near = [h for h in screened if not needing or not h.joints or needing & set(h.joints)]
     # What is larger than the smallest size of interest may show where that would not.
     near = [h for h in near if scores[h.key].testable or scores[h.key].gain > state.least_gain]
     # A fit finds more than its first step does, but not many times as much.
