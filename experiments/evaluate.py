@@ -33,7 +33,7 @@ _GRID_S = 5.0
 
 @dataclass(frozen=True, kw_only=True)
 class Args:
-    """Measures the gait of a policy in a target."""
+    """Measures how well a policy walks in a target: gait, tracking, falls and return."""
 
     out: Path = Path("runs/evaluate")
     """Folder of evaluation.json, gait.png, film.png and walk.gif."""

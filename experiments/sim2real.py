@@ -18,7 +18,7 @@ class Args(Transfer):
 
 
 def main(args: Args) -> None:
-    """Plays the rounds."""
+    """Plays the rounds that are not played yet, and reports on each one."""
     checkpoint.set_up_compiler(preset(args.preset).xla_flags)
     play(args, compile_programs(args))
 

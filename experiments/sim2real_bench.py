@@ -45,7 +45,7 @@ _EVALUATION_SEED = 999_000
 
 @dataclass(frozen=True, kw_only=True)
 class Args:
-    """Compares what methods make of a robot that answers through log files."""
+    """Compares methods on a stand-in robot that answers through log files, from the same start policy."""
 
     out: Path = Path("runs/sim2real_bench")
     """Folder; the same command with the same folder goes on where it was. Other seeds may run beside it; a last call
@@ -73,7 +73,7 @@ class Args:
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
-    """What became of one method with one seed."""
+    """What became of one method with one seed: its rounds, and evaluations of the policy before and after them."""
 
     seed: int
     rounds: list[Round]
@@ -217,7 +217,12 @@ def main(args: Args) -> None:
 
 
 def show(args: Args, results: dict[str, list[Outcome]]) -> None:
-    """Prints a row for every method, means over seeds."""
+    """Prints a table with a row for every method.
+
+    Args:
+      args: of the benchmark.
+      results: outcomes by method; numbers are means over their seeds.
+    """
     model = f"in {args.model}, " if args.model else ""
     title = f"{model}masses at {args.mass:g}X, mean over {len(args.seeds)} seed(s), {args.evaluation} walks each"
     table = Table(title=title)

@@ -85,7 +85,7 @@ class Bench:
         """Noise floor and thresholds of this robot and motion, from simulated null logs; computed once and kept."""
         path = self._out / "calibration.npz"
         if not path.exists():
-            question = self.build_question(self.record(Truth(None), 10_000), null_logs=self.size.healthy)
+            question = self.build_question(self.record(Truth(None), 10_000), null_logs=self.size.null_logs)
             found = workflow.calibrate(question.problem)
             arrays = {
                 f"floor {horizon} {split}": floor

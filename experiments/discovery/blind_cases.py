@@ -45,7 +45,7 @@ SIZE_BOUNDS = {
 
 @dataclass(frozen=True)
 class Case:
-    """One robot of the benchmark and what it hides."""
+    """One robot of the benchmark: which effect it hides, and how severe the effect should be."""
 
     number: int
     effect: str | None
@@ -68,7 +68,7 @@ class Size:
     """Effects and severities."""
     empty: int
     outside: tuple[tuple[str, float], ...]
-    healthy: int
+    null_logs: int
 
 
 def _spread(names: Sequence[str], count: int) -> tuple[tuple[str, float], ...]:

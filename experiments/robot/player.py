@@ -32,7 +32,11 @@ class Player:
         self.reset(phase)
 
     def reset(self, phase: float = 0.0) -> None:
-        """Forgets the last step."""
+        """Forgets the last step, as before a walk.
+
+        Args:
+          phase: where the left foot's clock starts, in cycles.
+        """
         self.phase = np.mod(phase + np.array(self.meta["clock"]["offsets"]), 1.0)
         self.action = np.zeros(len(self.meta["joints"]))
         self.target = None
@@ -76,12 +80,13 @@ class Player:
         return self.target.copy()
 
     def tick(self) -> None:
-        """Moves the gait clock on by a step."""
+        """Advances the gait clock by one policy step. Call it after every `step`, once the targets were sent."""
         clock = self.meta["clock"]
         self.phase = np.mod(self.phase + clock["hz"] / self.meta["rate_hz"], 1.0)
 
     def network(self, obs: np.ndarray) -> np.ndarray:
-        """The action [act] for an observation [obs]."""
+        """Computes the action [act] for an observation [obs]: normaliser, dense layers with ELU, no output
+        squashing."""
         value = (obs - self._mean) / self._std
         for number, (kernel, bias) in enumerate(self._layers):
             value = value @ kernel + bias
@@ -90,7 +95,14 @@ class Player:
         return value
 
     def observe(self, velocity, command, gyro, gravity, joint, joint_velocity, action, error, phase) -> np.ndarray:
-        """The observation [obs], laid out as `meta["observation"]` says."""
+        """Builds the observation [obs] from readings, laid out and scaled as `meta["observation"]` says.
+
+        Args:
+          velocity, command, gyro, gravity, joint, joint_velocity: as in `step`.
+          action: [joints] of the last step.
+          error: [joints] rad, last target minus joint position.
+          phase: [2] cycles, of the gait clock.
+        """
         angle = 2.0 * np.pi * np.asarray(phase)
         parts = {
             "velocity": velocity,
@@ -106,7 +118,13 @@ class Player:
         return np.concatenate([np.asarray(parts[row["name"]]) * row["scale"] for row in self.meta["observation"]])
 
     def reference(self, phase: np.ndarray, command: np.ndarray) -> np.ndarray:
-        """Joint angles [joints] of feet that follow the clock (Raibert's heuristic)."""
+        """Computes joint angles [joints], rad, of feet that follow the clock (Raibert's heuristic), by inverse
+        kinematics.
+
+        Args:
+          phase: [2] cycles; a foot stands below `duty` and swings above.
+          command: [3] m/s, m/s, rad/s.
+        """
         leg, clock = self.meta["leg"], self.meta["clock"]
         reach = (np.abs(1.0 - 2.0 * phase) - 0.5) * clock["duty"] / clock["hz"]
         x = reach * (command[0] - command[2] * np.array(leg["hip_y_m"]))

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True, kw_only=True)
 class WalkMeans:
-    """Means over walks, simulated or measured."""
+    """Means over walks, simulated or measured, so that a prediction and its measurement have the same fields."""
 
     mean_return: float = field(metadata={"key": "return"})
     """Of a walk, under the weights of Table I."""
@@ -39,7 +39,7 @@ class Suspicion:
 
 @dataclass(frozen=True, kw_only=True)
 class Measured(WalkMeans):
-    """What came of the walks that the robot was asked for."""
+    """How the robot walked: means over the walks that it was asked for, and what the log doctor suspects of them."""
 
     episodes: int
     """Number of walks."""
@@ -58,7 +58,7 @@ class Measured(WalkMeans):
 
 @dataclass(frozen=True, kw_only=True)
 class Moved:
-    """A parameter before and after a tuning, in physical values."""
+    """A parameter before and after a tuning, in physical values: multiples of nominal, or offsets with a unit."""
 
     before: float
     after: float

@@ -83,7 +83,7 @@ class Programs:
 
 @dataclass(frozen=True, kw_only=True)
 class Terms:
-    """What a robot is asked for, and on what conditions."""
+    """What a robot is asked for in a round, and the conditions under which it is asked and its log is believed."""
 
     walk_s: float = 10.0
     """Length of a walk that the robot is asked for."""

@@ -41,7 +41,7 @@ def contenders(
 
     Args:
       learner: BITeno's side of the tuner.
-      target: what is tuned to; only `oracle` is told its parameters.
+      target: what is tuned to; only `oracle` is given its parameters.
       policy: what every method starts with.
       radius: first radius of `ours` and `spm`, in coordinates.
       dr_radius: radius of domain randomisation, in coordinates.

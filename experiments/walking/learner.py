@@ -1,4 +1,4 @@
-"""Everything that the tuner is told about BITeno: how its policy learns, how episodes are simulated and scored.
+"""Everything that the tuner needs of BITeno: how its policy learns, how episodes are simulated and scored.
 
 `Learner` binds one robot, one preset and one parameter table together and offers the pure functions that
 `jaxtune.tuner.Tuner` wants (`train`, `simulate`, a target's `measure`), and those that the commands need beside them

@@ -93,7 +93,7 @@ def measure(problem: Problem, calibration: Calibration | None, say: Say) -> Nois
     Args:
       problem: its null logs are simulated and fitted, unless there is a calibration.
       calibration: floors that are known already.
-      say: told about progress.
+      say: receives a line of text about progress.
     """
     floor = {}
     for horizon in problem.horizons:

@@ -41,7 +41,7 @@ def conclude(settings: Settings, problem: Problem, floor: NoiseFloor, state: Sta
       problem: the hypotheses, and the torque that stands in where none fits.
       floor: the noise floor.
       state: after the last step, fitted at the main horizon.
-      say: told about progress.
+      say: receives a line of text about progress.
     """
     at, fit = floor[problem.main_horizon], state.fits[problem.main_horizon]
     errors = standard_errors(fit, problem.data["train"][at.horizon].run)

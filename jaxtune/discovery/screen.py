@@ -53,7 +53,7 @@ def screen(
       problem: the hypotheses and the simulator.
       floor: the noise floor and the fits to null logs.
       state: where the model stands, fitted at the main horizon.
-      say: told about progress.
+      say: receives a line of text about progress.
 
     Returns:
       The state with the secants, and a score by hypothesis' key.
@@ -86,7 +86,7 @@ def secant_columns(at: Floor, fit: Fit, hypotheses: Sequence[Hypothesis], say: S
       at: the floor at the main horizon.
       fit: where the model stands there.
       hypotheses: what is asked about.
-      say: told about progress.
+      say: receives a line of text about progress.
 
     Returns:
       [features] by (axis, size), per unit of the coordinate; zero where a simulation is not finite.

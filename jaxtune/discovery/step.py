@@ -58,7 +58,7 @@ def step(
       problem: the simulator, the hypotheses and the segments.
       floor: the noise floor.
       state: from `state.begin`, from the last step, or loaded.
-      say: told about progress.
+      say: receives a line of text about progress.
 
     Returns:
       The next state, and what was decided.

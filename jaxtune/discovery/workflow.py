@@ -40,7 +40,7 @@ def discover(
         the problem.
       saved: what an interrupted run saved last: this one goes on from there.
       save: called with the state after every accepted effect.
-      say: told about progress.
+      say: receives a line of text about progress.
 
     Raises:
       ValueError: the model cannot be simulated on these logs.
@@ -67,7 +67,7 @@ def calibrate(problem: Problem, settings: Settings = DEFAULTS, say: Say = lambda
     Args:
       problem: its null logs are simulated and screened.
       settings: the level of the threshold on the gain.
-      say: told about progress.
+      say: receives a line of text about progress.
 
     Raises:
       ValueError: the nominal model cannot be simulated on these logs.

@@ -47,7 +47,7 @@ class Entry:
     name: str
     kind: Literal["body", "geom", "joint", "actuator", "control"]
     """What the targets are. `control` is no part of the model (a delay of the controller, say): it has neither targets
-    nor fields, and `apply` leaves it to whoever moves the robot."""
+    nor fields, and `apply` leaves it to the code that steps the robot."""
     targets: tuple[str, ...]
     """Names of the objects that share this value."""
     fields: tuple[str, ...]
