@@ -32,7 +32,8 @@ _ROUNDS_MORE = 2  # of a fit that starts from the one at the main horizon: it is
 
 @dataclass(frozen=True)
 class Contest:
-    """The outcome of a contest: the finalists, best first, their fits at all horizons, and which hypotheses broke it."""
+    """The outcome of a contest: the finalists, best first, their fits at all horizons, and which hypotheses broke
+    it."""
 
     hypotheses: tuple[Hypothesis, ...]
     fits: Mapping[float, Mapping[str, Fit]]

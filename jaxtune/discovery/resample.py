@@ -136,9 +136,9 @@ def bagged(fits: Mapping[str, Linear], run: np.ndarray) -> dict[str, float]:
 
         (w sum_s n_s J_s'J_s + diag(1/sd^2)) u = -w sum_s (n_s - 1) J_s'r_s,
 
-    and the segments with n_s = 0 decide which is best. The right-hand side has n_s - 1: a fit is taken to be the best for
-    all segments, and a draw moves it by how it differs from them, not by what the slopes promise of places where it has
-    been and found it otherwise.
+    and the segments with n_s = 0 decide which is best. The right-hand side has n_s - 1: a fit is taken to be the best
+    for all segments, and a draw moves it by how it differs from them, not by what the slopes promise of places where it
+    has been and found it otherwise.
 
     Args:
       fits: residuals and slopes of all segments, flat, at each hypothesis' fit.
