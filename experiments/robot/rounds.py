@@ -226,7 +226,7 @@ class Rounds:
         suspected = tuple(Suspicion(sentence=one.sentence, runs=tuple(runs)) for one, runs in suspicions)
         write_json(place / "measured.json", summarise_log(walks, self._steps, suspected))
         start = recorded.beginning(walks, preset.episode_steps)
-        repeating = state.replace(policy=state.policy.replace(commands=start.commands))
+        repeating = state.replace(policy=state.policy.replace(asked=start.commands))
         tuned, info = self._tune(self._key(index, 1), repeating, start.trajectory)
         tuned = tuned.replace(policy=state.policy)
         checkpoint.save(place / "tuned", tuned, {})

@@ -39,7 +39,8 @@ class Policy:
     robots: State  # [envs] robots of the training environments, between two rollouts
     radius: jax.Array  # largest radius, in coordinates, of the distribution that the training robots are drawn from
     hidden: dict  # physical values by name of parameters that the robots have and nobody tunes
-    commands: Commands | None = None  # what simulated episodes repeat, in turn, where measured ones are compared
+    # What simulated episodes repeat, in turn, where measured ones are compared. Checkpoints of runs hold this name.
+    asked: Commands | None = None
 
 
 class Learner:
@@ -139,9 +140,9 @@ class Learner:
     def simulate(self, key: jax.Array, policy: Policy, coords: Coords) -> Trajectory:
         """Simulates one episode for every draw: the tuner's `simulate`.
 
-        Where the policy carries `commands`, the episodes repeat them in turn, from the same phase of the gait clock,
-        and only the last `episode_steps` steps are returned: a log shows a robot from a few steps after it began to
-        walk.
+        Where the policy carries commands (`asked`), the episodes repeat them in turn, from the same phase of the gait
+        clock, and only the last `episode_steps` steps are returned: a log shows a robot from a few steps after it began
+        to walk.
 
         Args:
           key: random key.
@@ -152,7 +153,7 @@ class Learner:
           Episodes, [episodes, time].
         """
         count, steps = len(next(iter(coords.values()))), self.preset.episode_steps
-        commands = jax.tree.map(lambda leaf: leaf[jnp.arange(count) % len(leaf)], policy.commands)
+        commands = jax.tree.map(lambda leaf: leaf[jnp.arange(count) % len(leaf)], policy.asked)
         length = steps if commands is None else commands.command.shape[1]
         whole = simulate(self.robot, key, self.act(policy), coords, length, commands)
         return jax.tree.map(lambda leaf: leaf[:, -steps:] if leaf.ndim > 1 else leaf, whole)
