@@ -3,8 +3,8 @@
 Discovery compares the gain of an effect with the gains that it has on such logs. Among many effects one always fits
 differences that are no physics: an engine's step, its integrator, the moment at which a controller reads the joint.
 A null log therefore has such differences too. The nominal model is simulated by MuJoCo C with half the step, another
-integrator and a controller whose ticks jitter; its masses, armatures, dampings and frictions are drawn from the prior;
-and the readings get the noise and the rounding found in the measured log.
+integrator and a controller whose ticks jitter; its masses, armatures, dampings and frictions are drawn from the prior,
+while the controller's gains stay as logged; and the readings get the noise and the rounding found in the measured log.
 """
 
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ from envs.models import suspended
 from envs.segments import noise, quantum_of, smoothed
 
 _STEP_S = 0.0005
-_SPREAD = 0.1  # standard deviation of the logarithm of every drawn parameter, as in `Rig.prior_sd`
+_SPREAD = 0.1  # standard deviation of the logarithm of every drawn parameter, as in `Axis.prior_sd`
 
 
 def simulate_null_log(log: Log, spec: mujoco.MjSpec, seed: int) -> Log:

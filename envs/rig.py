@@ -58,7 +58,8 @@ class Axis:
     scale: float
     """What one unit of the coordinate stands for, in the unit of the parameter."""
     least: float
-    """Smallest coordinate: no more can be taken from a field of the model than it has, but for a tenth."""
+    """Smallest coordinate. A field of the model keeps at least a tenth of its nominal value, so that it stays
+    positive."""
     prior_sd: float
     """Prior standard deviation, in coordinates, of a parameter that every model has; zero for an effect it lacks."""
     joints: tuple[int, ...]
@@ -116,14 +117,12 @@ class Rig:
         device.dof_frictionloss[self.dof] = np.maximum(model.dof_frictionloss[self.dof], MIN_FRICTION_NM)
         self._model = mjx.put_model(device)
         self._data = mjx.make_data(self._model)
-        # The IMU is taken to sit on the first body, which carries the others.
-        self._gravity = sensing.projected_gravity(jnp.asarray(model.body_quat[1], jnp.float32))
         self._scales: Mapping[str, np.ndarray] = {}
         self.places = {"joint": self.joints, "body": self.bodies, "foot": (), "robot": ("robot",)}
         self.effects = {row.name: row for row in EVERY.values() if self.places[row.on] and row.needs != "free"}
         self.chain = Chain(self.dt, tuple(self.effects.values()), self.qpos, self.dof, self._bodies)
         self.axes = self._describe_axes()
-        # The IMU sits on the body that holds the others.
+        # The IMU is taken to sit on the first body, which carries the others.
         self._gravity = sensing.projected_gravity(jnp.asarray(model.body_quat[1], jnp.float32))
 
     def check_matches(self, joints: Sequence[str], control_hz: float) -> None:

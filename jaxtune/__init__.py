@@ -7,6 +7,7 @@ Which module to import for what:
 - `jaxtune.dist`: make, sample, move and widen the distribution that is tuned.
 - `jaxtune.baselines`: domain randomisation and the paper's ungated method, to compare with.
 - `jaxtune.ppo`: a PPO update that can be jitted, for policies trained in Brax environments.
+- `jaxtune.mjx`: the table of an MJX model's parameters, and the model that has other values of them; needs MuJoCo.
 - `jaxtune.discovery`: find the effect that a model lacks when the tuner's verdict is `unexplained`.
 - `jaxtune.rules`, `jaxtune.spm`, `jaxtune.dvm`, `jaxtune.windows`: what the tuner is made of, to replace or to read.
 

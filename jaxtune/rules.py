@@ -143,8 +143,9 @@ class GateInfo:
 class UpdateInfo:
     """What one update did, [coords] each in the order of `dist.names`, but for `loss`.
 
-    Step and interval are in radii of the distribution before the update. The new estimate in coordinates is therefore
-    `centre + radius * step`, give or take `radius * interval`.
+    Step and interval are in radii of the distribution before the update. For an identifiable coordinate the new
+    estimate is `centre + radius * step`, give or take `radius * interval`. For any other one `step` is zero, and
+    `interval` says nothing about the centre.
     """
 
     step: jax.Array  # movement of the centre, before it is clipped to the bounds

@@ -21,7 +21,8 @@ ones, and trains a policy in it. One tuning is one `Tuner.step`:
     state of the next tuning, and Info for plots and reports
 
 D_q holds the simulated episodes that gate and update learn from; the held-out sets imitate the measured set and
-calibrate both. Novelty says how unlike them the measured set is. The verdict is the first of these that holds:
+calibrate both. Novelty says how unlike the simulated episodes the measured set is, and the threshold is the largest
+novelty that still counts as covered. The verdict is the first of these that holds:
 `not_finite` if novelty or threshold is not a finite number; `accept` if novelty <= threshold; `unexplained` after
 `patience` calls in a row without progress; `radius_exhausted` if the distribution fills its bounds or was widened
 `max_widenings` times; else `widen`. However a tuning ends, the radius stays as wide as it became, unless the update

@@ -33,7 +33,8 @@ class Trajectory:
     measured episodes must come from the same policy, commands, resets and observation noise; otherwise their comparison
     measures those instead of the physics. An episode that ends early keeps its length: later steps are masked by
     `alive` and may hold anything, nan included. Units of observations, actions and scores are the user's. Leading
-    dimensions may be stacked in front of `episodes`, such as [sets, episodes, time].
+    dimensions may be stacked in front of `episodes`, such as [sets, episodes, time]. Episodes need at least as many
+    steps as a window (`SPMConfig.window`, `DVMConfig.window`: 50 by default).
     """
 
     obs: jax.Array  # [episodes, time, obs], what the policy saw at the beginning of each step
@@ -86,7 +87,10 @@ class Verdict(enum.IntEnum):
 Scale = Literal["one", "torque", "damping", "stiffness", "inertia", "mass", "drag", "speed", "slow", "motor"]
 """Quantity that one unit of a discovery coordinate stands for.
 
-Except for `one`, its size depends on the robot and on how it moved in the log, such as the rms torque of a joint.
+Except for `one`, its size depends on the robot and on how it moved in the log; `envs.scales` measures it. Per joint:
+`torque` is the rms torque (Nm), `speed` the rms speed (rad/s), `slow` a tenth of it, `damping` torque / speed,
+`stiffness` torque / 0.02 rad, `motor` the largest torque limit / speed, `inertia` the diagonal of the joint-space
+inertia (kg m^2). Per body: `mass` (kg), and `drag`, mass * 9.81 (N s/m).
 """
 
 

@@ -16,7 +16,7 @@ class BraxBiteno(BraxEnv):
 
     A robot whose episode ends, by a fall or by the time limit, starts a new one in the same step. The parameters travel
     in `state.info["params"]`; `with_params` changes them without compiling anything again. An episode cut by the time
-    limit is marked in `state.info["truncation"]`, so that PPO bootstraps its value.
+    limit is marked in `state.info["truncation"]`, so that PPO does not take the cut for a fall.
 
     Args:
       robot: robot and task, unbatched.

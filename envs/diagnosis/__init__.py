@@ -2,16 +2,17 @@
 
 `structure` looks at time stamps and rows. `physics` tries repairs: two joints swapped back, a sign flipped, degrees
 converted to radians, an offset or a delay removed. A repair is believed where the log agrees much better with itself
-and with the model after it. Disagreement is the sum over joints of up to five parts, each from 0 (agreement) to 2, in
-units of the signals' own size:
+and with the model after it. Disagreement is the sum over joints of up to five parts, in units of the signals'
+own size. Each goes from 0 (agreement) to 2, that of the targets to 1:
 
 - measured velocities against the slopes of measured positions;
 - the controller's torque against what the model needs for the measured motion (fixed base alone);
 - the measured torque against the controller's;
-- positions against their targets, and against the joints' ranges.
+- positions against their targets;
+- positions against the joints' ranges.
 
-Repairs are searched greedily, the best first, three at most; two at once where units are wrong, because nothing agrees
-in wrong units.
+Repairs are searched greedily in three rounds at most. A round makes the best repair, or a unit and one other repair
+together, because nothing agrees in wrong units.
 """
 
 from collections.abc import Mapping, Sequence

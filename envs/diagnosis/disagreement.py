@@ -15,7 +15,7 @@ _ROWS = 250  # at which inverse dynamics are evaluated, at most
 class Disagreement:
     """A measure of how much a run disagrees with itself and with the model; repairs are judged by how much it falls.
 
-    It is the sum over joints of these parts, each from 0 to 2:
+    It is the sum over joints of these parts, each from 0 to 2 (`target` to 1):
 
         velocity   dq against the slope of q
         torque     tau against the controller's torque

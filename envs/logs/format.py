@@ -48,7 +48,8 @@ class Run:
     """[rows] s, strictly increasing."""
     signals: Mapping[str, np.ndarray]
     """[rows], [rows, joints] or [rows, components] by the name of the signal, those that were recorded. Angles are in
-    rad, torques in Nm, supply in V, velocities of the base in m/s; phases in cycles."""
+    rad, `dq` and `gyro` in rad/s, torques in Nm, supply in V, `vel` in m/s, `acc` in m/s^2, `cmd` in m/s, m/s and
+    rad/s, phases in cycles. `gyro`, `acc`, `vel` and the unit vector `gravity` are in the body frame."""
     other: Mapping[str, np.ndarray] = field(default_factory=dict)
     """Columns that the format does not know, [rows] by name, unchanged."""
 
@@ -73,7 +74,7 @@ class Log:
     base: str
     """`fixed` (suspended or clamped) or `free` (on the ground)."""
     rate_hz: float
-    """Nominal rate of the rows; time stamps count."""
+    """Nominal rate of the rows in Hz. Where the time stamps differ from it, they are used."""
     joints: tuple[str, ...]
     """Names of the joints, in the order of the signals' last axis."""
     policy: Mapping[str, Any] | None

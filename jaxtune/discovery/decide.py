@@ -58,7 +58,7 @@ class Thresholds:
     t: float
     """Max-t threshold over all hypotheses that are compared on `select`, at once."""
     gain: float
-    """Gain of the best hypothesis on null logs, 95th percentile; of a pair, twice that."""
+    """Gain that the best hypothesis exceeds on null logs with probability `Settings.level`; for a pair, twice that."""
     floors: float = 1.0
     horizons: int = 2
     chosen: float = 0.7

@@ -1,10 +1,10 @@
 """The noise floor: how far simulation and measurement may differ where nothing is missing in the model.
 
 It is measured on simulated null logs: another engine moves the nominal robot, with parameters drawn from the prior and
-the measured log's noise. What is left of their residuals after the nominal parameters were fitted holds noise,
-rounding, the error of the state that a segment starts from, and the gap between engines, in one number for every
-component of every signal and every moment of a segment. All other modules work on residuals divided by it ("floor
-units"): one floor unit is as far off as a perfect model would be.
+the measured log's noise. Their nominal parameters are fitted. The residuals that are left hold noise, rounding, the
+error of the state that a segment starts from, and the gap between engines. Their rms, for every component of every
+signal and every moment of a segment, is the floor. All other modules work on residuals divided by it: a residual of one
+floor unit is as large as that rms, which even a model in which nothing is missing leaves.
 """
 
 from collections.abc import Callable, Mapping
@@ -82,9 +82,9 @@ class Calibration:
     floors: dict[float, tuple[Mapping[str, np.ndarray], float]]
     """Floor [bins, components] by split, and the independent share, by horizon."""
     gain: float
-    """Gain of the best hypothesis on null logs, 95th percentile: what a hypothesis must exceed."""
+    """Gain (fall of the loss) that the best hypothesis exceeds on null logs with probability `Settings.level`."""
     penalty: float
-    """Smallest penalty under which no joint of a null log needs a torque of its own."""
+    """Smallest weight of the group lasso (`localise.free_torque`) at which no joint of a null log gets a torque."""
 
 
 def measure(problem: Problem, calibration: Calibration | None, say: Say) -> NoiseFloor:

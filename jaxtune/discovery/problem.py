@@ -33,7 +33,8 @@ class Hypothesis:
     places: tuple[str, ...]
     """Joints or bodies that have the effect."""
     directions: np.ndarray
-    """[parameters, axes]: change of the vector per unit of each coordinate; one at the first place."""
+    """[parameters, axes]: how far each axis moves per unit of each coordinate. It is one at the first place; at the
+    others it converts between the scales of the places, so that the physical size is the same everywhere."""
     probes: np.ndarray
     """[probes, parameters]: coordinates at which the screen takes secants; the smallest of interest comes first."""
     bounds: np.ndarray
@@ -119,7 +120,8 @@ class Problem:
     """Measured segments by split and horizon (their length in s)."""
     null_logs: Sequence[Mapping[str, Mapping[float, Segments]]]
     """Segments, by split and horizon, of simulated logs of a robot that lacks nothing: the nominal model in another
-    engine, with its parameters drawn from the prior and the noise of the measured log."""
+    engine, with masses, armatures, dampings and frictions drawn from the prior, and with the noise of the measured
+    log."""
     bin_rows: int
     """Rows of a signal whose residuals are averaged to one bin."""
     regimes: tuple[str, ...]

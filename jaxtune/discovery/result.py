@@ -23,7 +23,8 @@ class Settings:
     finalists: int = 4
     """How many of those are fitted with fresh slopes, at every horizon, and compared."""
     paired: int = 4
-    """How many of the best are tried two by two where none passes alone."""
+    """How many of the best are tried two by two where none passes alone. Pairs are tried only while nothing was
+    accepted and the model is above the floor."""
     most: int = 4
     """Largest number of effects that are accepted."""
     level: float = 0.05
@@ -85,4 +86,5 @@ class Result:
     gap: Mapping[str, float]
     """Rms of the worst position on the sealed segments, in floor units: `before`, `null` and `after`."""
     proof: Mapping[str, Any]
-    """`cells` (rms of every component), `no_cell_worse`, and `others`: the gap of ablations and placebos."""
+    """`cells` (rms of every component), `no_cell_worse` (no component is more than a floor unit above the null's), and
+    `others`: the gap of ablations and placebos."""

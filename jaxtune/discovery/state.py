@@ -51,9 +51,11 @@ class State:
     """True where no further step is to be taken."""
 
     least_gain: float = 0.0
-    """Gain that chance gives: of the best hypothesis on null logs, 95th percentile; zero before it is known."""
+    """Gain (fall of the loss, `screen.Score.gain`) that the best hypothesis exceeds on null logs with probability
+    `Settings.level`; zero before it is known."""
     penalty: float = 0.0
-    """Smallest penalty under which no joint of a null log needs a torque of its own; zero before it is known."""
+    """Smallest weight of the group lasso (`localise.free_torque`) at which no joint of a null log gets a torque; zero
+    before it is known."""
     promise: Mapping[str, float] = field(default_factory=dict)
     """The screen's gain of every hypothesis, by key, before anything was accepted; empty before the first screen."""
     not_testable: tuple[str, ...] = ()
@@ -62,7 +64,8 @@ class State:
     """Cells above the floor before anything was accepted; see `localise.cells`."""
 
     needs_torque: Mapping[str, float] = field(default_factory=dict)
-    """How much every joint needs a torque of its own beside the model as it stands; zero where it needs none."""
+    """Norm over all segments of the torque that `localise.free_torque` gives every joint beside the model as it stands,
+    in floor units; zero where the joint needs none."""
     not_finite: tuple[str, ...] = ()
     """Keys of hypotheses that broke the simulation."""
     dropped: tuple[str, ...] = ()

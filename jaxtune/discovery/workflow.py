@@ -2,6 +2,7 @@
 
     noise floor -> null -> step (at most `Settings.most` acceptances) -> conclude -> prove
 
+The null is the nominal model with its nominal parameters and the controller's timing fitted, and no effect added.
 `step` draws what a step does. The sealed segments are simulated by `prove` alone, once.
 """
 
@@ -36,8 +37,8 @@ def discover(
     Args:
       problem: the simulator, the hypotheses and the measured segments.
       settings: how much is tried, and how much evidence is asked for.
-      calibration: what null logs of the same robot and motion taught; see `calibrate`. Without it they are taken from
-        the problem.
+      calibration: the noise floor and the thresholds that `calibrate` measured for the same robot, motion and noise.
+        Without it they are measured on the null logs of the problem.
       saved: what an interrupted run saved last: this one goes on from there.
       save: called with the state after every accepted effect.
       say: receives a line of text about progress.

@@ -51,9 +51,11 @@ class Entry:
     targets: tuple[str, ...]
     """Names of the objects that share this value."""
     fields: tuple[str, ...]
-    """Fields of `mjx.Model` that the value enters; those of a joint are indexed by its degrees of freedom."""
+    """Fields of `mjx.Model` that the value enters. Those of a joint must have one row per degree of freedom, such as
+    `dof_damping`; of a ball or free joint only the first row is changed."""
     bounds: tuple[float, float]
-    """Smallest and largest physical value."""
+    """Smallest and largest physical value. `apply` does not check them: they bound the distribution that is
+    searched."""
     column: int | None = None
     """Which column of the fields (the first of `geom_friction` is sliding friction); all of them where None."""
     log: bool = True
