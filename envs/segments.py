@@ -35,8 +35,8 @@ class Segment:
     limit: jax.Array  # [before + after, joints] Nm, of stiffness and damping together
     emf: jax.Array  # [before + after, joints] Nm s/rad, back electromotive force, not limited
     sample: jax.Array  # [before + after] true where the controller reads the joint anew
-    # [before + 1 + ahead, 2, joints] rad and rad/s, smoothed; index `before` is the start, and the `LONGEST_S / dt` steps
-    # `ahead` of it are what undoing a sensor's delay needs
+    # [before + 1 + ahead, 2, joints] rad and rad/s, smoothed. Index `before` is the start; the `LONGEST_S / dt` steps
+    # `ahead` of it are what undoing a sensor's delay needs.
     measured: jax.Array
     row_step: jax.Array  # [rows] the last step at or before each row; 0 is the segment's start
     row_share: jax.Array  # [rows] share of a step between that step and the row

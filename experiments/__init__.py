@@ -1,8 +1,8 @@
 """The commands of jaxtune, one module each: `python -m experiments` lists them.
 
-What commands share is in four packages: `common` (command line, configs, checkpoints, pages and pictures), `walking`
-(policies of BITeno and the simulators that they walk in), `discovery` (logs in, names of missing effects out) and
-`robot` (rounds with a robot that answers through files). A command imports packages and never another command.
+What commands share is in four packages: `common` (command line, configs, checkpoints, reports and plots), `walking`
+(policies of BITeno and the simulators that they walk in), `discovery` (from measured logs to names of missing effects)
+and `robot` (rounds with a robot that answers through files). A command imports packages and never another command.
 """
 
 import contextlib

@@ -11,7 +11,7 @@ from experiments.common.cli import console
 def commands() -> dict[str, str]:
     """Finds every command and the sentence that says what it does.
 
-    Modules are parsed, not imported, so the list appears at once and an optional dependency that is missing hides no
+    Modules are parsed and not imported, so the list appears at once, and a missing optional dependency hides no
     command.
 
     Returns:
@@ -25,7 +25,7 @@ def commands() -> dict[str, str]:
 
 
 def main() -> None:
-    """Prints the table of commands."""
+    """Prints the table of commands, for a user who does not know their names yet."""
     table = Table("command", "what it does", box=None)
     for name, sentence in commands().items():
         table.add_row(f"python -m experiments.{name}", sentence)

@@ -1,6 +1,6 @@
 """Measures speeds, and how often the gate rejects: `python -m experiments.bench speed`, or `targets`, `logs`, `alarm`.
 
-Speeds are facts about one machine on one day: compare ratios within one run. None of them is asserted in a test.
+Speeds depend on the machine and on what else it does, so compare only ratios within one run. No test asserts them.
 """
 
 import dataclasses
@@ -31,6 +31,9 @@ from jaxtune import tuner
 from jaxtune.mjx import parameters
 
 FIELDS = ("novelty", "threshold", "p_value")
+"""Numbers of a gate call that `alarm` keeps."""
+
+_HEADINGS = {"rings": "rejects"}  # of the table; the key in JSON stays
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,24 +41,29 @@ class Args:
     """Measures one thing, prints it as a table and writes it as JSON."""
 
     what: tyro.conf.Positional[Literal["speed", "targets", "logs", "alarm"]]
-    """speed: training steps a second with both physics presets. targets: steps a second of every engine that is
-    installed. logs: reading ten minutes of 40 columns at 1 kHz. alarm: first gate calls over many seeds."""
+    """speed: training steps per second, with exact and fast physics. targets: simulation steps per second of every
+    engine that is installed. logs: seconds to read ten minutes of 40 columns at 1 kHz. alarm: how often the gate
+    rejects in its first call, over many seeds."""
     out: Path = Path("runs/bench")
-    """Folder of the results."""
+    """Folder of the results, a JSON file for each measurement."""
     preset: str = "cpu"
-    """Sizes: smoke, cpu or gpu."""
+    """Size of the run: smoke (seconds, to see that it works), cpu (two cores) or gpu (one GPU)."""
     policy: str = "walk"
-    """Policy of targets and alarm: walk, or a folder of experiments.train."""
+    """Policy of targets and alarm: walk (ships with the package), or a folder of experiments.train."""
     seeds: int = 10
-    """Gate calls for each target."""
+    """Number of gate calls for each target of alarm, with a random seed each."""
     radius: float = 0.2
-    """Radius of the distribution in `alarm`, in log space."""
+    """Radius (half width) of the distribution in alarm, in log space: 0.2 spans 0.82 to 1.22 times nominal."""
 
 
 def speed(args: Args) -> dict:
-    """Measures environment steps a second of whole PPO updates (rollout and learning), with both physics presets.
+    """Measures environment steps per second of whole PPO updates (rollout and learning), with exact and fast physics.
 
-    The first call compiles and is listed apart; the speed is that of the fastest of three more.
+    The first call compiles and is listed separately. The speed is that of the fastest of three further calls, because
+    other work on the machine can only slow a call down.
+
+    Returns:
+      `first_call_s` and `steps_per_second` by physics.
     """
     rows = {}
     for physics in ("exact", "fast"):
@@ -78,9 +86,12 @@ def speed(args: Args) -> dict:
 
 
 def targets(args: Args) -> dict:
-    """Measures steps a second of whole episodes in every engine that is installed, at sub-steps of 1 ms.
+    """Measures steps per second of whole episodes in every engine that is installed, at sub-steps of 1 ms.
 
-    The policy is the shipped one, because a robot that falls at once makes an engine look fast. Compilation is apart.
+    It plays a policy that walks, because a robot that falls at once makes an engine look fast.
+
+    Returns:
+      By engine: `first_call_s` (compilation included), policy and physics steps per second of the second call.
     """
     sizes = preset(args.preset)
     sizes = dataclasses.replace(sizes, task=dataclasses.replace(sizes.task, physics="exact"))
@@ -105,9 +116,10 @@ def targets(args: Args) -> dict:
 
 
 def logs(args: Args) -> dict:
-    """Measures how long reading a log takes, by format: ten minutes of 40 columns at 1 kHz.
+    """Measures how long it takes to read a log of ten minutes, 40 columns and 1 kHz (a hundredth of it with `smoke`).
 
-    With the preset `smoke` it is a hundredth of that.
+    Returns:
+      `seconds`, `rows` and `columns` by file format.
     """
     rows, joints = 600_000 // (100 if args.preset == "smoke" else 1), constants.JOINTS
     rng = np.random.default_rng(0)
@@ -134,9 +146,13 @@ def logs(args: Args) -> dict:
 
 
 def alarm(args: Args) -> dict:
-    """Counts how often a first gate call rejects: target outside the radius, at its centre, and drawn within it.
+    """Counts how often the first call of the gate rejects, over many seeds.
 
-    The share of rejections within the radius is the false-alarm rate, outside it the power.
+    Two targets lie outside the distribution, where the gate should reject: the share of rejections is its power. Two
+    lie inside, at the centre and at a random place: there the share is the rate of false alarms.
+
+    Returns:
+      By target: the number of rejections `rings`, `of` how many calls, and the gate's numbers in every call.
     """
     sizes = preset(args.preset)
     learner = Learner(sizes, chosen("legs6"))
@@ -182,13 +198,13 @@ def alarm(args: Args) -> dict:
 
 
 def main(args: Args) -> None:
-    """Measures what was asked for, prints it and writes it."""
+    """Measures one thing, prints a table, and writes it as JSON with the time and the memory that it took."""
     checkpoint.set_up_compiler(preset(args.preset).xla_flags)
     begin = time.monotonic()
     rows = {"speed": speed, "targets": targets, "logs": logs, "alarm": alarm}[args.what](args)
     table = Table(title=args.what)
     for column in ("", *next(iter(rows.values()))):
-        table.add_column(column)
+        table.add_column(_HEADINGS.get(column, column))
     for name, row in rows.items():
         table.add_row(name, *(np.array2string(np.asarray(value), precision=2) for value in row.values()))
     console.print(table)

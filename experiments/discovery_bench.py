@@ -1,9 +1,9 @@
-"""Measures blind how often discovery is right: `python -m experiments.discovery_bench --size smoke --out DIR`.
+"""Counts how often discovery is right, in a blind test: `python -m experiments.discovery_bench --size smoke --out DIR`.
 
-It hides an effect in a robot that another engine moves, writes a log as a user would and the truth into a folder that
-only the scorer reads, has discovery work on the log and the nominal model, and scores what it says. Every case is a
-file of its own: the same command goes on where it stopped, and `--piece 0/2` and `--piece 1/2` share the work between
-two processes.
+For every case it hides an effect in a robot that another engine simulates, and writes a log as a user would. The truth
+goes into a folder that only the scorer reads. Discovery gets the log and the nominal model, and its answer is scored.
+Every case is a file of its own, so the same command continues where it stopped. `--piece 0/2` and `--piece 1/2` share
+the work between two processes.
 """
 
 from dataclasses import dataclass
@@ -20,22 +20,28 @@ from experiments.discovery.scores import shown
 
 @dataclass(frozen=True, kw_only=True)
 class Args:
-    """Hides effects in simulated robots, has discovery look for them, and counts how often it is right."""
+    """Hides effects in simulated robots, lets discovery look for them, and counts how often it is right."""
 
     out: Path = Path("runs/discovery_bench")
     """Folder of the cases and the scores."""
     size: str = "smoke"
-    """smoke, arm, standard or full."""
+    """Cases: smoke (6 two-joint arms, to see that it works), arm (75 arms, an hour), standard (98 BITenos, a night on a
+    CPU) or full (BITenos with longer logs, for a GPU or a few nights)."""
     seed: int = 0
-    """Seed of everything random."""
+    """Random seed of the cases, their places, sizes and wrong parameters."""
     nominal_error: float = 0.1
-    """By how much nominal parameters are wrong: half of it to one and a half times it; gains by a third of that."""
+    """Relative error of the nominal parameters. Each is wrong by 0.5 to 1.5 times this, up or down; gains by a third of
+    that."""
     piece: str = "0/1"
-    """Which share of the cases to work on."""
+    """Share of the cases to work on, as NUMBER/COUNT: 0/2 and 1/2 in two processes make all."""
 
 
 def main(args: Args) -> None:
-    """Answers this piece's cases, and scores all that are answered."""
+    """Lets discovery answer the cases of this piece, and scores all cases that are answered.
+
+    Raises:
+      ValueError: an option is wrong, or the folder holds another benchmark.
+    """
     checkpoint.set_up_compiler(checkpoint.a_device_a_core())
     if args.size not in SIZES:
         raise ValueError(f"size: got '{args.size}', expected one of {', '.join(SIZES)}")

@@ -1,4 +1,8 @@
-"""Says what is wrong with a log before anything is learnt from it: `python -m experiments.doctor --log LOG`."""
+"""Finds probable errors in a log before anything is learnt from it: `python -m experiments.doctor --log LOG`.
+
+It reports suspicions, never certainties: which change of order, sign, unit, offset or delay would make the log agree
+much better with itself and with the robot's model. `envs.diagnosis` holds the tests.
+"""
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -14,17 +18,21 @@ from experiments.common.cli import console, run
 
 @dataclass(frozen=True, kw_only=True)
 class Args:
-    """Looks for swapped joints, flipped signs, degrees for radians, offsets, delays, and a clock that jumps or
-    drifts."""
+    """Looks in a log for swapped joints, flipped signs, degrees in the place of radians, offsets, delays and clock
+    errors."""
 
     log: Path
-    """Folder of the log."""
+    """Folder of the log, with its meta.yaml."""
     out: Path | None = None
-    """Folder of doctor.json and doctor.png; the log's own name in runs/doctor where not given."""
+    """Folder of doctor.json and doctor.png; runs/doctor/NAME_OF_THE_LOG if not given."""
 
 
 def main(args: Args) -> None:
-    """Reads the log, prints what is suspected, and writes doctor.json and a picture of the worst run."""
+    """Reads the log, prints what is suspected, and writes doctor.json and a plot of the run with most suspicions.
+
+    Raises:
+      ValueError: the log is damaged and cannot be read.
+    """
     log = read(args.log)
     out = args.out or Path("runs/doctor") / args.log.resolve().name
     found = diagnose_log(log)
@@ -37,13 +45,13 @@ def main(args: Args) -> None:
     worst = max(log.runs, key=lambda one: len(found[one.name]))
     plots.suspicions(out / "doctor.png", worst, log.joints, [one.sentence for one in found[worst.name]])
     if not said:
-        console.print(f"nothing is suspected in {len(log.runs)} run(s); picture in {out}")
+        console.print(f"nothing is suspected in {len(log.runs)} run(s); plot in {out}")
         return
     table = Table("what is suspected", "runs", title=escape(str(args.log)))
     for finding, names in said:
         table.add_row(escape(finding.sentence), f"{len(names)} of {len(log.runs)}: {', '.join(names[:3])}")
     console.print(table)
-    console.print(f"picture of {worst.name} in {out}")
+    console.print(f"plot of {worst.name} in {out}")
 
 
 if __name__ == "__main__":

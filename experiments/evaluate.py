@@ -26,35 +26,35 @@ from experiments.walking.targets import TARGETS
 from jaxtune.mjx import parameters
 
 GRID = tuple(itertools.product((-0.4, 0.0, 0.4, 0.8), (-0.3, 0.0, 0.3), (-0.8, 0.0, 0.8)))
-"""Commands forward in m/s, sideways in m/s, turning in rad/s."""
+"""Velocity commands (forward in m/s, sideways in m/s, turning in rad/s) that are measured one by one."""
 
-_GRID_S = 5.0
+_GRID_S = 5.0  # how long each of them is held
 
 
 @dataclass(frozen=True, kw_only=True)
 class Args:
-    """Measures how well a policy walks in a target: gait, tracking, falls and return."""
+    """Measures how well a policy walks in a simulator: gait, tracking of commands, falls and return."""
 
     out: Path = Path("runs/evaluate")
     """Folder of evaluation.json, gait.png, film.png and walk.gif."""
     policy: str = "walk"
     """Policy: walk (ships with the package), or a folder of experiments.train."""
     target: str = "mjx"
-    """Engine: mjx, mujoco_c or bullet."""
+    """Engine of the simulator: mjx, mujoco_c or bullet."""
     set: tuple[str, ...] = ()
-    """Parameters of the target that are not nominal, as name=value."""
+    """Parameters that are not nominal, as name=value, such as foot_friction=0.5 (a multiple of nominal)."""
     preset: str = "cpu"
-    """Sizes of the network: smoke, cpu or gpu."""
+    """Preset that the policy was trained with, which fixes its network: smoke, cpu or gpu."""
     physics: str = "exact"
-    """exact: sub-steps of 1 ms. fast: of 2 ms."""
+    """Physics: exact (sub-steps of 1 ms) or fast (2 ms)."""
     episodes: int = 100
-    """Episodes of the full time limit, without and with pushes."""
+    """Number of full-length episodes (20 s; 0.8 s with smoke) without pushes, and again with pushes."""
     push: float = 0.5
-    """Speed of a push in m/s; one comes every 4 s."""
+    """Change of velocity by a push, in m/s; a push comes every 4 s."""
     seed: int = 0
-    """Seed of commands, resets and pushes."""
+    """Random seed of commands, resets and pushes."""
     video: bool = False
-    """Write the walk as a GIF too."""
+    """Also write the walk as walk.gif."""
 
 
 def check(args: Args) -> dict[str, float]:
@@ -74,7 +74,11 @@ def check(args: Args) -> dict[str, float]:
 
 
 def main(args: Args) -> None:
-    """Measures in all three ways, prints a table, and writes evaluation.json and pictures."""
+    """Makes the three measurements, prints them as a table, and writes evaluation.json and pictures.
+
+    Raises:
+      ValueError: an option is wrong, the policy cannot be loaded, or the engine is not installed.
+    """
     checkpoint.set_up_compiler(preset(args.preset).xla_flags)
     params = check(args)
     sizes = preset(args.preset)
@@ -99,8 +103,9 @@ def main(args: Args) -> None:
 
     table = Table(title=f"{args.policy} in {args.target} {' '.join(args.set)}")
     table.add_column("")
+    headings = {"grid": "command grid", "none": "no pushes", "pushes": "pushes"}
     for name in rows:
-        table.add_column(name, justify="right")
+        table.add_column(headings[name], justify="right")
     for name in rows["grid"]:
         table.add_row(name, *(f"{row[name]:.3f}" for row in rows.values()))
     table.add_section()

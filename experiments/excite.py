@@ -1,8 +1,7 @@
 """Writes targets in which missing effects are distinguishable: `python -m experiments.excite --robot MODEL --out DIR`.
 
-What is written is a log without measurements. Play its targets on the robot, suspended or clamped, and put what was
-measured beside them; `experiments.discover` then reads the log. `experiments.discovery.excitation` says what the motion
-is made of.
+The result is a log without measurements. Play its targets on the robot, suspended or clamped, and add the measured
+columns; `experiments.discover` then reads the log. The motion is described in `experiments.discovery.excitation`.
 """
 
 import shutil
@@ -20,32 +19,37 @@ from experiments.discovery.excitation import excitation, scaled
 
 @dataclass(frozen=True, kw_only=True)
 class Args:
-    """Writes targets for a log in which missing effects are distinguishable."""
+    """Writes joint targets for a robot to play, so that discovery can distinguish missing effects in its log."""
 
     out: Path
-    """Folder of the log: meta.yaml, and a run_*.csv of times, targets and motor switches for every run."""
+    """Folder of the log: meta.yaml, and for every run a run_*.csv with times, joint targets, and whether the motors are
+    on."""
     robot: str = "biteno"
-    """biteno, pendulum, or the path of an MJCF file."""
+    """Robot: biteno, pendulum, or the path of an MJCF file."""
     runs: int = 6
-    """Number of runs, 4 or more."""
+    """Number of runs; 4 or more, so that they can be split into train, select and sealed."""
     seconds: float = 3.0
-    """Length of a run."""
+    """Length of a run in s."""
     rate_hz: float = 500.0
-    """Rows a second."""
+    """Rows per second of the log."""
     kp: float = 60.0
-    """Proportional gain of the joint controllers in Nm/rad. Half of the runs have half of both gains."""
+    """Proportional gain of the joint controllers in Nm/rad. Half of the runs use half of kp and kd."""
     kd: float = 2.0
-    """Damping of the joint controllers in Nm s/rad."""
+    """Derivative gain of the joint controllers in Nm s/rad."""
     torque_limit_nm: float = 60.0
-    """Torque limit of the joint controllers."""
+    """Torque limit of the joint controllers in Nm."""
     control_hz: float = 1000.0
-    """Rate of the joint controllers."""
+    """Rate of the joint controllers in Hz."""
     seed: int = 0
-    """Seed of postures and steps."""
+    """Random seed of postures, paces and steps."""
 
 
 def main(args: Args) -> None:
-    """Writes the targets, and a copy of the model where it is not a built-in one."""
+    """Writes the targets, and a copy of the model if it is not a built-in one.
+
+    Raises:
+      ValueError: an option is wrong, or the model cannot be read.
+    """
     for name in ("seconds", "rate_hz", "kp", "torque_limit_nm", "control_hz"):
         if not 0 < getattr(args, name) < np.inf:
             raise ValueError(f"{name}: got {getattr(args, name)}, expected a positive, finite number")
@@ -74,8 +78,8 @@ def main(args: Args) -> None:
     if not built_in:
         shutil.copy(args.robot, args.out / name)
     console.print(
-        f"{len(runs)} runs of {args.seconds:g} s for {', '.join(joints)} in {args.out}: play each run's targets, and "
-        "write what was measured into the same files or copies of them (q.*, and dq.* where there is a sensor)"
+        f"wrote {len(runs)} runs of {args.seconds:g} s for {', '.join(joints)} to {args.out}. Play each run's targets "
+        "on the robot, and add the measured columns to its file or a copy of it: q.*, and dq.* if there is a sensor."
     )
 
 

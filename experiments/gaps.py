@@ -1,7 +1,7 @@
-"""Measures what a gap costs a policy that was not tuned: `python -m experiments.gaps --out DIR`.
+"""Measures how much a wrong parameter costs a policy that was not tuned: `python -m experiments.gaps --out DIR`.
 
-A gap in which an untuned policy loses nothing is no transfer problem, so look here before tuning. Friction, mass and
-motor strength vary one at a time, and the policy walks under the task's own commands.
+If an untuned policy loses nothing, tuning has nothing to gain, so look here first. Friction, mass and motor strength
+vary one at a time in MJX, and the policy walks under the task's own commands.
 """
 
 from dataclasses import dataclass
@@ -26,12 +26,13 @@ SWEEPS = {
     "mass": (("trunk_mass", "abductor_mass", "thigh_mass", "shank_mass"), (0.5, 0.67, 0.8, 1.0, 1.25, 1.5, 1.75, 2.0)),
     "motor": (("torque_scale",), (0.4, 0.5, 0.6, 0.75, 0.9, 1.0, 1.2)),
 }
-"""Parameters that share one value, and its values: the coefficient of friction, multiples of mass and of torque."""
+"""By sweep, the parameters that share one value, and the values: coefficients of friction, multiples of nominal mass
+and multiples of nominal torque."""
 
 SHOWN = {
     "return": "return of 20 s (at most 70)",
     "speed_error_mps": "speed error, m/s",
-    "slip_mps": "slip, m a second",
+    "slip_mps": "slip, m/s",
     "falls_per_20s": "falls in 20 s",
 }
 """Columns of the table and panels of the picture."""
@@ -39,22 +40,22 @@ SHOWN = {
 
 @dataclass(frozen=True, kw_only=True)
 class Args:
-    """Walks a policy through ranges of friction, mass and motor strength."""
+    """Lets a policy walk with wrong friction, mass and motor strength, and measures what that costs."""
 
     out: Path = Path("runs/gaps")
     """Folder of gaps.json and gaps.png."""
     policy: str = "walk"
     """Policy: walk (ships with the package), or a folder of experiments.train."""
     preset: str = "cpu"
-    """Sizes: smoke, cpu or gpu."""
+    """Preset that the policy was trained with; it fixes the network and the length of an episode: smoke, cpu or gpu."""
     episodes: int = 32
-    """Episodes of the full time limit at every point."""
+    """Number of full-length episodes (20 s; 0.8 s with smoke) for every value of every parameter."""
     seed: int = 0
-    """Seed of commands and resets, the same at every point."""
+    """Random seed of commands and resets, the same for all values, so that they compare."""
 
 
 def points(friction: float) -> list[tuple[str, float, dict[str, float]]]:
-    """Lists the points of all sweeps.
+    """Lists the points of all sweeps, with the physical values of the simulator at each.
 
     Args:
       friction: the nominal coefficient; friction sweeps in coefficients, the others in multiples of nominal.
@@ -70,7 +71,11 @@ def points(friction: float) -> list[tuple[str, float, dict[str, float]]]:
 
 
 def main(args: Args) -> None:
-    """Walks at every point, prints a table, and writes gaps.json and gaps.png."""
+    """Lets the policy walk at every point, prints a table, and writes gaps.json and gaps.png.
+
+    Raises:
+      ValueError: an option is wrong, or the policy cannot be loaded.
+    """
     checkpoint.set_up_compiler(preset(args.preset).xla_flags)
     if args.episodes < 1:
         raise ValueError(f"episodes: got {args.episodes}, expected 1 or more")
@@ -94,7 +99,7 @@ def main(args: Args) -> None:
             results.append({"sweep": sweep, "value": value, **quality(*jax.device_get(walk(policy, params)))})
 
     table = Table(title=f"{args.policy}, untuned")
-    for column in ("", "value", *SHOWN):
+    for column in ("varied", "value", *SHOWN.values()):
         table.add_column(column, justify="right")
     for row in results:
         table.add_row(row["sweep"], f"{row['value']:g}", *(f"{row[name]:.2f}" for name in SHOWN))

@@ -34,41 +34,46 @@ from jaxtune.types import ParamDist, Verdict
 
 @dataclass(frozen=True, kw_only=True)
 class Args:
-    """Tunes a simulator to a target in another simulator, and compares with the baselines."""
+    """Tunes the simulator of a walking BITeno to a second simulator, the target, and compares tuning methods."""
 
     out: Path = Path("runs/sim2sim")
-    """Folder of the run; the same command with the same folder goes on after the last finished (method, seed)."""
+    """Folder of the run. The same command with the same folder continues after the last finished (method, seed)."""
     case: str = "mass"
-    """What is off: friction, mass, bullet (another engine), weak_motor or weaker_motor (0.75 and 0.6 of the torque, in
-    bullet)."""
+    """How the target differs: friction, mass, bullet (the engine PyBullet), weak_motor or weaker_motor (PyBullet with
+    0.75 or 0.6 of the torque)."""
     start: float = 0.5
-    """Where the simulator starts, as a multiple of the target; for friction and mass alone."""
+    """Where the simulator starts, as a multiple of the target's values; only the cases friction and mass use it."""
     target: str | None = None
-    """Engine of the target, where not the case's own: mjx, mujoco_c or bullet."""
+    """Engine of the target: mjx, mujoco_c or bullet; the case's own if not given."""
     methods: tuple[str, ...] = ("ours", "dr")
-    """Which of ours, spm, dr, oracle."""
+    """Methods to compare: ours, spm (the paper's update without the gate), dr (wide domain randomisation without
+    tuning), oracle (trained with the target's parameters)."""
     seeds: int = 1
-    """Number of seeds, from 0."""
+    """Number of random seeds; they count from 0."""
     preset: str = "cpu"
-    """Sizes: smoke, cpu or gpu."""
+    """Size of the run: smoke (a minute, to see that it works), cpu (two cores) or gpu (one GPU)."""
     policy: str = "walk"
     """Starting policy: walk (ships with the package), scratch (trained first), or a folder of experiments.train."""
     parameters: str = "legs6"
-    """Parameters that are tuned: legs6, whole_body, or names joined by commas."""
+    """Parameters that are tuned: legs6 (foot friction and the six link masses), whole_body (friction, trunk mass, link
+    masses with left and right tied), or names joined by commas."""
     radius: float = 0.2
-    """First radius of ours and spm, in log space."""
+    """First radius (half width of the distribution) of ours and spm, in log space: 0.2 spans 0.82 to 1.22 times the
+    centre."""
     dr_radius: float = 0.4
-    """Radius of domain randomisation."""
+    """Radius of dr, in log space: 0.4 spans 0.67 to 1.49 times the nominal value."""
     update: str = "posterior"
-    """How ours moves the distribution: posterior (sweep, move, narrow) or vote (the paper's rule)."""
+    """How ours moves the distribution: posterior (move to the estimate, narrow to its interval) or vote (the paper's
+    steps)."""
     step_size: float = 0.5
-    """Radii per unit vote in the paper's rule."""
+    """Step of the paper's update, in radii per unit of vote; for spm, and for ours with --update vote."""
     widen_factor: float = 1.5
-    """What a failed check multiplies the radius by."""
+    """The radius is multiplied by this every time the gate rejects."""
     level: float = 0.95
-    """The gate's threshold is this quantile of the novelty of held-out simulated sets."""
+    """Quantile of the novelty of held-out simulated sets that is the gate's threshold; 1 - level is the rate of false
+    alarms."""
     threshold: float | None = None
-    """A fixed threshold in its stead, a mean rank between 0 and 1."""
+    """Fixed threshold of the gate, a mean rank between 0 and 1, instead of the calibrated one."""
 
 
 def check(args: Args) -> tuple[Preset, dict[str, Entry], tuner.Knobs]:
@@ -102,16 +107,16 @@ def make_target(args: Args, learner: Learner) -> Target:
 
 
 class Runner:
-    """Tunes with every (method, seed) pair, and keeps the result of each in a file of its own.
+    """Runs every (method, seed) pair, and keeps the result of each in a file of its own.
 
-    A pair whose file exists is read instead of tuned, which is how an interrupted run goes on.
+    A pair whose file exists is read instead of run again, so an interrupted run continues with its next pair.
 
     Args:
-      args: of the command.
-      learner: BITeno's side of the tuner.
+      args: options of the command.
+      learner: gives the tuner its functions.
       target: what is tuned to.
       policy: what every pair starts with.
-      knobs: of the tuner.
+      knobs: scalars of the tuner, such as step size and level.
     """
 
     def __init__(self, args: Args, learner: Learner, target: Target, policy: Policy, knobs: tuner.Knobs):
@@ -123,10 +128,15 @@ class Runner:
         self._steps = {name: learner.step(one.tuner, self._play) for name, one in self._contenders.items()}
 
     def __call__(self, name: str, seed: int, progress: Progress) -> dict:
-        """Tunes with one pair, or reads what an earlier call left.
+        """Runs one pair, or reads the result of an earlier call.
+
+        Args:
+          name: of the method.
+          seed: of everything random.
+          progress: display that gets a bar for the pair.
 
         Returns:
-          `lines`, the metrics after every tuning (the first one before any), and `measured_episodes`.
+          `lines`, the metrics before the first tuning and after each, and `measured_episodes`, their total number.
         """
         path = self._args.out / "results" / f"{name}_{seed}.json"
         tunings = self._learner.preset.tunings
@@ -165,7 +175,8 @@ class Runner:
         verdict = info.verdicts[int(info.calls) - 1] if info.calls else Verdict.ACCEPT
         if verdict == Verdict.NOT_FINITE and info.measured_falls == self._learner.preset.tuner.set_episodes:
             raise ValueError(
-                f"target: every measured episode fell or broke within {self._learner.preset.tuner.dvm.window} steps"
+                f"target: every measured episode fell or broke within {self._learner.preset.tuner.dvm.window} steps, "
+                "expected at least one that lasts longer: start from a policy that can stand there"
             )
 
     def _describe(self, dist: ParamDist) -> dict:
@@ -184,10 +195,15 @@ class Runner:
 
 
 def main(args: Args) -> None:
-    """Tunes with every pair that is not finished, and writes metrics, summary and plots."""
+    """Runs every pair that is not finished, writes metrics, summary and plots, and prints two tables.
+
+    Raises:
+      ValueError: an option is wrong, the folder holds another run, or no measured episode lasts as long as a window.
+    """
     checkpoint.set_up_compiler(preset(args.preset).xla_flags)
     sizes, entries, knobs = check(args)
     identity = {**dataclasses.asdict(args), "sizes": sizes}
+    # A later call may add methods and seeds to the same folder.
     for option in ("out", "methods", "seeds"):
         del identity[option]
     case = CASES[args.case]

@@ -1,8 +1,8 @@
-"""Sweeps the tuner's knobs as one compiled program: `python -m experiments.sweep --out DIR`.
+"""Runs the tuner with every combination of its settings: `python -m experiments.sweep --out DIR`.
 
-Every combination of step size, widening factor, start radius, level and seed is a lane of one vmapped `Tuner.run`
-against one target. The policy is fixed, so that a lane costs simulation and model training alone, and the update is
-the paper's rule, which is the one that has a step size.
+Every combination of step size, widening factor, first radius, level and seed is a lane of one vmapped `Tuner.run`
+against one target. The policy is fixed, so a lane costs only simulation and the training of the tuner's two models.
+The update is the paper's, because the posterior update has no step size.
 """
 
 import dataclasses
@@ -32,34 +32,36 @@ from jaxtune.types import Coords, Verdict
 
 @dataclass(frozen=True, kw_only=True)
 class Args:
-    """Tunes one simulator with every combination of the tuner's knobs at once."""
+    """Tunes one simulator with every combination of the tuner's settings, as one compiled program."""
 
     out: Path = Path("runs/sweep")
-    """Folder of the results."""
+    """Folder of summary.json and heat_map.png."""
     case: str = "mass"
-    """What is off: friction or mass."""
+    """How the target differs: friction or mass."""
     start: float = 0.5
-    """Where the simulator starts, as a multiple of the target."""
+    """Where the simulator starts, as a multiple of the target's values."""
     step_sizes: tuple[float, ...] = (0.25, 0.5, 1.0)
-    """Radii per unit vote."""
+    """Steps of the paper's update, in radii per unit of vote."""
     widen_factors: tuple[float, ...] = (1.5, 2.0)
-    """What a failed check multiplies the radius by."""
+    """Factors on the radius every time the gate rejects."""
     radii: tuple[float, ...] = (0.2, 0.4)
-    """First radii, in log space."""
+    """First radii (half widths of the distribution), in log space: 0.2 spans 0.82 to 1.22 times the centre."""
     levels: tuple[float, ...] = (0.8, 0.95)
-    """Quantiles of the held-out novelty that are the threshold."""
+    """Quantiles of the novelty of held-out simulated sets that are the gate's threshold."""
     seeds: int = 2
-    """Number of seeds, from 0."""
+    """Number of random seeds of every combination; they count from 0."""
     preset: str = "cpu"
-    """Sizes: smoke, cpu or gpu."""
+    """Size of the run: smoke (a minute, to see that it works), cpu (two cores) or gpu (one GPU)."""
     policy: str = "walk"
-    """Policy: walk (ships with the package), scratch (trained first), or a folder of experiments.train."""
+    """Policy, which stays fixed: walk (ships with the package), scratch (trained first), or a folder of
+    experiments.train."""
     parameters: str = "legs6"
-    """Parameters that are tuned: legs6, whole_body, or names joined by commas."""
+    """Parameters that are tuned: legs6 (foot friction and the six link masses), whole_body (friction, trunk mass, link
+    masses with left and right tied), or names joined by commas."""
 
 
 def check(args: Args) -> tuple[Preset, dict[str, Entry]]:
-    """Checks the arguments, every combination of knobs included, before anything is compiled.
+    """Checks the arguments, and every combination of the tuner's settings, before anything is compiled.
 
     Returns:
       Sizes, with those of a sweep in the place of a single tuning's, and the table of parameters that are tuned.
@@ -74,12 +76,12 @@ def check(args: Args) -> tuple[Preset, dict[str, Entry]]:
         check_positive(radius=radius, seeds=args.seeds)
         tuner.knobs(step_size=step_size, widen_factor=widen_factor, level=level)
     if CASES[args.case].target != "mjx":
-        raise ValueError(f"case: got '{args.case}', but a sweep is one program and needs a target in mjx")
+        raise ValueError(f"case: got '{args.case}', expected friction or mass: a sweep needs a target in mjx")
     return dataclasses.replace(sizes, tuner=sizes.sweep, episode_steps=sizes.sweep_steps), entries
 
 
 def lanes(args: Args) -> np.ndarray:
-    """Lists all combinations of knobs and seed as a grid, one lane of the vmapped program each.
+    """Lists all combinations of settings and seed as a grid; each is one lane of the vmapped program.
 
     Returns:
       [step sizes, widening factors, radii, levels, seeds, 5], the last axis in that order.
@@ -89,13 +91,16 @@ def lanes(args: Args) -> np.ndarray:
 
 
 def program(args: Args, learner: Learner, policy: Policy) -> Callable:
-    """Compiles the sweep as one function of its lanes, [lanes, 5] -> (distribution, info), both [lanes, ...].
+    """Makes the sweep one compiled function of its lanes, [lanes, 5] -> (distribution, info), both [lanes, ...].
 
-    The policy never trains, so that a lane costs simulation and the tuner's own models alone.
+    Args:
+      args: options of the command.
+      learner: gives the tuner its functions.
+      policy: what walks in every lane; it is never trained.
     """
     target = MjxTarget(robot=learner.robot, params=CASES[args.case].true_params(learner.entries, args.start))
     fixed = dataclasses.replace(learner.tuner(target), train_policy=_keep, update=tuner.vote_update)
-    dist = learner.dist(parameters.nominal(learner.entries), 1.0)
+    dist = learner.dist(parameters.nominal(learner.entries), 1.0)  # each lane sets a radius of its own
 
     def one(step_size, widen_factor, radius, level, seed):
         knobs = tuner.knobs().replace(step_size=step_size, widen_factor=widen_factor, level=level)
@@ -109,7 +114,7 @@ def program(args: Args, learner: Learner, policy: Policy) -> Callable:
 
 
 def _keep(key, policy, dist):
-    """Returns the policy as it is: the tuner's `train_policy` where nothing is trained."""
+    """Returns the policy as it is; stands in for the tuner's `train_policy`, since nothing is trained."""
     return policy, {}
 
 
@@ -123,14 +128,18 @@ def mean_error(learner: Learner, truth: Mapping[str, float], centre: Coords, off
       off: names that are averaged over.
 
     Returns:
-      [lanes]
+      [lanes] mean relative error.
     """
     estimate = parameters.from_coords(learner.entries, centre)
     return np.mean([np.abs(np.asarray(estimate[name]) / truth[name] - 1) for name in off], axis=0)
 
 
 def main(args: Args) -> None:
-    """Runs the sweep, prints a table, and writes summary.json and heat_map.png."""
+    """Runs the sweep, prints a table with the best combination first, and writes summary.json and heat_map.png.
+
+    Raises:
+      ValueError: an option is wrong, or the folder holds another run.
+    """
     checkpoint.set_up_compiler(preset(args.preset).xla_flags)
     sizes, entries = check(args)
     learner = Learner(sizes, entries)
@@ -183,7 +192,8 @@ def _draw(args: Args, mean: np.ndarray) -> None:
 
 def _table(args: Args, rows: Sequence[dict], seconds: float, count: int) -> None:
     table = Table(title=f"case {args.case}, start {args.start:g}X: {count} lanes in {seconds:.0f} s, one program")
-    for column in ("step size", "widen", "radius", "level", "error at the end", "gate calls", "accepted"):
+    columns = "step size", "widening factor", "first radius", "level", "error at the end", "gate calls", "accepted"
+    for column in columns:
         table.add_column(column, justify="right")
     for row in sorted(rows, key=lambda row: np.mean(row["error"])):
         table.add_row(

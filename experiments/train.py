@@ -21,19 +21,25 @@ class Args:
     out: Path
     """Folder of the policy: orbax checkpoint, config.json, curve.json, curve.png."""
     preset: str = "cpu"
-    """Sizes: smoke, cpu or gpu."""
+    """Size of the run: smoke (seconds, to see that it works), cpu (two cores) or gpu (one GPU)."""
     parameters: str = "legs6"
-    """Parameters that vary in training, within the preset's policy_radius: a set's name or names joined by commas."""
+    """Parameters that are randomised in training, a little (the preset's policy_radius): legs6 (foot friction and the
+    six link masses), whole_body (friction, trunk mass, link masses with left and right tied), or names joined by
+    commas."""
     model: Path | None = None
-    """Folder of a corrected model that discovery wrote (`OUT/model`), to train in instead of the nominal one."""
+    """Folder of a corrected model that discovery wrote (`OUT/model`), to train in instead of the nominal model."""
     updates: int | None = None
-    """PPO updates; the preset's scratch_updates where not given."""
+    """Number of PPO updates; the preset's scratch_updates if not given."""
     seed: int = 0
-    """Seed of everything random."""
+    """Random seed of networks, robots, commands and exploration."""
 
 
 def main(args: Args) -> None:
-    """Trains, saves the policy, and draws the training curve."""
+    """Trains, saves the policy, draws the training curve, and prints the speed.
+
+    Raises:
+      ValueError: an option is wrong, or the corrected model cannot be read.
+    """
     checkpoint.set_up_compiler(preset(args.preset).xla_flags)
     sizes, entries = preset(args.preset), chosen(args.parameters)
     updates = sizes.scratch_updates if args.updates is None else args.updates
@@ -46,9 +52,10 @@ def main(args: Args) -> None:
     write_json(args.out / "curve.json", {"args": args, "curve": curve})
     plots.training(args.out / "curve.png", curve)
     first, last = curve[0], curve[-1]
+    # The first chunk includes compilation, so the speed is that of the others.
     if len(curve) > 1:
         speed = (last["steps"] - first["steps"]) / (last["seconds"] - first["seconds"])
-        console.print(f"{speed:,.0f} environment steps a second after compilation")
+        console.print(f"{speed:,.0f} environment steps per second after compilation")
     console.print(f"{last['steps']:,} steps in {last['seconds']:.0f} s, saved to {args.out}")
 
 

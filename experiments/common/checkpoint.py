@@ -1,6 +1,7 @@
 """Saving and loading: checkpoints, JSON, and the folder of a run with its config and versions.
 
-Every file is written whole or not at all, since a run may be killed at any moment and must go on from what it left.
+Every file is written whole or not at all: a run may be killed at any moment, and must be able to continue from its
+files.
 """
 
 import dataclasses
@@ -23,7 +24,7 @@ _DRAFT = ".tmp"  # suffix of a file that is being written, or that a killed run 
 
 
 def set_up_compiler(xla_flags: str) -> None:
-    """Sets the compiler's flags, and keeps compiled programs on disk so that a second run starts sooner.
+    """Sets the flags of XLA, JAX's compiler, and keeps compiled programs on disk so that a second run starts sooner.
 
     Call it before JAX makes its first array, because JAX reads the flags then and never again. Programs are kept in the
     user's cache folder, or where `JAX_COMPILATION_CACHE_DIR` says.
@@ -41,7 +42,10 @@ def set_up_compiler(xla_flags: str) -> None:
 
 
 def a_device_a_core(most: int = 8) -> str:
-    """Returns the XLA flag that makes every core of this process a JAX device, for programs that shard their work.
+    """Returns the XLA flag that makes every core of this process a JAX device.
+
+    XLA uses a single CPU device otherwise, and a vmapped simulation would run on one core. Programs that shard their
+    work over devices, as discovery does, use all of them. Pass the flag to `set_up_compiler`.
 
     Args:
       most: largest number of devices.
@@ -51,9 +55,9 @@ def a_device_a_core(most: int = 8) -> str:
 
 
 def versions() -> dict[str, str]:
-    """Lists what a result depends on beside its config: versions of packages, the device, and the git revision.
+    """Lists what a result depends on besides its config: versions of packages, the device, and the git revision.
 
-    Every summary and config holds it, so that a number can be traced to the code that produced it.
+    Every summary and config holds this list, so that a number can be traced to the code that produced it.
     """
     found = {"python": platform.python_version(), "device": jax.devices()[0].device_kind}
     for package in _PACKAGES:
@@ -96,7 +100,7 @@ def as_json(value: Any) -> Any:
 
 
 def from_json(kind: Any, value: Any) -> Any:
-    """Reads what `as_json` made of a dataclass: the inverse, by the types of its fields.
+    """Rebuilds a dataclass from its JSON form; the inverse of `as_json`, guided by the types of the fields.
 
     Args:
       kind: a dataclass, or a type that one of its fields may have (`tuple[T, ...]`, `dict[str, T]`, numbers, texts).
@@ -120,20 +124,24 @@ def _key(field: dataclasses.Field) -> str:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Writes JSON whole or not at all, by renaming a finished draft into place."""
+    """Writes a value as JSON, whole or not at all: a finished draft is renamed into place.
+
+    A program that is killed in between leaves the old file, and a program that reads meanwhile never sees half of one.
+    """
     draft = path.with_suffix(f".{os.getpid()}{_DRAFT}")
     draft.write_text(json.dumps(as_json(value), indent=1) + "\n")
     draft.replace(path)
 
 
 def open_run(out: Path, config: Any) -> None:
-    """Makes the folder of a run and writes its config, or checks that an earlier run there had the same one.
+    """Makes the folder of a run and writes its config, or checks that an earlier run there had the same config.
 
     A command calls it before it computes anything: results of two configs must never mix in one folder.
 
     Args:
       out: the folder.
-      config: everything that the results depend on.
+      config: everything that the results depend on. Leave out options that a later call may change, such as the
+        number of seeds.
 
     Raises:
       ValueError: the folder holds a run of another config (names the first field that differs), or other files.
@@ -150,12 +158,13 @@ def open_run(out: Path, config: Any) -> None:
 
 
 def save(path: Path, state: Any, config: Any) -> None:
-    """Writes a pytree of arrays as an orbax checkpoint, with the config that `load` will ask for.
+    """Writes a pytree of arrays as an orbax checkpoint, together with the config that `load` will compare.
 
     Args:
       path: folder of the checkpoint.
       state: the pytree.
-      config: what a program that loads the state must agree in.
+      config: settings without which the state means nothing, such as the network's sizes. `load` refuses the state if
+        the program that loads it has other ones.
     """
     with ocp.StandardCheckpointer() as checkpointer:
         checkpointer.save(path.absolute() / "state", state, force=True)
@@ -167,8 +176,11 @@ def load(path: Path, like: Any, config: Any) -> Any:
 
     Args:
       path: folder of the checkpoint.
-      like: a pytree of the same structure, shapes and types.
-      config: what the state must have been saved with.
+      like: a pytree of the same structure, shapes and types, for example a state that was just initialised.
+      config: the settings that the state must have been saved with.
+
+    Returns:
+      The pytree, with arrays on JAX's default device.
 
     Raises:
       ValueError: there is no checkpoint, or one of another config; names the first field that differs.

@@ -1,5 +1,4 @@
-"""What every command shares: reading its arguments, printing, showing progress, and ending with one line on an
-error."""
+"""What every command shares: it reads arguments, prints, shows progress, and turns a user's error into one line."""
 
 import threading
 import time
@@ -21,8 +20,9 @@ _LINE_S = 60.0  # between two lines of progress where there is no terminal to dr
 def run(main: Callable[[Any], None], args_type: type) -> None:
     """Runs a command: parses the command line into its `Args` and calls its `main` with them.
 
-    Bad input is the user's to mend, so a `ValueError` ends the process with exit code 2 and one line on stderr, which
-    names the field, what was found and what was expected. Any other exception is a defect and keeps its traceback.
+    A `ValueError` means bad input, which the user can correct. It ends the process with exit code 2 and one line on
+    stderr that names the field, what was found and what was expected. Any other exception is a defect of the program
+    and keeps its traceback.
 
     Raises:
       SystemExit: with code 2, where `main` raised a `ValueError` or the command line cannot be parsed.
@@ -47,7 +47,7 @@ def bars() -> Progress:
 
 
 class _Lines(Progress):
-    """Progress as a line a minute for every task that is not finished."""
+    """Prints one line a minute for every task that is not finished, in the place of bars."""
 
     def start(self) -> None:
         super().start()

@@ -1,6 +1,7 @@
-"""Sizes of the experiments: every number that decides how long a run takes and how good it can get, by preset.
+"""Presets: sizes of the experiments, and readers of the options that several commands share.
 
-`smoke` runs every command in seconds to minutes and shows that it works, not that it tunes; `cpu` is for two cores,
+A preset holds every number that decides how long a run takes and how good its result can be. `smoke` runs any command
+in seconds to minutes; it shows that the command works, but is too small to tune anything. `cpu` is for two cores,
 `gpu` for one data-centre GPU.
 """
 
@@ -16,7 +17,7 @@ from jaxtune.spm import SPMConfig
 from jaxtune.tuner import TunerConfig
 
 WALK = Path(__file__).parents[1] / "policies" / "walk"
-"""The policy that ships with the package."""
+"""Folder of the policy that ships with the package, the default of `--policy`."""
 
 QUICK_COMPILATION = "--xla_backend_optimization_level=0 --xla_backend_extra_options=xla_cpu_disable_new_fusion_emitters"
 """XLA flags of the preset `smoke` and of the tests: programs that run for seconds are not worth minutes of
@@ -27,30 +28,35 @@ compiling."""
 class Preset:
     """Sizes of one kind of run: task, PPO, tuner, and how much is simulated and evaluated.
 
-    A run writes its preset into `config.json`, and goes on only in a folder whose preset is the same.
+    A run writes its preset into `config.json`. It continues only in a folder whose preset is the same.
     """
 
     task: TaskConfig = field(default_factory=lambda: TaskConfig(physics="fast", base="raibert"))
+    """BITeno's task. `fast` physics has sub-steps of 2 ms (`exact`: 1 ms). With `raibert`, actions are offsets from a
+    reference walk; with `stand`, from the standing pose."""
     ppo: PPOConfig = field(default_factory=PPOConfig)
+    """Sizes of PPO: environments, rollout length, network."""
     tuner: TunerConfig = field(default_factory=TunerConfig)
+    """Sizes of a tuning: simulated episodes, measured episodes, both models."""
     push_mps: float = 0.5
-    """Speed of the pushes that the policy trains with. Tuning and evaluation have none."""
+    """Speed of the pushes that the policy trains with, in m/s. Tuning and evaluation have none."""
     policy_radius: float = 0.1
-    """Largest radius, in coordinates, that the policy trains in, however wide the tuner's distribution is."""
+    """Largest radius, in coordinates, of the distribution that the policy trains in. The tuner's may be wider, but a
+    policy trained on all of that would be robust to robots that do not exist, at the price of its return."""
     episode_steps: int = 250
-    """Steps of a simulated or measured episode."""
+    """Policy steps (10 ms each) of a simulated or measured episode that the tuner compares."""
     epochs: int = 30
-    """PPO updates in a tuning; each one is a rollout and the gradient steps on it."""
+    """PPO updates in a tuning. Each is one rollout and the gradient steps on it."""
     tunings: int = 5
-    """Tunings in a run."""
+    """Tunings in a run: verify and update the distribution, then train the policy in it."""
     evaluation_episodes: int = 32
-    """Episodes of the full time limit that a return is averaged over."""
+    """Episodes, each as long as the task's time limit, that a return is averaged over."""
     scratch_updates: int = 3000
     """PPO updates of a policy trained from scratch."""
     foreseen_episodes: int = 100
     """Episodes simulated to predict falls before a robot walks."""
     chunk: int = 10
-    """PPO updates between two lines of progress."""
+    """PPO updates between two lines of progress and of the training curve."""
     sweep: TunerConfig = field(
         default_factory=lambda: TunerConfig(
             episodes=120,
@@ -61,13 +67,13 @@ class Preset:
             dvm=DVMConfig(channels=32, train_steps=300, batch=64, references=512),
         )
     )
-    """Sizes of a tuning in a sweep, where many run side by side in one program."""
+    """Sizes of a tuning in a sweep. They are smaller, because many tunings run side by side in one program."""
     sweep_steps: int = 100
-    """Steps of an episode in a sweep."""
+    """Policy steps of an episode in a sweep."""
     sweep_tunings: int = 3
-    """Tunings in a sweep."""
+    """Tunings of every combination in a sweep."""
     xla_flags: str = ""
-    """Flags of the compiler."""
+    """Flags that are added to `XLA_FLAGS`; only `smoke` has some, to compile faster."""
 
 
 _TINY = TunerConfig(
@@ -114,6 +120,7 @@ _GPU = Preset(
 )
 
 PRESETS = {"smoke": _SMOKE, "cpu": Preset(), "gpu": _GPU}
+"""Presets by the name that `--preset` takes; the defaults of `Preset` are those of `cpu`."""
 
 
 def preset(name: str) -> Preset:
@@ -133,15 +140,18 @@ def chosen(parameters: str) -> dict[str, Entry]:
     Args:
       parameters: the name of a set (`legs6`, `whole_body`), or names of parameters joined by commas.
 
+    Returns:
+      The rows (`jaxtune.mjx.Entry`) by name, in the order given.
+
     Raises:
-      ValueError: a name is neither; lists those that exist.
+      ValueError: a name is neither; the message lists those that exist.
     """
     names = constants.PARAMETER_SETS.get(parameters) or tuple(name.strip() for name in parameters.split(","))
     return select(constants.ENTRIES, names)
 
 
 def named_values(option: str, items: Sequence[str], entries: Mapping[str, Entry]) -> dict[str, float]:
-    """Parses physical values that an option gives as `name=value`.
+    """Parses physical values that an option gives as `name=value`, such as `--start trunk_mass=0.5`.
 
     Args:
       option: its name, for messages.

@@ -1,4 +1,4 @@
-"""Pictures of the walking robot, rendered off screen by MuJoCo: a strip for a page, a film for the eye."""
+"""Renders the walking robot off screen with MuJoCo: a strip of pictures for a page, or an animated GIF."""
 
 import os
 from pathlib import Path
@@ -11,21 +11,23 @@ from envs.biteno import constants
 
 _SIZE = 360, 270  # width and height of a picture
 _PICTURES = 10
-_EVERY_STRIP, _EVERY_GIF = 6, 4  # policy steps between two pictures
+_EVERY_STRIP, _EVERY_GIF = 6, 4  # policy steps of 10 ms between two pictures
 
 
 class NoPicture(RuntimeError):
-    """MuJoCo cannot render here: no OpenGL off screen. A command that meets it prints why and goes on without
-    pictures."""
+    """Says that MuJoCo cannot render here, because there is no OpenGL off screen.
+
+    Pictures are an extra, so a command that meets it prints the reason and continues without them.
+    """
 
 
 def strip(path: Path, model: mujoco.MjModel, qpos: np.ndarray) -> None:
-    """Writes pictures of the second half of an episode side by side, 60 ms apart, so that a stride can be seen.
+    """Writes ten pictures of an episode's second half, 60 ms apart in two rows, so that a stride can be seen.
 
     Args:
-      path: a PNG.
+      path: of the PNG.
       model: the robot.
-      qpos: [time, 13] of one episode.
+      qpos: [time, 13] generalised positions of one episode, a row for each policy step.
 
     Raises:
       NoPicture: no OpenGL for rendering off screen.
@@ -37,12 +39,12 @@ def strip(path: Path, model: mujoco.MjModel, qpos: np.ndarray) -> None:
 
 
 def gif(path: Path, model: mujoco.MjModel, qpos: np.ndarray) -> None:
-    """Writes the whole episode as a GIF in real time.
+    """Writes the whole episode as an animated GIF that plays in real time, for a person who wants to see the gait.
 
     Args:
-      path: a GIF.
+      path: of the GIF.
       model: the robot.
-      qpos: [time, 13] of one episode.
+      qpos: [time, 13] generalised positions of one episode, a row for each policy step.
 
     Raises:
       NoPicture: no OpenGL for rendering off screen.

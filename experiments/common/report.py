@@ -1,4 +1,4 @@
-"""Pages from templates, and what a tuning did in the form that JSON and pages want."""
+"""Renders report pages from templates, and describes a tuning in the form that JSON files and pages need."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,14 +14,18 @@ from jaxtune.types import ParamDist, Verdict
 
 
 def render(template: Path, **values) -> str:
-    """Renders a page from a template, whose folder and this one it may include from.
+    """Renders an HTML page from a Jinja template.
 
-    All values are escaped, because names and texts come from logs of unknown origin. A value that the template names
-    and the call does not give is an error, never an empty place on the page.
+    The template may include files from its own folder and from this one. All values are escaped, because names and
+    texts come from logs of unknown origin. If the template names a value that the call does not give, that is an error
+    and not an empty place on the page.
 
     Args:
       template: path of the template.
       **values: what the template names.
+
+    Returns:
+      The page's HTML.
     """
     folders = jinja2.FileSystemLoader([template.parent, Path(__file__).parent])
     pages = jinja2.Environment(loader=folders, autoescape=True, undefined=jinja2.StrictUndefined)
@@ -29,14 +33,15 @@ def render(template: Path, **values) -> str:
 
 
 def tuning(info: Info) -> dict:
-    """Lists what happened in a tuning, for JSON.
+    """Lists what happened in a tuning, for `metrics.jsonl` and `tuning.json`.
 
     Args:
       info: of `Tuner.tune` or `Tuner.step`.
 
     Returns:
       `verdicts`, `radius` and the gate's numbers as lists over its calls; the update's `step` and `interval` by
-      parameter in radii, and whether it was `identifiable`; falls, broken episodes and training metrics.
+      parameter, in radii, and whether the parameter was `identifiable`; the number of falls and of episodes with
+      values that are not finite; and means of the training metrics.
     """
     calls = int(info.calls)
     order = dists.names(info.dist)
@@ -63,12 +68,13 @@ def moved(entries: Mapping[str, Entry], before: ParamDist, after: ParamDist, inf
     Args:
       entries: the parameter table.
       before: distribution that the tuning began with.
-      after: distribution that it left.
-      info: what happened in between; its intervals are those that held-out simulated sets have calibrated.
+      after: distribution that it ended with.
+      info: what happened in between. Its intervals were calibrated on held-out simulated sets.
 
     Returns:
-      `before`, `after`, `low` and `high` by parameter. The ends of the interval are nan where no set was accepted, and
-      where the interval reaches past the simulated box, because held-out sets say nothing about what lies there.
+      `before`, `after`, and the ends `low` and `high` of the interval, by parameter. The ends are nan if no set was
+      accepted. They are also nan if the interval reaches past the simulated range, because the held-out sets that
+      calibrate it say nothing about values outside.
     """
     update = info.update
     low, high = dists.normalised_box(info.dist)

@@ -1,4 +1,4 @@
-"""The gaps between simulator and target that the paper studies (Figs. 3.1 to 3.4), by name."""
+"""The cases of `sim2sim`: how the target differs from the simulator, after the paper's Figs. 3.1 to 3.4."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -11,24 +11,25 @@ from jaxtune.mjx import Entry, parameters
 class Case:
     """How the target differs from the simulator that is tuned to it.
 
-    The simulator starts at nominal. The target has `1 / start` times the nominal value of every parameter that the case
-    is about, so the simulator starts at `start` times the target, as the paper counts.
+    The simulator starts at its nominal parameters. The target has `1 / start` times the nominal value of every
+    parameter that the case scales. So the simulator starts at `start` times the target, as the paper counts: "0.5X"
+    means that the target's masses are twice the nominal ones.
     """
 
     scaled: Callable[[str], bool] = lambda name: False
-    """Whether the case is about a parameter of this name, so that the target has it divided by `start`."""
+    """Tells by the name of a parameter whether the target has its nominal value divided by `start`."""
     hidden: Mapping[str, float] = field(default_factory=dict)
-    """Physical values that the target has beside those, whether or not they are tuned."""
+    """Further physical values of the target, by name. They do not depend on `start`, and need not be tuned."""
     target: str = "mjx"
     """Engine of the target."""
 
     def true_params(self, entries: Mapping[str, Entry], start: float) -> dict[str, float]:
-        """Returns the target's physical values by name, those of `hidden` included."""
+        """Returns the target's physical values by name: all parameters of `entries`, and those of `hidden`."""
         nominal = parameters.nominal(entries)
         return {name: value / start if self.scaled(name) else value for name, value in nominal.items()} | self.hidden
 
     def off(self, entries: Mapping[str, Entry]) -> tuple[str, ...]:
-        """Returns the names of tuned parameters whose true value is not nominal."""
+        """Returns the names of tuned parameters whose true value is not nominal: those that tuning has to find."""
         return tuple(name for name in entries if self.scaled(name) or name in self.hidden)
 
 
@@ -39,20 +40,20 @@ CASES = {
     "weak_motor": Case(hidden={"torque_scale": 0.75}, target="bullet"),
     "weaker_motor": Case(hidden={"torque_scale": 0.6}, target="bullet"),
 }
-"""The paper's four gaps, Figs. 3.1 to 3.4, and a harder one."""
+"""The paper's four cases, Figs. 3.1 to 3.4, and a weaker motor, since this walk loses little with the paper's."""
 
 
 def check_case(
     name: str, start: float, entries: Mapping[str, Entry], parameter_option: str, target: str | None = None
 ) -> None:
-    """Checks that a case can be played with the parameters that are tuned.
+    """Checks that the target of a case differs from the simulator in something that can be tuned or measured.
 
     Args:
       name: of the case.
       start: where the simulator starts, as a multiple of the target.
       entries: the parameter table that is tuned.
-      parameter_option: what the user asked to tune, for the message.
-      target: engine of the target, where it is not the case's own.
+      parameter_option: value of `--parameters`, for the message.
+      target: engine of the target; None means the case's own.
 
     Raises:
       ValueError: names the option, the value and what is allowed.
@@ -61,9 +62,12 @@ def check_case(
         if value is not None and value not in allowed:
             raise ValueError(f"{option}: got '{value}', expected one of {', '.join(allowed)}")
     case = CASES[name]
+    # In another engine, or with hidden values, a target differs even if no tuned parameter does.
     about_parameters = case.target == "mjx" or ((target or case.target) == "mjx" and not case.hidden)
     if about_parameters and not case.off(entries):
-        raise ValueError(f"parameters: got '{parameter_option}', but case '{name}' needs one that it is about")
+        raise ValueError(
+            f"parameters: got '{parameter_option}', but case '{name}' needs one whose value differs in its target"
+        )
     check_positive(start=start)
     for parameter in filter(case.scaled, entries):
         low, high = entries[parameter].bounds

@@ -1,4 +1,4 @@
-"""Compares the tuning methods of the paper's section IV-B: what each one is, their summary and their tables."""
+"""Compares the tuning methods of the paper's section IV-B: sets them up, summarises their runs, prints tables."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -17,21 +17,25 @@ from jaxtune.tuner import Tuner
 from jaxtune.types import ParamDist
 
 METHODS = ("ours", "spm", "dr", "oracle")
-"""`ours`; `spm`, the paper's rule without the gate; `dr`, wide domain randomisation; `oracle`, trained at the truth."""
+"""`ours` (gate and posterior update), `spm` (the paper's update without the gate), `dr` (wide domain randomisation,
+never tuned) and `oracle` (trained with the target's own parameters)."""
 
 UPDATES = {"posterior": tuner.posterior_update, "vote": tuner.vote_update}
-"""How `ours` moves the distribution, by the name that the command line gives it."""
+"""How `ours` moves the distribution, by the name that `--update` takes."""
 
 
 @dataclass(frozen=True)
 class Contender:
-    """A method, ready to be tuned: the same tuner with other functions, or another policy or distribution."""
+    """One method of a comparison, ready to run.
+
+    All methods are the same tuner. They differ in its functions, the policy that they start with, or the distribution.
+    """
 
     tuner: Tuner | Untuned
     policy: Policy
     dist: ParamDist
     sets: int
-    """Measured sets that it asks for in a tuning."""
+    """Measured sets that the method uses up in a tuning: one, or zero if it is never tuned."""
 
 
 def contenders(
@@ -41,7 +45,7 @@ def contenders(
 
     Args:
       learner: BITeno's side of the tuner.
-      target: what is tuned to; only `oracle` is given its parameters.
+      target: what is tuned to. Only `oracle` uses its parameters; the others see episodes.
       policy: what every method starts with.
       radius: first radius of `ours` and `spm`, in coordinates.
       dr_radius: radius of domain randomisation, in coordinates.
@@ -55,7 +59,9 @@ def contenders(
     untuned = Untuned(tuner=machine)
     start = learner.dist(nominal, radius)
     truth = {name: target.params[name] for name in nominal}
+    # Domain randomisation trains on all of its distribution, while the other policies train on a narrow part of theirs.
     wide = policy.replace(radius=jnp.full_like(policy.radius, dr_radius))
+    # Values that nobody tunes (a weak motor) are part of the truth too.
     knowing = policy.replace(
         hidden={name: jnp.full_like(value, target.params[name]) for name, value in policy.hidden.items()}
     )
@@ -70,8 +76,8 @@ def contenders(
 def summarise(settings: Mapping[str, object], results: dict[str, list[dict]], off: Sequence[str]) -> dict:
     """Summarises a run for `summary.json`.
 
-    `falls_in_target` counts falls in the closing evaluation, `measured_falls` those in the episodes that tuning paid
-    with.
+    `falls_in_target` counts falls in the evaluation after the last tuning. `measured_falls` counts those in the
+    measured episodes: with a real robot they would be the price of tuning.
 
     Args:
       settings: `case`, `start`, `preset` and `seeds` of the run.
@@ -106,7 +112,13 @@ def summarise(settings: Mapping[str, object], results: dict[str, list[dict]], of
 
 
 def show(console: Console, summary: dict, results: dict[str, list[dict]]) -> None:
-    """Prints two tables: the methods side by side, and the error of every parameter at the end."""
+    """Prints two tables: the methods side by side, and the error of every parameter after the last tuning.
+
+    Args:
+      console: where they are printed.
+      summary: of `summarise`.
+      results: what `summary` was made of.
+    """
     console.print(_methods_table(summary))
     console.print(_parameters_table(summary, results))
 
@@ -114,7 +126,7 @@ def show(console: Console, summary: dict, results: dict[str, list[dict]]) -> Non
 def _methods_table(summary: dict) -> Table:
     start = f", start {summary['start']:g}X" if summary["off"] else ""
     table = Table(title=f"case {summary['case']}{start}, mean over {summary['seeds']} seed(s)")
-    columns = "method", "return in target", "falls", "parameter error", "gate calls", "target episodes", "s"
+    columns = "method", "return in target", "falls", "parameter error", "gate calls", "target episodes", "seconds"
     for column in columns:
         table.add_column(column, justify="left" if column == "method" else "right")
     for name, method in summary["methods"].items():
@@ -134,7 +146,7 @@ def _methods_table(summary: dict) -> Table:
 
 
 def _parameters_table(summary: dict, results: dict[str, list[dict]]) -> Table:
-    table = Table(title="|estimate / truth - 1| at the end (not identifiable in the last tuning: ~)")
+    table = Table(title="|estimate / truth - 1| after the last tuning (~: not identifiable in it)")
     table.add_column("parameter")
     for name in summary["methods"]:
         table.add_column(name, justify="right")
@@ -147,5 +159,6 @@ def _parameters_table(summary: dict, results: dict[str, list[dict]]) -> Table:
             mean = np.array(method["param_error_end"])[:, column].mean()
             cells.append(f"{'~ ' if unknown else ''}{mean:.3f}")
         table.add_row(f"{parameter}{' *' if parameter in summary['off'] else ''}", *cells)
-    table.caption = "* off at the start" if summary["off"] else "the truth is nominal; the gap is in none of these"
+    same = "target and simulator agree in all of these: they differ in something that is not tuned"
+    table.caption = "* differs from the target at the start" if summary["off"] else same
     return table

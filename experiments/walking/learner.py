@@ -1,8 +1,8 @@
-"""Everything that the tuner needs of BITeno: how its policy learns, how episodes are simulated and scored.
+"""Connects BITeno to the tuner: how its policy learns, and how episodes are simulated, measured and scored.
 
-`Learner` binds one robot, one preset and one parameter table together and offers the pure functions that
-`jaxtune.tuner.Tuner` wants (`train`, `simulate`, a target's `measure`), and those that the commands need beside them
-(`evaluate`, `predict`, `play`). It holds no state: what changes is in `Policy`, a pytree.
+`Learner` binds one robot, one preset and one parameter table together. It offers the pure functions that
+`jaxtune.tuner.Tuner` needs (`train`, `simulate`, a target's `measure`), and further ones for the commands (`evaluate`,
+`predict`, `play`). It holds no state: what changes is in `Policy`, a pytree.
 """
 
 from collections.abc import Callable, Mapping
@@ -36,24 +36,24 @@ class Policy:
     """
 
     learner: PPOState  # networks, optimiser and observation statistics
-    robots: State  # [envs] robots of the training environments, between two rollouts
+    robots: State  # [envs] states of the training environments, kept between two rollouts
     radius: jax.Array  # largest radius, in coordinates, of the distribution that the training robots are drawn from
-    hidden: dict  # physical values by name of parameters that the robots have and nobody tunes
-    # What simulated episodes repeat, in turn, where measured ones are compared. Checkpoints of runs hold this name.
+    hidden: dict  # physical values by name of parameters that the training robots have and nobody tunes
+    # Commands of measured episodes, which simulated ones repeat; drawn by the task where None. Checkpoints hold this name.
     asked: Commands | None = None
 
 
 class Learner:
     """Trains, simulates and evaluates policies of one robot, as pure functions.
 
-    Use it where a command needs BITeno: hand `learner.tuner(target)` to the tuning loop, or jit single methods.
-    Programs that are compiled for one learner can be shared by all runs of the same preset and table.
+    Use it wherever a command needs BITeno: run the tuner that `learner.tuner(target)` makes, or jit single methods.
+    All runs of the same preset and table can share one learner, and with it the programs that were compiled for it.
 
     Args:
       preset: sizes of everything.
       entries: the parameter table that is tuned.
-      hidden: parameters that are not tuned but may differ from nominal where a policy trains (the oracle's).
-      correction: a corrected model that discovery wrote; the nominal model where None.
+      hidden: parameters that are not tuned, but may differ from nominal in training. `oracle` uses them.
+      correction: a corrected model that discovery wrote; None means the nominal model.
     """
 
     def __init__(
@@ -95,7 +95,7 @@ class Learner:
 
         Args:
           key: random key (`jax.random.PRNGKey`, as Brax's wrappers need it).
-          ppo: a learnt state to go on from; new networks where None.
+          ppo: a learnt state to continue from; None means new networks.
         """
         key_learner, key_robots = jax.random.split(key)
         ppo = self._ppo.init(key_learner) if ppo is None else ppo
@@ -111,8 +111,8 @@ class Learner:
     def train(self, key: jax.Array, policy: Policy, dist: ParamDist, updates: int) -> tuple[Policy, dict]:
         """Runs PPO updates on robots drawn from the distribution.
 
-        The radius is cut to the policy's own: a policy that trained on all of a distribution that the gate has widened
-        would become robust to physics that the robot does not have, at the price of its return.
+        The distribution's radius is limited to `policy.radius`. If the gate has widened the distribution, a policy that
+        trained on all of it would become robust to physics that the robot does not have, at the price of its return.
 
         Args:
           key: random key.
@@ -138,11 +138,11 @@ class Learner:
         return policy.replace(learner=ppo, robots=robots), metrics
 
     def simulate(self, key: jax.Array, policy: Policy, coords: Coords) -> Trajectory:
-        """Simulates one episode for every draw: the tuner's `simulate`.
+        """Simulates one episode for every row of coordinates; this is the tuner's `simulate`.
 
-        Where the policy carries commands (`asked`), the episodes repeat them in turn, from the same phase of the gait
-        clock, and only the last `episode_steps` steps are returned: a log shows a robot from a few steps after it began
-        to walk.
+        If the policy carries commands (`asked`), episode i repeats the i-th of them (in turn), from the same phase of
+        the gait clock. Only the last `episode_steps` steps are then returned. The log begins a few steps after the
+        robot began to walk, so the simulated robot has to walk these steps too before the two can be compared.
 
         Args:
           key: random key.
@@ -159,7 +159,10 @@ class Learner:
         return jax.tree.map(lambda leaf: leaf[:, -steps:] if leaf.ndim > 1 else leaf, whole)
 
     def play(self, target: Target) -> Callable[..., Trajectory]:
-        """Makes the function that plays whole episodes in a target, compiled where the target is in JAX.
+        """Makes the function that plays episodes in a target; it is compiled if the target is written in JAX.
+
+        Args:
+          target: the simulator that the policy walks in.
 
         Returns:
           `(key, policy, count, steps) -> Trajectory [count, steps]`.
@@ -171,7 +174,7 @@ class Learner:
         return jax.jit(play, static_argnums=(2, 3)) if isinstance(target, MjxTarget) else play
 
     def evaluate(self, key: jax.Array, policy: Policy, play: Callable[..., Trajectory]) -> tuple[float, int]:
-        """Measures what a policy is worth in a target, over the preset's number of full episodes.
+        """Measures a policy's return and falls in a target, over `evaluation_episodes` episodes of the full time limit.
 
         Args:
           key: random key; the same key gives the same commands and resets.
@@ -186,7 +189,9 @@ class Learner:
         return float(trajectory.score.sum(axis=-1).mean()), int(trajectory.fell.sum())
 
     def predict(self, key: jax.Array, policy: Policy, dist: ParamDist, count: int, steps: int) -> dict[str, jax.Array]:
-        """Predicts how a policy will walk on robots drawn from the distribution.
+        """Predicts by simulation how a policy will walk on robots drawn from the distribution.
+
+        Use it before a real robot walks: `fall_rate` decides whether it may.
 
         Args:
           key: random key.
@@ -211,11 +216,11 @@ class Learner:
         return summarise_walks(trajectory, power)
 
     def tuner(self, target: Target | None = None) -> Tuner:
-        """Makes Algorithm 1 over this learner's functions.
+        """Makes the tuner (the paper's Algorithm 1) over this learner's functions.
 
         Args:
-          target: what is measured. The tuner is pure where it is in JAX; where None, measured sets come from outside
-            (a log) and are handed to `Tuner.tune`.
+          target: the simulator that episodes are measured in. The tuner is pure if the target is written in JAX. None
+            means that measured sets come from outside, such as a log, and are passed to `Tuner.tune`.
         """
         count, steps = self.preset.tuner.set_episodes, self.preset.episode_steps
         return Tuner(
@@ -226,7 +231,10 @@ class Learner:
         )
 
     def step(self, machine: Tuner | Untuned, play: Callable[..., Trajectory]) -> Callable:
-        """Makes a tuner's step out of parts that are compiled apart, so that several tuners share the large ones.
+        """Makes a tuner's step out of parts that are compiled separately.
+
+        Training is by far the largest program to compile, and it is the same for all methods. So they share one
+        compiled `train`, and only the small rest is compiled for each tuner. A target that is not JAX fits in between.
 
         Args:
           machine: a tuner, or a baseline that is never tuned.
@@ -249,7 +257,10 @@ class Learner:
         return step
 
     def act(self, policy: Policy) -> Act:
-        """Makes the policy's action function, `(observation [obs], key) -> (action [act], extras)`, without noise."""
+        """Makes the policy's action function, `(observation [obs], key) -> (action [act], extras)`.
+
+        It has no exploration noise. Targets and simulators take it to play episodes.
+        """
         # A pytree, so that a program which takes it as an argument is not compiled again for the next policy.
         return jax.tree_util.Partial(self._act, policy.learner)
 
@@ -258,7 +269,9 @@ class Learner:
 
 
 def summarise_walks(trajectory: Trajectory, power: jax.Array) -> dict[str, jax.Array]:
-    """Averages what matters of walks, simulated or recorded, so that predictions and measurements compare.
+    """Computes mean return, fall rate and mean power of walks.
+
+    Simulated and recorded walks are summarised by the same code, so that predictions and measurements compare.
 
     Args:
       trajectory: walks, [episodes, time].

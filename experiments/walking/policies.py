@@ -20,10 +20,10 @@ from jaxtune.mjx import parameters
 
 
 def policy_config(learner: Learner) -> dict:
-    """Lists what a saved policy and the run that loads it must agree in.
+    """Lists the settings that a saved policy shares with the run that loads it.
 
-    A policy means nothing to a run with another reference pose, action scale or network, so `starting_policy` refuses
-    a folder whose config differs.
+    With another reference pose, action scale or network, the same weights would be another policy. So `starting_policy`
+    refuses a folder whose config differs.
     """
     task, ppo = learner.preset.task, learner.preset.ppo
     return {"base": task.base, "action_scale": task.action_scale, "hidden": list(ppo.hidden)}
@@ -38,7 +38,7 @@ def walk(
       key: random key of everything.
       learner: robot and sizes; `preset.policy_radius` is how far its robots are from nominal.
       updates: PPO updates, rounded up to whole chunks of `preset.chunk`.
-      progress: where steps and reward are shown, if given.
+      progress: display of steps and reward; None shows nothing.
 
     Returns:
       The policy, and a line of metrics (means over the chunk) for every chunk of updates.
@@ -56,7 +56,7 @@ def walk(
         steps = (index + 1) * chunk * learner.preset.ppo.steps_per_update
         curve.append({"steps": steps, "seconds": time.monotonic() - start, **line})
         if progress:
-            progress.update(task, completed=steps, description=f"reward {100 * line['reward']:.2f} a second")
+            progress.update(task, completed=steps, description=f"reward {100 * line['reward']:.2f} per second")
     return policy, curve
 
 
@@ -67,7 +67,10 @@ def starting_policy(name: str, learner: Learner, out: Path | None = None) -> Pol
       name: `walk`, which ships with the package; a folder of `experiments.train`; or `scratch`, which is trained first
         and kept in `out`, where a second call finds it.
       learner: robot and sizes of the run.
-      out: folder of the run; needed for `scratch` alone.
+      out: folder of the run; only `scratch` needs it.
+
+    Returns:
+      The policy, on freshly reset training robots.
 
     Raises:
       ValueError: the folder holds no policy, or one of another config; names the field that differs.

@@ -1,4 +1,4 @@
-"""How well a policy walks, as numbers that can be compared between engines."""
+"""Measures how well a policy walks, in numbers that can be compared between engines."""
 
 import jax
 import numpy as np
@@ -11,7 +11,7 @@ from jaxtune.types import Trajectory
 def record_walks(
     target: Target, key: jax.Array, act: Act, count: int, steps: int, commands: Commands | None = None
 ) -> tuple[Trajectory, Recording]:
-    """Plays walks in a target and copies them to the host.
+    """Plays walks in a target and copies them from the device to NumPy arrays.
 
     Args:
       target: simulator that the policy walks in.
@@ -19,7 +19,7 @@ def record_walks(
       act: the policy.
       count: number of walks.
       steps: policy steps of a walk.
-      commands: what the walks are commanded; drawn by the task where None.
+      commands: velocity commands of the walks; None means that the task draws them.
 
     Returns:
       The walks and the motion behind them, [count, steps, ...], as NumPy arrays.
@@ -29,6 +29,10 @@ def record_walks(
 
 def quality(trajectory: Trajectory, recording: Recording) -> dict[str, float]:
     """Summarises walks: gait (touchdowns, clearance, slip, ...), tracking, falls, and mean return under Table I.
+
+    Args:
+      trajectory: walks, [episodes, time], from `record_walks`.
+      recording: the motion behind them.
 
     Returns:
       Means over the walks by name; units are in the names (see `envs.biteno.gait.quality`).

@@ -1,4 +1,4 @@
-"""The simulators that can play the target, by the name that commands give them."""
+"""The simulators that can be the target of a tuning or an evaluation, by the name that `--target` takes."""
 
 from collections.abc import Callable, Mapping
 
@@ -20,4 +20,5 @@ TARGETS: dict[str, Callable[[Biteno, Mapping[str, float]], Target]] = {
     "mujoco_c": mujoco_c.target,
     "bullet": _bullet,
 }
-"""`(robot, physical values by name) -> target` by engine: MJX, MuJoCo C, or PyBullet (extra `bullet`)."""
+"""Functions `(robot, physical values by name) -> target`, by engine: MJX, MuJoCo C, or PyBullet (extra `bullet`).
+All three share one observation function, PD law and reward."""

@@ -1,4 +1,7 @@
-"""Every picture that the commands draw, as functions from results to a file or a figure."""
+"""All plots of the commands, as functions from results to a PNG file or a matplotlib figure.
+
+Functions that take a `path` write the file. The others return a figure, which `embedded` puts into a page.
+"""
 
 from experiments.common.plots.base import embedded
 from experiments.common.plots.discovery import accepted_terms, confusion, heat_map, suspicions, traces

@@ -1,4 +1,4 @@
-"""What every picture shares: colours of the methods, bands over seeds, and where a figure goes."""
+"""What all plots share: colours of the methods, bands over seeds, and how a figure is written or embedded."""
 
 import base64
 import io
@@ -11,16 +11,17 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
 COLOURS = {"ours": "tab:blue", "spm": "tab:orange", "dr": "tab:green", "oracle": "tab:gray"}
+"""Colour of every method, the same in all plots."""
 
 
 def spread(axis, x: np.ndarray, values: np.ndarray, name: str) -> None:
     """Draws the mean over seeds as a line and their range as a band.
 
     Args:
-      axis: where to draw.
-      x: [points]
-      values: [seeds, points]
-      name: of the method, which gives colour and label.
+      axis: matplotlib axes to draw on.
+      x: [points] horizontal positions.
+      values: [seeds, points] what is averaged.
+      name: of the method; it chooses the colour and is the label.
     """
     axis.plot(x, values.mean(axis=0), "o-", ms=3, color=COLOURS[name], label=name)
     axis.fill_between(x, values.min(axis=0), values.max(axis=0), color=COLOURS[name], alpha=0.15)

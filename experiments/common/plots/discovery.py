@@ -1,4 +1,4 @@
-"""Pictures of logs, of the gap between simulation and measurement, and of how often discovery is right."""
+"""Plots of logs, of the gap between simulation and measurement, and of how often discovery is right."""
 
 import textwrap
 from collections.abc import Sequence
@@ -12,18 +12,20 @@ from experiments.common.plots.base import save
 
 
 def suspicions(path: Path, run: Run, joints: Sequence[str], titles: Sequence[str]) -> None:
-    """Draws a run as it was recorded: the clock's steps, and every joint's position and target.
+    """Draws a run as it was recorded: the time between rows, and every joint's position and target.
+
+    A person can check against it what the log doctor suspects.
 
     Args:
       path: of the PNG.
       run: the run.
       joints: names in the log's order.
-      titles: what the log doctor suspects, written above.
+      titles: sentences of the log doctor, written above the plot.
     """
     figure, axes = plt.subplots(1 + len(joints), 1, figsize=(10, 1.6 * (2 + len(joints))), layout="constrained")
     steps = 1e3 * np.diff(run.time)
     axes[0].plot(run.time[1:], steps, lw=0.8)
-    # A logarithmic axis, on which a clock's rounding is no spectacle.
+    # A logarithmic axis, because on a linear one the mere rounding of time stamps would look like a faulty clock.
     axes[0].set(ylabel="row to row, ms", yscale="log", ylim=(0.3 * steps.min(), 3.0 * steps.max()))
     for index, (axis, joint) in enumerate(zip(axes[1:], joints, strict=True)):
         if "target" in run.signals:
@@ -37,10 +39,13 @@ def suspicions(path: Path, run: Run, joints: Sequence[str], titles: Sequence[str
 
 
 def heat_map(cells: Sequence[dict]) -> plt.Figure:
-    """Draws the excess over the noise floor by joint and regime, a panel for every signal.
+    """Draws where simulation and measurement disagree: the excess over the noise floor by joint and motion regime.
 
     Args:
       cells: rows of `Result.where`: joint, signal, regime and excess in floor units.
+
+    Returns:
+      A figure with a heat map for every signal.
     """
     signals = list(dict.fromkeys(cell["signal"] for cell in cells))
     regimes = sorted({cell["regime"] for cell in cells})
@@ -72,12 +77,13 @@ def heat_map(cells: Sequence[dict]) -> plt.Figure:
 
 
 def traces(runs: Sequence[dict], joints: Sequence[str], most: int = 6) -> plt.Figure:
-    """Draws measured and simulated positions of whole runs, for the joint with the largest error in each.
+    """Draws measured and simulated positions of whole runs, in each run for the joint with the largest error.
 
     Args:
-      runs: rows of `free_runs`; sealed ones come first and have a red frame.
+      runs: rows of `experiments.discovery.summary.free_runs`. Sealed runs (the held-out test) come first and have a red
+        frame.
       joints: names in the log's order.
-      most: runs that are drawn at most.
+      most: largest number of runs that are drawn.
     """
     shown = sorted(runs, key=lambda run: run["split"] != "sealed")[:most]
     columns = 2 if len(shown) > 1 else 1
@@ -105,16 +111,16 @@ def traces(runs: Sequence[dict], joints: Sequence[str], most: int = 6) -> plt.Fi
 
 
 def accepted_terms(terms: Sequence) -> plt.Figure:
-    """Draws the gain of every accepted effect beside the threshold that simulated null logs set.
+    """Draws how much every accepted effect lowered the loss, beside the threshold that simulated null logs set.
 
     Args:
-      terms: accepted terms (`jaxtune.discovery`), in the order of their acceptance.
+      terms: `jaxtune.discovery.state.AcceptedTerm`, in the order of their acceptance.
     """
     figure, axis = plt.subplots(figsize=(8, 1.5 + 0.5 * len(terms)), layout="constrained")
     place = np.arange(len(terms))
     axis.barh(place, [term.evidence.gain for term in terms], color="tab:blue", height=0.5, label="gain")
     axis.plot([term.thresholds.gain for term in terms], place, "|", color="black", ms=22, mew=2, label="threshold")
-    axis.set(yticks=place, xscale="log", xlabel="fall of the loss on train")
+    axis.set(yticks=place, xscale="log", xlabel="reduction of the loss on train")
     axis.set_yticklabels([term.hypothesis.key for term in terms])
     axis.invert_yaxis()
     axis.legend(fontsize=8, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2)
@@ -122,7 +128,10 @@ def accepted_terms(terms: Sequence) -> plt.Figure:
 
 
 def confusion(path: Path, rows: Sequence[dict]) -> None:
-    """Draws what was hidden against what was named, as counts, a panel for every severity.
+    """Draws the confusion matrix of the blind benchmark: hidden effect by named effect, as counts.
+
+    There is a panel for every severity at which effects were hidden. Where nothing was named, the verdict stands in the
+    place of the name.
 
     Args:
       path: of the PNG.

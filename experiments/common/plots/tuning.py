@@ -1,4 +1,4 @@
-"""Pictures of training and tuning."""
+"""Plots of training, of tuning to another simulator, and of rounds with a robot."""
 
 import textwrap
 from collections.abc import Sequence
@@ -13,7 +13,10 @@ _MARKS = {"accept": "o", "widen": "^", "unexplained": "X", "radius_exhausted": "
 
 
 def training(path: Path, curve: Sequence[dict]) -> None:
-    """Draws a training run: reward and return under Table I, tracking, and episode ends, over the steps.
+    """Draws a training run over its environment steps.
+
+    One panel compares the trained reward with the reward of the paper's Table I, one shows how well commands and gait
+    clock are tracked, and one how often episodes end.
 
     Args:
       path: of the PNG.
@@ -25,10 +28,11 @@ def training(path: Path, curve: Sequence[dict]) -> None:
         "share": {
             "linear tracking": "linear_tracking",
             "angular tracking": "angular_tracking",
-            "feet against the clock (of 2)": "clock_contact",
+            "feet in step with the clock (of 2)": "clock_contact",
         },
         "episode ends per 20 s": {"ends": "done"},
     }
+    # Metrics are means over policy steps of 10 ms.
     scales = {"per second": 100.0, "share": 1.0, "episode ends per 20 s": 2000.0}
     figure, axes = plt.subplots(1, 3, figsize=(12, 3.2), layout="constrained")
     for axis, (label, series) in zip(axes, panels.items(), strict=True):
@@ -47,7 +51,7 @@ def sim2sim(out: Path, results: dict[str, list[dict]], off: Sequence[str], epoch
     Args:
       out: folder of `return.png`, `param_error.png`, `param_error_each.png` and `gate.png`.
       results: what `experiments.sim2sim.Runner` returned, by method and seed.
-      off: parameters whose true value is not nominal; the mean error is over them, or over all where there is none.
+      off: tuned parameters whose true value is not nominal. The mean error is over them, or over all if there is none.
       epochs: PPO updates in a tuning.
     """
     _returns(out / "return.png", results, epochs)
@@ -58,11 +62,11 @@ def sim2sim(out: Path, results: dict[str, list[dict]], off: Sequence[str], epoch
 
 
 def sweep(path: Path, grid: np.ndarray, rows: Sequence[str], columns: Sequence[str], titles: Sequence[str]) -> None:
-    """Draws a sweep as heat maps with one colour scale.
+    """Draws a sweep as heat maps that share one colour scale, so that all settings compare at a glance.
 
     Args:
       path: of the PNG.
-      grid: [panels, rows, columns]
+      grid: [panels, rows, columns] mean parameter error at the end.
       rows: labels of the rows.
       columns: labels of the columns.
       titles: name of the rows, name of the columns, then a title for every panel.
@@ -88,6 +92,8 @@ def sweep(path: Path, grid: np.ndarray, rows: Sequence[str], columns: Sequence[s
 
 def rounds(history: Sequence[dict]) -> plt.Figure:
     """Draws a robot's rounds: predicted and measured return, falls and power, and every parameter with its interval.
+
+    Predictions extend one round further than measurements, to the walks that come next.
 
     Args:
       history: rounds as `summary.json` has them.
@@ -124,7 +130,7 @@ def rounds(history: Sequence[dict]) -> plt.Figure:
 
 
 def transfer(path: Path, results: dict[str, list[dict]]) -> None:
-    """Draws return, falls and power of the robot's walks over the rounds, by method, after the paper's Fig. 6.
+    """Draws return, falls and power of the robot's walks over the rounds, by method, like the paper's Fig. 6.
 
     Args:
       path: of the PNG.

@@ -1,4 +1,4 @@
-"""Pictures of how a robot walks."""
+"""Plots of how a robot walks: the cost of wrong parameters, and foot contacts against the gait clock."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,13 +11,15 @@ from experiments.common.plots.base import save
 
 
 def gaps(path: Path, rows: Sequence[dict], shown: dict[str, str], nominal: dict[str, float]) -> None:
-    """Draws what gaps cost an untuned policy: a column of panels for every parameter, a row for every quantity.
+    """Draws how an untuned policy walks if one parameter of the target differs from the simulator's.
+
+    There is a column of panels for every varied parameter and a row for every quantity.
 
     Args:
       path: of the PNG.
       rows: one for every point: `sweep`, `value`, and the quantities.
       shown: labels of the quantities by name.
-      nominal: value at which nothing is off, by sweep; drawn as a dashed line.
+      nominal: the simulator's value, by sweep; drawn as a dashed line.
     """
     figure, axes = plt.subplots(
         len(shown), len(nominal), figsize=(9, 8), layout="constrained", sharex="col", sharey="row", squeeze=False
@@ -36,12 +38,12 @@ def gaps(path: Path, rows: Sequence[dict], shown: dict[str, str], nominal: dict[
 
 
 def gait(path: Path, force: np.ndarray, phase: np.ndarray) -> None:
-    """Draws the contacts of one episode over time, above what the gait clock asks for.
+    """Draws the foot contacts of one episode over time, each above the contact that the gait clock prescribes.
 
     Args:
-      path: a PNG.
-      force: [time, 2] N, normal, left and right foot.
-      phase: [time, 2] cycles.
+      path: of the PNG.
+      force: [time, 2] N, normal force of left and right foot.
+      phase: [time, 2] cycles, clock of left and right foot; the foot should be down below `constants.DUTY`.
     """
     time = np.arange(len(force)) * POLICY_DT_S
     figure, axis = plt.subplots(figsize=(9, 2.4), layout="constrained")
@@ -57,5 +59,5 @@ def gait(path: Path, force: np.ndarray, phase: np.ndarray) -> None:
 
 
 def _beside(axis):
-    """Coordinates that are shares of the axes horizontally and data vertically."""
+    """Returns the transform for labels beside the plot: horizontal shares of the axes, vertical data units."""
     return axis.get_yaxis_transform()
