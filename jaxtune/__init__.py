@@ -10,6 +10,7 @@ Which module to import for what:
 - `jaxtune.mjx`: the table of an MJX model's parameters, and the model that has other values of them; needs MuJoCo.
 - `jaxtune.discovery`: find the effect that a model lacks when the tuner's verdict is `unexplained`.
 - `jaxtune.rules`, `jaxtune.spm`, `jaxtune.dvm`, `jaxtune.windows`: what the tuner is made of, to replace or to read.
+- `jaxtune.mjx`: set the physical parameters of a MuJoCo or MJX model, with all derived fields.
 
-`jaxtune.tuner` and everything it stands on import no simulator; functions that you hand in know yours.
+`jaxtune.tuner` and the modules that it imports know no simulator; the functions that you hand in know yours.
 """

@@ -54,8 +54,8 @@ class Untuned:
     """Trains the policy in a distribution that never changes.
 
     Use it for domain randomisation or for the oracle; the distribution given to `init` decides which. One step trains
-    for as long as a tuning of the wrapped tuner does, so returns compare after equally many steps. It measures nothing,
-    so the tuner's `measure` may be None.
+    for as long as a tuning of the wrapped tuner does, so its return can be compared with the tuner's after the same
+    number of steps. It measures nothing, so the tuner's `measure` may be None.
     """
 
     tuner: Tuner

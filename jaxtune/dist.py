@@ -1,9 +1,9 @@
 """Makes, samples, moves and widens the parameter distribution (`ParamDist`).
 
 All functions are pure and, but for `make`, can be traced and vmapped over stacked distributions. Named values become
-vectors only at a network's door, sorted by name (`ravel`). Two units occur: *coordinates* (log space for multipliers)
-and *radii*, which are distances from the centre divided by the radius. Networks and steps use radii, so that sizes
-mean the same for every parameter and after every widening.
+vectors, sorted by name (`ravel`), only where a network reads or writes them. Two units occur: *coordinates* (log space
+for multipliers) and *radii*, which are distances from the centre divided by the radius. Networks and steps use radii,
+so that sizes mean the same for every parameter and after every widening.
 """
 
 from collections.abc import Sequence
@@ -113,7 +113,7 @@ def normalised_box(dist: ParamDist) -> tuple[Float[Array, " coords"], Float[Arra
 
 
 def at_bounds(dist: ParamDist) -> jax.Array:
-    """Tells whether every coordinate's support fills its bounds, as a boolean scalar.
+    """Checks whether every coordinate's support fills its bounds; returns a boolean scalar.
 
     Widening such a distribution changes nothing, so the gate's loop must end there.
     """

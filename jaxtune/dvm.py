@@ -31,8 +31,9 @@ from jaxtune import windows
 from jaxtune.types import Trajectory
 
 _STRIDE = 2
-_LAYERS = 4
-_MIN_LOG_STD = -3.0  # noiseless channels (the clock) would otherwise be fitted without end
+_LAYERS = 4  # they shorten a window of 50 steps to 25, 13, 7 and 4
+# A channel without noise (the gait clock) would otherwise raise the ELBO without limit as its learned noise shrinks.
+_MIN_LOG_STD = -3.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,8 +62,8 @@ class DVMConfig:
     neighbours: int = 10
     """Largest size of Q (the paper's N)."""
     reach: float = 0.95
-    """Sets the largest latent distance of a neighbour: this quantile of the distances from the simulated windows to
-    their own last neighbours."""
+    """Quantile that sets how far away a neighbour may lie in latent space. Every reference has a distance to its
+    `neighbours`-th nearest reference; the limit is this quantile of these distances."""
 
 
 def _halve(x: Float[Array, "batch time channels"]) -> Float[Array, "batch half patch"]:
@@ -110,6 +111,7 @@ class _VAE(nn.Module):
         x = nn.elu(self.from_latent(z)).reshape(z.shape[0], self.lengths[-1], -1)
         for layer, length in zip(self.up, reversed(self.lengths[:-1]), strict=True):
             x = _double(layer(x), length)
+            # The last layer gives the means of the channels, which may have any size and sign.
             x = x if layer is self.up[-1] else nn.elu(x)
         return x
 
@@ -152,6 +154,7 @@ def train(key: jax.Array, config: DVMConfig, trajectory: Trajectory) -> tuple[DV
     variables = network.init(key_init, jnp.zeros((1, config.window, scaler.mean.size)), jnp.zeros((1, config.latent)))
     schedule = optax.cosine_onecycle_schedule(config.train_steps, config.learning_rate)
     optimizer = optax.chain(optax.clip_by_global_norm(100.0), optax.adam(schedule))
+    # The loss is a mean over steps and channels; what is reported is per window again.
     scale = 1.0 / (config.window * scaler.mean.size)
 
     def loss(variables, key):

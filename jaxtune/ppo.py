@@ -34,7 +34,7 @@ from brax.training.acting import generate_unroll
 from brax.training.agents.ppo import losses, networks
 from flax import linen
 
-_LEARNING_RATE_RANGE = (1e-5, 1e-2)  # the divergence may drive the step size to these ends
+_LEARNING_RATE_RANGE = (1e-5, 1e-2)  # smallest and largest step size that the divergence may steer to
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,7 +58,8 @@ class PPOConfig:
     learning_rate: float = 3e-4
     """First step size of Adam; it follows target_kl from there."""
     target_kl: float = 0.01
-    """Divergence (nats) from the policy that collected the rollout that the step size is steered to."""
+    """Divergence in nats between the policy and the one that collected the rollout; the step size is adapted to keep
+    it near this value."""
     clip: float = 0.2
     """Largest deviation of the probability ratio from one that still counts in the objective."""
     entropy_cost: float = 0.003
@@ -126,6 +127,7 @@ class PPO:
             noise_std_type="log",
             init_noise_std=config.init_std,
         )
+        # The step size must be part of the optimiser's state, because every gradient step may change it (`_steer`).
         self._optimizer = optax.inject_hyperparams(
             lambda learning_rate: optax.chain(
                 optax.clip_by_global_norm(config.max_grad_norm), optax.adam(learning_rate)
@@ -170,6 +172,7 @@ class PPO:
         Returns:
           Mean and standard deviation [obs] of observations; and, for every layer, its kernel [in, out] and bias [out].
         """
+        # Names that Flax gives in Brax's policy network: the hidden layers, and a last layer for the mean.
         params = state.params.policy["params"]
         hidden = params["MLP_0"]
         every = [*(hidden[f"hidden_{index}"] for index in range(len(hidden))), params["Dense_0"]]
@@ -195,6 +198,7 @@ class PPO:
         key_unroll, key_learn = jax.random.split(key)
 
         def act(carry, key):
+            # One step a call: Brax's unroll returns transitions, but not the environments' metrics of every step.
             following, transition = generate_unroll(
                 env, carry, self.act(state, deterministic=False), key, 1, extra_fields=("truncation",)
             )
@@ -203,6 +207,7 @@ class PPO:
         env_state, (data, env_metrics) = jax.lax.scan(
             act, env_state, jax.random.split(key_unroll, self.config.unroll_steps)
         )
+        # As in Brax's own training, the loss already reads observations with the updated statistics.
         normalizer = running_statistics.update(state.normalizer, data.observation)
         # Brax's loss takes environments first, [num_envs, unroll_steps].
         data = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), data)
@@ -218,6 +223,7 @@ class PPO:
     def _pass(self, key, carry, normalizer, data):
         """Goes once over the rollout, environments shuffled into minibatches."""
         key_shuffle, key_loss = jax.random.split(key)
+        # Whole environments are shuffled, not single steps: the loss computes advantages along time.
         order = jax.random.permutation(key_shuffle, self.config.num_envs)
         batches = jax.tree.map(lambda x: x[order].reshape(self.config.minibatches, -1, *x.shape[1:]), data)
         keys = jax.random.split(key_loss, self.config.minibatches)

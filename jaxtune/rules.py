@@ -1,20 +1,18 @@
 """The two decisions of a tuning: is the measured set covered, and where does the distribution move?
 
-A `Tuner` is given one function for each. They stand in its schedule (drawn in `jaxtune.tuner`) like this:
-
-    D_q, held-out sets, measured set
-      -> verify: train a verification model (`jaxtune.dvm`) on D_q, score all sets by their novelty  -> GateInfo
-      -> the tuner compares novelty with threshold; if the verdict is `accept`
-      -> update: train a search-parameter model (`jaxtune.spm`) on D_q, read the measured set        -> ParamDist
-
-`calibrated_gate` is the default `verify`. `posterior_update` is the default `update`, and `vote_update` is the paper's.
+A `Tuner` is given one function for each; `jaxtune.tuner` draws where they are called. `verify` trains a verification
+model (`jaxtune.dvm`) and scores the measured set; its default is `calibrated_gate`. `update` trains a search-parameter
+model (`jaxtune.spm`) and moves the distribution; its default is `posterior_update`, and `vote_update` is the paper's.
 To change a decision, write a function with the same arguments (`Verify`, `Update`) and hand it to the tuner.
 
-Departures from the paper. Its threshold sigma' is set by hand; here held-out simulated sets calibrate it, so the gate
-is a conformal test with a known rate of false alarms. Its vote can only raise a parameter; here it has a sign. Both
-models are trained anew for every distribution, never continued. `posterior_update` is not in the paper: one sweep over
-guesses gives an estimate and an interval, so it may replace several tunings, and a parameter that the episodes say
-nothing about stays where it is.
+Departures from the paper:
+
+- Its threshold sigma' is set by hand. Here held-out simulated sets calibrate it, so the gate is a conformal test with a
+  known rate of false alarms. Sets are scored by mean ranks, not by the mean of Eq. 2.
+- Its vote can only raise a parameter; here it has a sign.
+- Both models are trained anew for every distribution, never continued.
+- `posterior_update` is not in the paper. One sweep over guesses gives an estimate and an interval, so it may replace
+  several tunings.
 """
 
 from collections.abc import Callable
@@ -30,8 +28,8 @@ from jaxtune.dvm import DVMConfig
 from jaxtune.spm import SPMConfig
 from jaxtune.types import ParamDist, Trajectory
 
-# An interval counts as informative below this share of the one that ignores the data. Chosen below 1, since the two are
-# quantiles over a few dozen sets and differ by chance.
+# An interval counts as informative if it is narrower than this share of the interval that ignores the data. The share
+# is below 1 because both are quantiles over a few dozen sets and differ by chance.
 _IDENTIFIABLE = 0.9
 
 
@@ -51,13 +49,13 @@ class TunerConfig:
     """Simulated sets that calibrate the gate's threshold and the update's interval. Each set is one robot, with
     coordinates of its own. With 39 sets, p-values are multiples of 1/40."""
     max_widenings: int = 6
-    """Most widenings within one tuning; the gate is called at most once more than that."""
+    """Largest number of widenings within one tuning; the gate is called at most once more than that."""
     patience: int = 3
     """Gate calls in a row without progress after which the verdict is `unexplained`."""
     least_fall: float = 0.01
     """Smallest novelty decrease that counts as progress, measured from the last call that made some. The novelty is a
-    mean rank between 0 and 1. Chosen; the score of a first call varies by 0.01 to 0.04 between seeds
-    (`experiments.bench alarm`)."""
+    mean rank between 0 and 1. The value was chosen, not calibrated: the novelty of a first call varies by 0.01 to 0.04
+    between seeds (`experiments.bench alarm`)."""
     coverage: float = 0.9
     """Share of held-out sets whose true coordinates the interval of the posterior update must contain."""
     min_radius: float = 0.1
@@ -173,12 +171,10 @@ def calibrated_gate(
         p          = (1 + #{held-out sets: score >= score(measured)}) / (held_out_sets + 1)
         threshold  = the ceil((held_out_sets + 1) level)-th smallest score of the held-out sets.
 
-    A measured set drawn like the held-out ones exceeds the threshold with probability at most `1 - level`; this is a
-    conformal test. It calibrates per set, since the windows of one episode depend on each other.
-
-    The paper averages Eq. 2 itself and sets the threshold by hand. Ranks replace nats because the novelty of single
-    windows is heavy-tailed: one held-out fall raises a mean in nats so far that a measured set which is a little novel
-    everywhere would pass. A window without a neighbour ranks highest.
+    A measured set drawn like the held-out ones exceeds the threshold with probability at most `1 - level`. The test is
+    calibrated per set, since the windows of one episode depend on each other. Ranks replace nats because the novelty of
+    single windows is heavy-tailed: one held-out fall raises a mean in nats so far that a measured set which is a little
+    novel everywhere would pass. A window without a neighbour ranks highest.
 
     Args:
       key: random key, for training the verification model.
@@ -196,7 +192,8 @@ def calibrated_gate(
     scored = dvm.novelty(config.dvm, model, measured)
     novelty, valid, covered = jax.tree.map(lambda sets, one: jnp.concatenate([sets, one[None]]), held_out, scored)
     novelty = jnp.where(covered, novelty, jnp.inf)
-    # Windows that are not valid sort to the end of the pool. One without a neighbour counts them too: hence the cap.
+    # Invalid windows sort to the end of the pool as infinite. A window without a neighbour is infinite too and would
+    # count them, so its rank is capped at 1 below.
     pool = jnp.sort(jnp.where(valid, novelty, jnp.inf), axis=None)
     rank = jnp.searchsorted(pool, novelty, side="right") / valid.sum()
     rank = jnp.where(jnp.isnan(novelty), jnp.nan, jnp.minimum(rank, 1.0))
@@ -213,10 +210,10 @@ def calibrated_gate(
 
 
 def _conformal_quantile(values: jax.Array, level: jax.Array | float) -> jax.Array:
-    """Bound that one more draw like `values` [n, ...] exceeds with probability at most `1 - level`.
+    """Computes a bound that one more draw like `values` [n, ...] exceeds with probability at most `1 - level`.
 
-    It is the ceil((n + 1) level)-th smallest value. The promise needs n of at least `level / (1 - level)`; with fewer,
-    the largest value is returned.
+    It is the ceil((n + 1) level)-th smallest value. The guarantee needs n of at least `level / (1 - level)`; with
+    fewer, the largest value is returned.
     """
     rank = jnp.ceil((len(values) + 1) * level).astype(int) - 1
     return jnp.sort(values, axis=0)[jnp.minimum(rank, len(values) - 1)]
@@ -229,9 +226,8 @@ def vote_update(
 
         centre <- centre + step_size * radius * vote,    vote = 2 p(truth > centre) - 1, in [-1, 1]
 
-    (the last line of Algorithm 1). The paper's answer in (0, 1) can only raise a parameter; ours is positive where it
-    must rise and negative where it must fall. The radius stays, no interval is given, and every coordinate counts as
-    identifiable. Use it for the baseline, or to compare with the paper.
+    (the last line of Algorithm 1). The radius stays, no interval is given, and every coordinate counts as identifiable.
+    Use it for the baseline, or to compare with the paper.
 
     Args:
       key: random key, for training the search-parameter model.
@@ -264,8 +260,7 @@ def posterior_update(
         radius      <- max(radius * interval, min_radius)           where identifiable and inside the box; never larger
 
     A coordinate that is not identifiable keeps centre and radius. One whose interval reaches past the box moves, but
-    keeps its radius, since held-out truths lie inside the box and tell nothing of errors beyond. The paper has no such
-    update: it votes in each tuning (`vote_update`).
+    keeps its radius.
 
     Args:
       key: random key, for training the search-parameter model.
@@ -277,6 +272,7 @@ def posterior_update(
     """
     model, loss = spm.train(key, config.spm, collected.trajectory, collected.coords, dist)
     held_out = jax.lax.map(lambda episodes: spm.estimate(config.spm, model, episodes), collected.held_out)
+    # The errors on robots with known coordinates stand for the error on the measured one.
     truth = dists.normalise(dist, collected.held_out_coords)
     low, high = dists.normalised_box(dist)
     interval = _conformal_quantile(jnp.abs(held_out - truth), config.coverage)
@@ -286,8 +282,8 @@ def posterior_update(
     moved = dists.move(dist, step)
     radius = dists.ravel(dist.radius)
     narrowed = jnp.clip(radius * interval, jnp.minimum(config.min_radius, radius), radius)
-    # Held-out truths all lie in the box. Where the interval reaches past it, their errors do not bound the measured
-    # one, and a narrow box at the edge could shut the truth out for good.
+    # Held-out truths all lie in the box, so their errors say nothing of truths beyond it. Narrowing at the edge could
+    # exclude such a truth for good.
     inside = (step - interval >= low) & (step + interval <= high)
     radius = jnp.where(identifiable & inside, narrowed, radius)
     moved = moved.replace(radius=dists.unravel(dists.names(dist), radius))

@@ -12,8 +12,8 @@ sweeps the guess and gives a value. Everything is in radii of the distribution t
 
 Departures from the paper:
 
-- A window enters as its moments, since a network that sees the raw steps of a few hundred episodes learns them by
-  heart. BayesSim (Ramos et al., RSS 2019) likewise reads covariances of states and actions.
+- A window enters as its moments (means, spreads, covariances), since a network that sees the raw steps of a few hundred
+  episodes overfits to them. BayesSim (Ramos et al., RSS 2019) likewise reads covariances of states and actions.
 - The answer has a sign. The paper's rule `mu + alpha q` with q in (0, 1) can only raise a parameter.
 - Guesses are drawn over the whole query box independently of the truth, the centre among them. Only then is
   p(truth > guess), as a function of the guess, one minus a distribution function, so that a sweep is a posterior.
@@ -67,7 +67,10 @@ class SPMConfig:
 
 
 class _Network(nn.Module):
-    """Encoders of window and guess, and all coordinates' heads as one layer and one contraction."""
+    """Encoders of window and guess, and the heads of all coordinates.
+
+    All heads are computed at once: their hidden layers are one dense layer, their outputs one contraction.
+    """
 
     config: SPMConfig
     num_coords: int
@@ -84,6 +87,7 @@ class _Network(nn.Module):
             features = nn.elu(layer(features))
         for layer in self.guess_layers:
             guesses = nn.elu(layer(guesses))
+        # A window is encoded once and combined with each of its guesses.
         features = jnp.broadcast_to(features[:, None], (*guesses.shape[:2], features.shape[-1]))
         hidden = nn.elu(self.head_hidden(jnp.concatenate([features, guesses], axis=-1)))
         hidden = hidden.reshape(*hidden.shape[:-1], self.num_coords, self.config.head)
@@ -119,7 +123,7 @@ def _moments(window: Float[Array, "batch time channels"]) -> Float[Array, "batch
     mean = window.mean(axis=1)
     centred = window - mean[:, None]
     step = jnp.diff(window, axis=1)
-    upper = jnp.triu_indices(channels)
+    upper = jnp.triu_indices(channels)  # covariances within a step are symmetric; those across steps are not
     at_once = jnp.einsum("bti,btj->bij", centred, centred)[:, *upper] / time
     ahead = jnp.einsum("bti,btj->bij", step, centred[:, :-1]).reshape(batch, -1) / time
     return jnp.concatenate([mean, step.std(axis=1), jnp.diff(step, axis=1).std(axis=1), at_once, ahead], axis=-1)
@@ -142,8 +146,9 @@ def train(
 
     Returns:
       The model, and its logistic loss per coordinate in nats, as the mean over the last tenth of the steps. A model
-      that learned nothing has a loss of log 2 = 0.69 at the centre and, on average, 0.5 elsewhere in the box; a loss
-      near that says that the episodes do not show the coordinates.
+      that learned nothing knows only where a guess lies in the box. Its loss is log 2 = 0.69 at the centre and 0.5 on
+      average over the box, so 0.55 with four guesses. A loss near that says that the episodes do not show the
+      coordinates.
     """
     key_init, key_moments, key_train = jax.random.split(key, 3)
     truth = dists.normalise(dist, coords)
@@ -160,9 +165,11 @@ def train(
         key_window, key_guess = jax.random.split(key)
         window, episode = windows.draw(key_window, trajectory, config.batch, config.window)
         shape = (config.batch, config.guesses, truth.shape[-1])
+        # `vote` asks about the centre, so the centre is among the guesses of every window.
         guesses = jax.random.uniform(key_guess, shape, minval=low, maxval=high).at[:, 0].set(0.0)
         logits = network.apply(variables, _read(steps, moments, window), guesses)
         label = truth[episode][:, None] > guesses
+        # The mean over windows and guesses, summed over coordinates; `tail` is per coordinate again.
         return optax.sigmoid_binary_cross_entropy(logits, label).mean(axis=(0, 1)).sum()
 
     def descend(carry, key):
@@ -237,11 +244,13 @@ def estimate(config: SPMConfig, spm: SPM, trajectory: Trajectory) -> Float[Array
     share = jnp.linspace(0.0, 1.0, config.sweep)[:, None]
     curve = logits(config, spm, trajectory, low + share * (high - low))
     left, right = curve[:-1], curve[1:]
+    # A flat part has no crossing; this only avoids a division by zero.
     rise = jnp.where(left == right, 1.0, left - right)
     # Share of each part of the sweep, between two neighbouring guesses, in which the logit is positive.
     crossing = jnp.clip(left / rise, 0.0, 1.0)
     positive = jnp.where((left > 0) & (right > 0), 1.0, 0.0)
     positive = jnp.where((left > 0) & (right <= 0), crossing, positive)
+    # Nothing forces the curve to fall everywhere. Where it rises through zero, the part after the crossing counts.
     positive = jnp.where((left <= 0) & (right > 0), 1.0 - crossing, positive)
     # No evidence at all (a set without a valid window) leaves the estimate in the middle.
     positive = jnp.where((left == 0) & (right == 0), 0.5, positive)

@@ -25,17 +25,14 @@ calibrate both. Novelty says how unlike the simulated episodes the measured set 
 novelty that still counts as covered. The verdict is the first of these that holds:
 `not_finite` if novelty or threshold is not a finite number; `accept` if novelty <= threshold; `unexplained` after
 `patience` calls in a row without progress; `radius_exhausted` if the distribution fills its bounds or was widened
-`max_widenings` times; else `widen`. However a tuning ends, the radius stays as wide as it became, unless the update
-narrows it.
+`max_widenings` times; else `widen`. A radius that was widened stays so, unless the update narrows it.
 
-Departures from the paper:
+Departures from the paper, besides those of gate and update (`jaxtune.rules`):
 
-- A tuning ends with training the policy, where the paper's begins with it. So the first tuning finds the policy that
-  was trained in the first distribution, and the last one leaves a policy that knows the last distribution.
+- A tuning ends with training the policy, where the paper's begins with it. The last tuning therefore leaves a policy
+  that was trained in the last distribution.
 - The radius grows only after a failed check (in print it grows before each), is capped by the bounds, and the loop ends
-  with a verdict instead of running for ever.
-- Gate and update depart as well, above all in a threshold that is calibrated instead of set by hand, and in an update
-  that has a sign or follows a posterior: see `jaxtune.rules`.
+  with a verdict.
 
 Everything here is pure: a key and a state go in, a state and an info come out. A user hands in three functions; gate
 and update are functions as well and have defaults:
@@ -46,10 +43,7 @@ and update are functions as well and have defaults:
     from jaxtune.tuner import Tuner, TunerConfig, knobs
     from jaxtune.types import Trajectory
 
-    def train_policy(key, policy, dist):  # any learner, on draws of dist; here the policy is a constant push
-        return policy, {}
-
-    def simulate(key, policy, coords):  # one episode per draw; a cart whose friction is searched in log space
+    def simulate(key, policy, coords):  # a cart; the policy is a constant push; the log of its friction is searched
         start = jax.random.normal(key, coords["friction"].shape)
         move = lambda speed, _: (speed + 0.1 * (policy - jnp.exp(coords["friction"]) * speed), speed)
         speed = jax.lax.scan(move, start, length=100)[1].T  # [episodes, time]
@@ -57,17 +51,15 @@ and update are functions as well and have defaults:
         obs, action = speed[..., None], jnp.full((*speed.shape, 1), policy)
         return Trajectory(obs=obs, action=action, alive=alive, score=speed, fell=no, not_finite=no)
 
-    def measure(key, policy):  # the robot; here another cart, whose friction the tuner does not know
-        return simulate(key, policy, {"friction": jnp.full(5, 0.8)})
-
+    train_policy = lambda key, policy, dist: (policy, {})  # any learner, on draws of dist
+    measure = lambda key, policy: simulate(key, policy, {"friction": jnp.full(5, 0.8)})  # the robot: another cart
     tuner = Tuner(config=TunerConfig(), train_policy=train_policy, simulate=simulate, measure=measure)
     first = dist.make({"friction": 0.0}, 0.2, {"friction": -2.0}, {"friction": 2.0})
     state = tuner.init(1.0, first, knobs())
 
-`tuner.run(key, state, num_tunings)` then does the rest, and `state.dist.centre` holds what was found. With a target in
-JAX, `run` is one program that can be jitted and vmapped over seeds, starts and knobs. With any other target (another
-engine, a log on disk, a robot), leave `measure` out, loop over `tuner.train` and `tuner.tune`, and fetch the measured
-set between them.
+`tuner.run(key, state, num_tunings)` returns the state whose `dist.centre` is the estimate. With a target in JAX it is
+one program that can be jitted and vmapped over seeds, starts and knobs. With any other target (another engine, a log on
+disk, a robot), leave `measure` out, loop over `tuner.train` and `tuner.tune`, and fetch the measured set between them.
 """
 
 from collections.abc import Callable
@@ -112,13 +104,15 @@ __all__ = [
 ]
 
 Policy = Any
-"""Whatever the user's functions take as a policy: any pytree; the tuner only passes it on."""
+"""Any pytree that the user's functions take as a policy; the tuner only passes it on."""
 TrainPolicy = Callable[[jax.Array, Policy, ParamDist], tuple[Policy, dict]]
-"""`(key, policy, dist) -> (policy, metrics)`: trains the policy on robots drawn from the distribution."""
+"""`(key, policy, dist) -> (policy, metrics)`: trains the policy on robots drawn from the distribution. Metrics are
+scalars or arrays by name."""
 Simulate = Callable[[jax.Array, Policy, Coords], Trajectory]
-"""`(key, policy, coords [episodes]) -> Trajectory [episodes, time]`: one episode for every draw."""
+"""`(key, policy, coords [episodes]) -> Trajectory [episodes, time]`: one episode for every draw, traceable by JAX."""
 Measure = Callable[[jax.Array, Policy], Trajectory]
-"""`(key, policy) -> Trajectory [set_episodes, time]`: episodes of the target, whose coordinates nobody knows."""
+"""`(key, policy) -> Trajectory [set_episodes, time]`: episodes of the target, with the same episode length, policy,
+commands and observation noise as the simulated ones."""
 
 
 @chex.dataclass(frozen=True)
@@ -162,12 +156,12 @@ class Tuner:
 
     Attributes:
       config: sizes.
-      train_policy: `(key, policy, dist) -> (policy, metrics)`; metrics are scalars or arrays by name.
-      simulate: `(key, policy, coords [episodes]) -> Trajectory [episodes, time]`; it must be traceable by JAX.
-      measure: `(key, policy) -> Trajectory [set_episodes, time]`, with the same episode length, policy, commands and
-        observation noise as `simulate`. None where the target is not JAX; hand the measured set to `tune` then.
-      verify: scores a measured set against simulated ones; `rules.calibrated_gate` unless given.
-      update: moves the distribution after an accepted set; `rules.posterior_update` unless given.
+      train_policy: trains the policy in a distribution (`TrainPolicy`).
+      simulate: simulates episodes of robots with given coordinates (`Simulate`).
+      measure: measures episodes of the target (`Measure`). None where the target is not JAX; hand the measured set to
+        `tune` then.
+      verify: scores a measured set against simulated ones (`rules.Verify`).
+      update: moves the distribution after an accepted set (`rules.Update`).
     """
 
     config: TunerConfig
@@ -180,16 +174,14 @@ class Tuner:
     def init(self, policy: Policy, dist: ParamDist, knobs: Knobs) -> TunerState:
         """Makes the state before the first tuning.
 
-        `policy` should have been trained in `dist` already (`train` does that), since a tuning measures before it
-        trains.
+        A tuning measures before it trains, so `policy` should have been trained in `dist` already (`train` does that).
         """
         return TunerState(policy=policy, dist=dist, knobs=knobs)
 
     def step(self, key: jax.Array, state: TunerState) -> tuple[TunerState, Info]:
         """Does one tuning: measures a set, tunes the distribution with it, and trains the policy in the result.
 
-        Use it where the target is in JAX, so that `measure` can be traced. It is pure: the same key and state give the
-        same result, jitted or not.
+        Use it where the target is in JAX, so that `measure` can be traced.
         """
         key_measure, key_tune, key_train = jax.random.split(key, 3)
         state, info = self.tune(key_tune, state, self.measure(key_measure, state.policy))
@@ -228,6 +220,7 @@ class Tuner:
         """
         key_gate, key_update = jax.random.split(key)
         carry = self._gate_loop(key_gate, state, measured)
+        # A branch, so that (unless vmapped) no search-parameter model is trained for a set that was not accepted.
         moved, update = jax.lax.cond(
             carry["verdict"] == Verdict.ACCEPT,
             lambda: self.update(key_update, self.config, carry["collected"], measured, carry["dist"], state.knobs),
@@ -251,6 +244,7 @@ class Tuner:
 
         def body(carry):
             calls = carry["calls"]
+            # Every call simulates new robots and trains its models anew, because the distribution has changed.
             key_collect, key_verify = jax.random.split(jax.random.fold_in(key, calls))
             dist = carry["dist"]
             collected = self.collect(key_collect, state.policy, dist)
@@ -278,6 +272,7 @@ class Tuner:
 
     def _before_gate(self, key, state):
         """Makes the loop's carry before the first call; the verdict `widen` lets the loop begin."""
+        # A while loop needs a carry of fixed shapes: zeros stand for the episodes that the first call will collect.
         shapes = jax.eval_shape(self.collect, key, state.policy, state.dist)
         return {
             "calls": jnp.zeros((), int),
@@ -293,9 +288,8 @@ class Tuner:
     def collect(self, key: jax.Array, policy: Policy, dist: ParamDist) -> Collected:
         """Simulates D_q and the held-out sets under one policy, with coordinates drawn from one distribution.
 
-        Every episode of D_q is a robot of its own; a held-out set is one robot in `set_episodes` episodes, like a
-        measured set. All `episodes + held_out_sets * set_episodes` episodes are simulated in one batch. `tune` calls
-        this before every gate call; call it yourself to study gate or update alone.
+        All `episodes + held_out_sets * set_episodes` episodes are simulated in one batch. `tune` calls this before
+        every gate call; call it yourself to study gate or update alone.
         """
         key_train, key_held_out, key_simulate = jax.random.split(key, 3)
         sets, each = self.config.held_out_sets, self.config.set_episodes

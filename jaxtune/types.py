@@ -98,8 +98,8 @@ inertia (kg m^2). Per body: `mass` (kg), and `drag`, mass * 9.81 (N s/m).
 class Parameter:
     """One number of an effect, with the rule that turns its coordinate into a physical value.
 
-    Discovery fits coordinates, since they are of order one for every effect and zero where an effect is absent. For a
-    coordinate c at a place of scale s (see `Scale`):
+    Discovery fits coordinates, since they are of order one for every effect and zero where an effect is absent. A place
+    is where the effect sits, such as one joint. For a coordinate c at a place of scale s (see `Scale`):
 
         form                `inner`: the physics reads    `value`: a report prints
         added               c s                           c s
@@ -120,7 +120,7 @@ class Parameter:
     scale: Scale = "one"
     """What one unit of the coordinate stands for."""
     prior: float = 1.0
-    """Standard deviation of the coordinate before anything is measured."""
+    """Prior standard deviation of the coordinate, about zero: the size that discovery expects before it sees a log."""
     shape: bool = False
     """True for a parameter that only shapes its effect, such as the speed at which friction falls off. It has no
     influence while the effect's other parameters are zero, and its coordinate starts at zero like theirs."""
@@ -186,8 +186,8 @@ class Effect:
     """Kind of place that has values of its own."""
     parameters: tuple[Parameter, ...]
     sizes: tuple[float, ...]
-    """Coordinates at which the search first tries the effect, the smallest of interest first. An effect without a
-    derivative at zero lists larger ones too."""
+    """Coordinates at which discovery first simulates the effect, the smallest size of interest first. An effect whose
+    derivative at zero does not exist (a delay, a deadband) lists larger ones too, for secants."""
     sentence: str
     """What happens in the robot, for a report."""
     excited_by: str
@@ -195,8 +195,8 @@ class Effect:
     act: Callable[..., Any] | None = None
     """Transforms the stage's signal; None for an effect that changes fields of the model."""
     start: Callable[..., Any] | None = None
-    """`start(values, signal, dt) -> memory`: the memory after a constant signal has lasted for ever. None where nothing
-    is remembered."""
+    """`start(values, signal, dt) -> memory`: the memory in steady state, after a constant input signal. None where the
+    effect has no memory."""
     undo: Callable[..., Any] | None = None
     """For a sensor effect, `undo(values, readings, dt) -> truth`: recovers true positions and velocities from recorded
     ones, [time, 2, joints]."""

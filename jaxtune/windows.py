@@ -29,9 +29,10 @@ def steps(trajectory: Trajectory) -> Float[Array, "... time channels"]:
 def valid_starts(alive: Bool[Array, "*episodes time"], length: int) -> Bool[Array, "*episodes starts"]:
     """Marks the steps at which a window of `length` steps lies wholly within its episode.
 
-    There are `time - length + 1` possible starts. A start is valid if all steps up to the window's last one are alive,
-    so nothing after an end counts even if the mask were to come back.
+    There are `time - length + 1` possible starts. A start is valid if all steps of the episode up to the window's last
+    one are alive.
     """
+    # A running count, not the window alone: nothing after an episode's end counts, even if `alive` is true again there.
     ended = jnp.cumsum(~alive, axis=-1)
     return ended[..., length - 1 :] == 0
 

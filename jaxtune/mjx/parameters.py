@@ -1,8 +1,8 @@
 """The table of a model's parameters, and the model that has other values of them.
 
-Mass is not one field of a MuJoCo model: a body's inertia scales with it, and so do the fields that MuJoCo derives from
-both. `apply` is therefore the only door through which parameters enter a model: it changes the fields that the table
-names and recomputes all that depend on them.
+Mass is not one field of a MuJoCo model: a body's inertia scales with it, and MuJoCo derives further fields from both.
+Parameters therefore enter a model through `apply` alone, which changes the fields that the table names and recomputes
+all fields that depend on them. `apply_mujoco` does it for MuJoCo C.
 """
 
 import copy
@@ -22,7 +22,7 @@ from jaxtune.types import Coords
 Params = Mapping[str, jax.Array]
 """Physical values by name: a multiplier of the nominal model for a logarithmic entry, an offset for a linear one.
 
-Not to be mixed up with the coordinates that are searched (`to_coords`).
+The values that the tuner searches are coordinates, another type (`jaxtune.types.Coords`); `to_coords` translates.
 """
 
 _OBJECTS = {
@@ -37,8 +37,8 @@ _OBJECTS = {
 class Entry:
     """Describes one parameter: which fields of which objects of the model share its value, and within which bounds.
 
-    A row of the table that `apply` reads. Entries that share a field are applied one after the other: two multipliers
-    multiply.
+    It is a row of the table that `apply` reads. Entries that share a field are applied one after the other, so that
+    two multipliers of one field multiply.
 
         mass = Entry(name="shank_mass", kind="body", targets=("left_shank", "right_shank"),
                      fields=("body_mass", "body_inertia"), bounds=(0.5, 2.0))
@@ -46,8 +46,8 @@ class Entry:
 
     name: str
     kind: Literal["body", "geom", "joint", "actuator", "control"]
-    """What the targets are. `control` is no part of the model (a delay of the controller, say): it has neither targets
-    nor fields, and `apply` leaves it to the code that steps the robot."""
+    """What the targets are. A `control` parameter, such as a delay of the controller, is not part of the model. It has
+    neither targets nor fields, so `apply` ignores it, and the code that simulates the controller reads it."""
     targets: tuple[str, ...]
     """Names of the objects that share this value."""
     fields: tuple[str, ...]
@@ -81,6 +81,7 @@ class Entry:
                 raise ValueError(f"parameter '{self.name}': got {self.kind} '{target}', which the model does not have")
             ids.append(index)
         ids = np.array(ids)
+        # Damping, armature and friction of a joint are stored by degree of freedom.
         return model.jnt_dofadr[ids] if self.kind == "joint" else ids
 
 
@@ -155,7 +156,9 @@ def apply(model: mjx.Model, params: Params, entries: Mapping[str, Entry]) -> mjx
     """
     fields = {}
     for field, index, entry, value in _cells(model, params, entries):
+        # An earlier entry may have changed the same field.
         array = fields.get(field, getattr(model, field))
+        # One value per target must broadcast over the columns of its row.
         columns = (1,) * (array.ndim - 1 if entry.column is None else 0)
         cell, value = array.at[index], jnp.reshape(value, (*jnp.shape(value), *columns))
         fields[field] = cell.multiply(value) if entry.log else cell.add(value)
@@ -180,6 +183,7 @@ def apply_mujoco(model: mujoco.MjModel, params: Params, entries: Mapping[str, En
     """
     model = copy.copy(model)
     for field, index, entry, value in _cells(model, params, entries):
+        # A view of the model's own memory: assigning to it changes the model.
         array = getattr(model, field)
         array[index] = array[index] * float(value) if entry.log else array[index] + float(value)
     mujoco.mj_setConst(model, mujoco.MjData(model))
