@@ -187,7 +187,7 @@ class Bench:
             result = workflow.discover(question.problem, calibration=self.calibration)
             path.parent.mkdir(parents=True, exist_ok=True)
             answer = summarise(question, result) | {"seconds": time.monotonic() - began, "rejected": result.rejected}
-            write_json(path, checkpoint.as_json(answer))
+            write_json(path, answer)
         return json.loads(path.read_text())
 
     def scored(self) -> list[dict]:

@@ -39,7 +39,7 @@ class Policy:
     robots: State  # [envs] states of the training environments, kept between two rollouts
     radius: jax.Array  # largest radius, in coordinates, of the distribution that the training robots are drawn from
     hidden: dict  # physical values by name of parameters that the training robots have and nobody tunes
-    # Commands of measured episodes, which simulated ones repeat; drawn by the task where None. The name is in checkpoints.
+    # Commands of measured episodes, which simulated ones repeat; drawn by the task where None. Named as in checkpoints.
     asked: Commands | None = None
 
 
