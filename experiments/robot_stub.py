@@ -60,6 +60,7 @@ def answer(place: Path, robot: Robot, seed: int) -> Sequence[bool]:
         player = Player(exported)
     except (KeyError, TypeError, zipfile.BadZipFile) as error:
         raise ValueError(f"{exported}: {error!r}, expected what experiments.export writes") from error
+    # A generator for every walk, so that a walk does not depend on how long the one before it lasted.
     rngs = [np.random.default_rng((seed, request["seed"], index)) for index in range(request["episodes"])]
     walked = [robot.walk(f"run_{index:03d}", player, request["seconds"], rng) for index, rng in enumerate(rngs)]
     meta = player.meta
@@ -135,6 +136,7 @@ def main(args: Args) -> None:
             except (ValueError, OSError) as error:
                 if (place / "log").exists():  # another process was faster
                     continue
+                # Whole or not at all, because the learner reads the file as soon as it exists.
                 draft = place / f"refused.{os.getpid()}.partial"
                 draft.write_text(f"{error}\n")
                 draft.rename(place / "refused.txt")

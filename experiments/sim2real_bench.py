@@ -210,11 +210,13 @@ def main(args: Args) -> None:
     check(args)
     checkpoint.set_up_compiler(preset(args.preset).xla_flags)
     identity = asdict(args) | {"model_sha256": args.model and corrected.read(args.model).digest}
+    # Other processes may play other methods and seeds in the same folder.
     for option in ("out", "methods", "seeds"):
         del identity[option]
     checkpoint.open_run(args.out, identity)
     first = transfer_of(args, "ours", 0)
     programs = transfers.compile_programs(first)
+    # The first policy is trained in the nominal model, also where the methods then learn in a corrected one.
     nominal = programs if args.model is None else transfers.compile_programs(replace(first, model=None))
     results: dict[str, list[Outcome]] = {name: [] for name in args.methods}
     for seed in args.seeds:

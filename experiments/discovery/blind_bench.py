@@ -152,7 +152,7 @@ class Bench:
 
         Severity is the rms by which the effect changes the positions of the most affected joint, in floor units. It is
         measured without noise and after the nominal parameters were fitted again: what they can imitate within their
-        priors cannot be told from wrong parameters by any method.
+        priors no method can distinguish from wrong parameters.
 
         Args:
           case: its effect and seed.
@@ -165,12 +165,13 @@ class Bench:
         zero = np.zeros(problem.axes)
         slope = prior_slopes(problem, main) / floor[..., None]
         plain = residuals(problem, zero, problem.data["train"][main])[0]
-        positions = slice(-len(self.size.joints), None)
+        positions = slice(-len(self.size.joints), None)  # the last columns of a residual are q
 
         def severity(size: float) -> float:
             log = self.record(Truth(case.effect, places, size), seed, noise=False)
             segments = self.build_question(log, (main,)).problem.data["train"][main]
             moved = (residuals(problem, zero, segments)[0] - plain) / floor
+            # A robot whose simulation diverges is more severe than any wanted severity.
             if not np.isfinite(moved).all():
                 return np.inf
             left = left_by_prior(moved, slope, weight)

@@ -47,7 +47,7 @@ so for a limit or a stiffness it is the larger one."""
 
 @dataclass(frozen=True)
 class Case:
-    """One robot of the benchmark with its hidden effect."""
+    """One robot of the benchmark with its hidden effect; its place and size are drawn by `Bench.truth`."""
 
     number: int
     """Position in the shuffled list of cases; it names the files."""

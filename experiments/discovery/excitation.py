@@ -21,7 +21,7 @@ _SHARES = {"triangle": 0.35, "chirp": 0.3, "steps": 0.2, "swing": 0.15}  # of a 
 
 @dataclass(frozen=True)
 class TargetRun:
-    """The joint targets of one run, before anything is measured."""
+    """The joint targets of one run, before anything is measured; a robot or a simulation plays it."""
 
     name: str
     """Name of the run, which is that of its file."""

@@ -116,6 +116,7 @@ def build_question(
     plain = plain or Rig(spec, log.joints, rate)
     plain.check_matches(log.joints, rate)
     rig = plain.scaled(measure_scales(plain, unsealed))
+    # A signal that some runs lack is not compared, since segments of all runs share one layout.
     signals = tuple(name for name in ("dq", "gravity", "q") if all(name in run.signals for run in log.runs))
     axes = {(axis.effect, axis.place): number for number, axis in enumerate(rig.axes)}
     library = {name: row for name, row in rig.effects.items() if name in LIBRARY}
@@ -180,6 +181,7 @@ def drop_filtered(log: Log) -> tuple[Log, tuple[str, ...]]:
       was left out.
     """
     notes = []
+    # Sealed runs are left out here too: nothing may be decided by them.
     late = [segments.velocity_lag(run) for run in without_sealed(log).runs if "dq" in run.signals]
     if late and np.median(late) > _LATE_S:
         notes.append(f"dq lags q by {1e3 * np.median(late):.0f} ms, so it was filtered and is not used")

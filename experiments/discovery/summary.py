@@ -62,6 +62,7 @@ def _effect(rig: Rig, hypothesis: Hypothesis, fit: Fit, errors: np.ndarray, othe
         mine = [i for i, free in enumerate(fit.free.directions) if ((free != 0) & (direction != 0)).any()]
         number = int(np.flatnonzero(direction)[0])
         value, scale = fit.vector[number], rig.axes[number].scale
+        # Standard errors of the directions through this coordinate add up in quadrature; 1.96 makes it a 95 % interval.
         error = 1.96 * float(np.sqrt(sum((errors[i] * fit.free.directions[i][number]) ** 2 for i in mine)))
         # A limit or a stiffness that may as well not be there has no upper end.
         least = max(value - error, 1e-12) if parameter.form == "reciprocal" else value - error
@@ -95,6 +96,7 @@ def free_runs(log: Log, question: Question, result: Result) -> dict:
     rig = question.rig
     cut = segments.whole(log.runs, rig.dt)
     play = jax.jit(jax.vmap(lambda value, inputs: rig.simulate(rig.tree(value), inputs)["q"], (None, 0)))
+    # All three models are simulated by one compiled program, which takes their coordinates as an argument.
     vectors = {
         "before": np.zeros(len(rig.axes)),
         "null": result.null.vector,

@@ -171,6 +171,7 @@ class Rounds:
         return self._out / f"round_{index:03d}"
 
     def _key(self, index: int, use: int) -> jax.Array:
+        # `use` is 0 for the prediction, 1 for tuning, 2 for training, 3 for the prediction in the tuned simulator.
         key = jax.random.fold_in(jax.random.PRNGKey(self._terms.seed), _KEYS)
         return jax.random.fold_in(jax.random.fold_in(key, index), use)
 

@@ -86,7 +86,9 @@ class Robot:
         model = fixed_base(spec) if suspended else model
         model.opt.timestep = _STEP_S
         model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+        # The solver converges here, while the learner's few iterations trade accuracy for speed.
         model.opt.iterations, model.opt.ls_iterations = 100, 50
+        # The model's own actuators are off, because torques with lag and limits are applied by `_push`.
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION
         self.model = model
         joints = [model.joint(name) for name in constants.JOINTS]
@@ -137,6 +139,7 @@ class Robot:
             mujoco.mj_step(self.model, self.data)
             if self._fallen():
                 fell = True
+                # A last row with the motors off tells the reader of the log that the walk ended in a fall.
                 rows.append(rows[-1] | self._look(rng) | {"enabled": 0.0})
                 break
         signals = {signal: np.stack([row[signal] for row in rows]).astype(float) for signal in rows[0]}

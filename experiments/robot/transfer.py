@@ -136,6 +136,7 @@ def _identity(transfer: Transfer, sizes: Preset) -> dict:
     identity = {**asdict(transfer), "sizes": sizes, "terms": terms}
     # The folder may hold another model by the time that a run continues, so the model's hash is compared.
     identity["model_sha256"] = transfer.model and corrected.read(transfer.model).digest
+    # A later call may find the folder moved, and may play more rounds.
     for option in ("out", "rounds"):
         del identity[option]
     return identity
