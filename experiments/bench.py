@@ -164,6 +164,7 @@ def alarm(args: Args) -> dict:
         truth = {name: multiplier if name.endswith("_mass") else 1.0 for name in learner.entries}
         return parameters.to_coords(learner.entries, truth)
 
+    # A target with 1 / start times the nominal masses, as in `experiments.walking.cases`.
     fixed = {"masses, start 0.5X": 2.0, "masses, start 1.5X": 2.0 / 3.0, "centre of the radius": 1.0}
     names = [*fixed, "drawn within the radius"]
 

@@ -82,6 +82,7 @@ def main(args: Args) -> None:
     checkpoint.set_up_compiler(preset(args.preset).xla_flags)
     params = check(args)
     sizes = preset(args.preset)
+    # A learner needs a parameter; foot friction at its nominal value changes nothing.
     entries = chosen(",".join(dict.fromkeys(("foot_friction", *params))))
     task = dataclasses.replace(sizes.task, physics=args.physics)
     pushed = dataclasses.replace(task, push_mps=args.push)
@@ -120,6 +121,7 @@ def main(args: Args) -> None:
         args.out / "evaluation.json",
         {"args": args, "rows": rows, "grid": by_command, "versions": checkpoint.versions()},
     )
+    # The pictures show a straight walk at medium speed.
     _, recording = jax.tree.map(lambda leaf: leaf[GRID.index((0.4, 0.0, 0.0))], grid)
     plots.gait(args.out / "gait.png", recording.foot_force[..., 2], recording.phase)
     try:

@@ -1,4 +1,4 @@
-"""Writes targets in which missing effects are distinguishable: `python -m experiments.excite --robot MODEL --out DIR`.
+"""Writes joint targets that make missing effects visible in a log: `python -m experiments.excite --robot MJCF --out D`.
 
 The result is a log without measurements. Play its targets on the robot, suspended or clamped, and add the measured
 columns; `experiments.discover` then reads the log. The motion is described in `experiments.discovery.excitation`.
@@ -54,6 +54,7 @@ def main(args: Args) -> None:
         if not 0 < getattr(args, name) < np.inf:
             raise ValueError(f"{name}: got {getattr(args, name)}, expected a positive, finite number")
     spec = models.spec(args.robot)
+    # A free joint is the base, which is held, and a ball joint has no scalar target.
     kinds = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
     joints = tuple(joint.name for joint in spec.joints if joint.type in kinds)
     everywhere = np.ones(len(joints))
@@ -75,6 +76,7 @@ def main(args: Args) -> None:
     built_in = args.robot in models.BUILT_IN
     name = args.robot if built_in else Path(args.robot).name
     write(Log(robot=name, base="fixed", rate_hz=args.rate_hz, joints=joints, policy=None, runs=runs), args.out)
+    # The log names its model by a path relative to itself, so that the folder can be moved as a whole.
     if not built_in:
         shutil.copy(args.robot, args.out / name)
     console.print(

@@ -88,6 +88,7 @@ def main(args: Args) -> None:
     rows = points(friction)
     key, steps = jax.random.PRNGKey(args.seed), round(sizes.task.episode_s / constants.POLICY_DT_S)
 
+    # Parameters are arguments, so that one compiled program serves all points.
     @jax.jit
     def walk(policy, params):
         return MjxTarget(robot=learner.robot, params=params).record(key, learner.act(policy), args.episodes, steps)

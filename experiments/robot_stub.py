@@ -1,9 +1,9 @@
-"""Plays a robot that answers through files alone: `python -m experiments.robot_stub --folder RUN`.
+"""Plays a simulated robot that answers through files: `python -m experiments.robot_stub --folder RUN`.
 
-It stands in for a real robot; `experiments.robot.surrogate` says what its body is like. Where it finds
-`RUN/**/round_*/request.json` beside an exported policy it walks with that policy, falls where it falls, and writes
-`round_*/log`. Where it finds targets of `experiments.excite`, `RUN/**/hung/targets`, it plays them while it is
-suspended and writes `hung/log`. Nothing else of it can be seen.
+It stands in for a real robot, so that `sim2real` can be tried without one; `experiments.robot.surrogate` describes its
+body. For every `RUN/**/round_*/request.json` beside an exported policy it walks with that policy and writes
+`round_*/log`. For targets of `experiments.excite` in `RUN/**/hung/targets` it plays them suspended and writes
+`hung/log`. The learner sees nothing of it but these files.
 """
 
 import json
@@ -27,24 +27,25 @@ from experiments.robot.surrogate import ROW_S, Body, Robot
 
 @dataclass(frozen=True, kw_only=True)
 class Args:
-    """Plays the robot: walks with the policies in a folder, plays targets while suspended, and writes logs."""
+    """Plays a simulated robot: walks with the policies in a folder, plays targets while suspended, and writes logs."""
 
     folder: Path
-    """Folder of requests, `round_*/request.json` beside `round_*/policy`, and of targets, `hung/targets`."""
+    """Folder that is searched, at any depth, for requests to walk (`round_*/request.json` beside `round_*/policy`) and
+    for targets to play while suspended (`hung/targets`)."""
     body: Body = field(default_factory=Body)
-    """What the robot's body is like."""
+    """Properties of the robot's body; masses, friction and torque are multiples of the nominal model's."""
     idle_s: float = 3600.0
-    """Ends after so long without a request."""
+    """The program ends after this many seconds without a request."""
     seed: int = 0
-    """Seed of its noise and, with the request's own, of its commands."""
+    """Random seed of its noise and, together with the request's own seed, of its commands."""
 
 
 def answer(place: Path, robot: Robot, seed: int) -> Sequence[bool]:
-    """Walks as a request asks, and writes the log.
+    """Answers a request: walks as often and as long as it says, and writes the log.
 
     Args:
       place: folder of the request and the policy.
-      robot: stands on the ground.
+      robot: a robot that stands on the ground.
       seed: of its noise.
 
     Returns:
@@ -59,6 +60,7 @@ def answer(place: Path, robot: Robot, seed: int) -> Sequence[bool]:
         player = Player(exported)
     except (KeyError, TypeError, zipfile.BadZipFile) as error:
         raise ValueError(f"{exported}: {error!r}, expected what experiments.export writes") from error
+    # A generator for every walk, so that a walk does not depend on how long the one before it lasted.
     rngs = [np.random.default_rng((seed, request["seed"], index)) for index in range(request["episodes"])]
     walked = [robot.walk(f"run_{index:03d}", player, request["seconds"], rng) for index, rng in enumerate(rngs)]
     meta = player.meta
@@ -89,11 +91,11 @@ def _request(path: Path) -> dict:
 
 
 def play_targets(place: Path, robot: Robot, seed: int) -> None:
-    """Plays the targets of a folder while the robot is suspended, and writes the log.
+    """Plays the targets of a folder on the suspended robot, and writes the log that discovery reads.
 
     Args:
-      place: holds `targets`, and then `log`.
-      robot: is suspended.
+      place: folder that holds `targets`; `log` is written beside it.
+      robot: a robot that is suspended.
       seed: of its noise.
 
     Raises:
@@ -117,7 +119,7 @@ def _put(log: Log, place: Path) -> None:
 
 
 def main(args: Args) -> None:
-    """Answers requests until none has come for a while; what it cannot answer it refuses in `refused.txt`."""
+    """Answers requests until none has come for `idle_s`; the reason of a refusal goes into `refused.txt`."""
     standing, suspended = Robot(args.body), Robot(args.body, suspended=True)
     last = time.monotonic()
     while time.monotonic() - last < args.idle_s:
@@ -134,6 +136,7 @@ def main(args: Args) -> None:
             except (ValueError, OSError) as error:
                 if (place / "log").exists():  # another process was faster
                     continue
+                # Whole or not at all, because the learner reads the file as soon as it exists.
                 draft = place / f"refused.{os.getpid()}.partial"
                 draft.write_text(f"{error}\n")
                 draft.rename(place / "refused.txt")

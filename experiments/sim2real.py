@@ -1,7 +1,8 @@
 """Tunes BITeno's simulator to a robot that answers through log files: `python -m experiments.sim2real --out RUN`.
 
-A round predicts how the policy will walk, exports it, waits for a log, has the doctor look it through, verifies and
-tunes, trains on, and reports. `experiments.robot.rounds` says what is in the folder.
+A round predicts how the policy will walk, exports it, requests walks and waits for their log. The log doctor checks the
+log and the gate verifies it. The tuner moves the distribution, the policy trains in it, and a report is written.
+`experiments.robot.rounds` lists the files in the folder.
 """
 
 from dataclasses import dataclass
@@ -18,7 +19,11 @@ class Args(Transfer):
 
 
 def main(args: Args) -> None:
-    """Plays the rounds that are not played yet, and reports on each one."""
+    """Plays all rounds that have not been played yet.
+
+    Raises:
+      ValueError: an option is wrong, too many falls are expected, or the robot's log is missing or unusable.
+    """
     checkpoint.set_up_compiler(preset(args.preset).xla_flags)
     play(args, compile_programs(args))
 

@@ -1,9 +1,9 @@
-"""Repeats the paper's Fig. 6 on a stand-in robot: `python -m experiments.sim2real_bench --out DIR`.
+"""Compares tuning methods on a stand-in robot (the paper's Fig. 6): `python -m experiments.sim2real_bench --out DIR`.
 
-The learner starts with all masses at half of the robot's, and with a policy that was trained there, in the nominal
-model. The robot is a process of its own (`experiments.robot_stub`) with what a real one has: delay, lag, noise, drift,
-another friction. Falls in the walks of the rounds are the price of tuning. At the end each policy is evaluated in
-further walks, from which nothing is learnt.
+The learner's simulator starts with all masses at half of the robot's, and the first policy was trained there. The robot
+is a process of its own (`experiments.robot_stub`) that has what real robots have and the nominal model lacks: delay,
+motor lag, noise, drift, another friction. Falls in the walks of the rounds are the price of tuning. At the end each
+policy is evaluated in further walks, from which nothing is learnt.
 """
 
 import json
@@ -36,55 +36,60 @@ from experiments.walking.policies import policy_config, starting_policy
 from jaxtune.tuner import knobs
 
 METHODS = ("ours", "spm", "dr", "oracle")
+"""`ours` (gate and posterior update), `spm` (the paper's update without the gate), `dr` (wide domain randomisation,
+never tuned) and `oracle` (trained with the robot's masses and friction)."""
+
 _DR_RADIUS = 0.4
 _LEGS = ("abductor_mass", "thigh_mass", "shank_mass")
-_ANSWER_S = 900.0
-_DAY_S = 86400.0
-_EVALUATION_SEED = 999_000
+_ANSWER_S = 900.0  # how long the stand-in may take for the walks of a request
+_DAY_S = 86400.0  # longer than any round: the stand-in ends with its `with` block, not by itself
+_EVALUATION_SEED = 999_000  # far from the seeds of the rounds, so evaluation walks are new ones
 
 
 @dataclass(frozen=True, kw_only=True)
 class Args:
-    """Compares methods on a stand-in robot that answers through log files, from the same start policy."""
+    """Compares tuning methods on a simulated robot that answers through log files, as a real one would."""
 
     out: Path = Path("runs/sim2real_bench")
-    """Folder; the same command with the same folder goes on where it was. Other seeds may run beside it; a last call
-    with all of them writes summary and picture."""
+    """Folder of the results. The same command with the same folder continues where it was. Several processes may share
+    the folder with a seed each; a last call with all seeds then writes summary.json and fig6.png."""
     methods: tuple[str, ...] = METHODS
-    """Which of ours, spm, dr, oracle."""
+    """Methods to compare: ours, spm (the paper's update without the gate), dr (wide domain randomisation without
+    tuning), oracle (trained with the robot's masses and friction)."""
     seeds: tuple[int, ...] = (0, 1, 2)
-    """Seeds of everything random."""
+    """Random seeds; every method runs once with each."""
     rounds: int = 5
-    """Rounds of every method."""
+    """Rounds of every method; in each the robot walks and the policy trains."""
     mass: float = 0.5
-    """Where the learner's masses start, as a multiple of the robot's, or of what a corrected model says these are."""
+    """Where the simulator's masses start, as a multiple of the robot's masses. With --model, as a multiple of the
+    corrected model's masses."""
     walk_s: float = 10.0
-    """Length of a walk."""
+    """Length of a walk in s."""
     evaluation: int = 20
-    """Walks in which a policy is evaluated before the first round and after the last."""
+    """Number of walks in which a policy is evaluated before the first round and after the last."""
     model: Path | None = None
-    """Folder of a corrected model that discovery wrote of the robot, for what every method learns in from the first
-    round on; the nominal one where None."""
+    """Folder of a corrected model of the robot, written by discovery (`OUT/model`), in which all methods learn; the
+    nominal model if not given."""
     preset: str = "cpu"
-    """Sizes: smoke, cpu or gpu."""
+    """Size of the run: smoke (minutes, to see that it works), cpu (two cores) or gpu (one GPU)."""
     noise: float = 0.2
-    """Noise of simulated sensors, in units of `sensing.NOISE`."""
+    """Noise of simulated sensors, as a multiple of envs.sensing.NOISE."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
-    """What became of one method with one seed: its rounds, and evaluations of the policy before and after them."""
+    """Result of one method with one seed: its rounds, and how the policy walks before and after them."""
 
     seed: int
     rounds: list[Round]
     start: WalkMeans
-    """Of the policy that every method begins with."""
+    """Evaluation of the policy that all methods of the seed begin with."""
     end: WalkMeans
-    """Of the policy after the last round."""
+    """Evaluation of the policy after the last round."""
 
 
 def check(args: Args) -> None:
-    """Checks the arguments, those of every run among them.
+    """Checks the arguments, and the options of every run that they lead to, before anything is compiled.
 
     Raises:
       ValueError: names the field, the value and what is allowed.
@@ -101,11 +106,12 @@ def check(args: Args) -> None:
 
 
 def transfer_of(args: Args, method: str, seed: int) -> Transfer:
-    """Returns the run of one method with one seed, as `experiments.sim2real` would play it.
+    """Returns the options of one method with one seed, with which `experiments.sim2real` would play the same run.
 
     Args:
       args: of the benchmark.
-      method: one of `METHODS`; `oracle` is `dr` around what the stand-in has, as far as the simulator can have it.
+      method: one of `METHODS`. `oracle` is `dr` with a small radius around the stand-in's own masses and friction; its
+        delay and lag cannot be set in the simulator.
       seed: of everything random.
     """
     body = Body()
@@ -125,14 +131,17 @@ def transfer_of(args: Args, method: str, seed: int) -> Transfer:
         model=args.model,
         noise=args.noise,
         preset=args.preset,
-        # Falls cost the stand-in nothing, and how many there are is what is measured.
+        # The stand-in cannot break, and the number of falls is a result, so walks are never withheld.
         terms=Terms(walk_s=args.walk_s, force=True, timeout_s=_ANSWER_S, seed=seed),
         **how | {"start": tuple(f"{name}={value:g}" for name, value in how["start"].items())},
     )
 
 
 def prepare(args: Args, programs: Programs, seed: int) -> None:
-    """Trains the policy that every method of a seed starts with: the one that ships, trained on at wrong masses.
+    """Trains the policy that all methods of a seed start with, unless an earlier call did.
+
+    It is the policy that ships, trained further in the nominal model with the wrong masses. So it fits a simulator
+    that does not fit the robot, as in the paper.
 
     Args:
       args: of the benchmark.
@@ -152,10 +161,12 @@ def prepare(args: Args, programs: Programs, seed: int) -> None:
 
 @contextmanager
 def stand_in(folder: Path):
-    """Runs the stand-in robot as a process of its own for the length of a `with` block.
+    """Runs the stand-in robot as a process of its own for the duration of a `with` block.
+
+    A separate process shares nothing with the learner but files, as a real robot would.
 
     Args:
-      folder: where it looks for requests; what it prints goes into `robot_NAME.log` beside the folder.
+      folder: where it looks for requests; its output goes into `robot_NAME.log` beside the folder.
     """
     folder.mkdir(parents=True, exist_ok=True)
     options = ["--folder", str(folder.resolve()), "--idle-s", str(_DAY_S)]
@@ -170,12 +181,12 @@ def stand_in(folder: Path):
 
 
 def evaluate(args: Args, programs: Programs, policy: Path) -> WalkMeans:
-    """Has the stand-in walk with a policy, in walks that nothing is learnt from, and summarises them.
+    """Lets the stand-in walk with a policy, in walks from which nothing is learnt, and summarises them.
 
     Args:
-      args: of the benchmark; `evaluation` walks of `walk_s` are asked for.
-      programs: whose learner loads the policy.
-      policy: its folder; the walks are kept in `round_evaluation` beside it.
+      args: of the benchmark; `evaluation` walks of `walk_s` seconds are requested.
+      programs: their learner loads the policy.
+      policy: folder of the policy. The walks are kept in `round_evaluation` beside it, where a second call finds them.
     """
     place = policy.parent / "round_evaluation"
     found = place / "evaluation.json"
@@ -191,15 +202,21 @@ def evaluate(args: Args, programs: Programs, policy: Path) -> WalkMeans:
 
 
 def main(args: Args) -> None:
-    """Plays what has not been played, evaluates, prints and draws."""
+    """Plays and evaluates all runs that are not finished, prints a table, and writes summary.json and fig6.png.
+
+    Raises:
+      ValueError: an option is wrong, the folder holds another benchmark, or the stand-in does not answer.
+    """
     check(args)
     checkpoint.set_up_compiler(preset(args.preset).xla_flags)
     identity = asdict(args) | {"model_sha256": args.model and corrected.read(args.model).digest}
+    # Other processes may play other methods and seeds in the same folder.
     for option in ("out", "methods", "seeds"):
         del identity[option]
     checkpoint.open_run(args.out, identity)
     first = transfer_of(args, "ours", 0)
     programs = transfers.compile_programs(first)
+    # The first policy is trained in the nominal model, also where the methods then learn in a corrected one.
     nominal = programs if args.model is None else transfers.compile_programs(replace(first, model=None))
     results: dict[str, list[Outcome]] = {name: [] for name in args.methods}
     for seed in args.seeds:
@@ -217,16 +234,12 @@ def main(args: Args) -> None:
 
 
 def show(args: Args, results: dict[str, list[Outcome]]) -> None:
-    """Prints a table with a row for every method.
-
-    Args:
-      args: of the benchmark.
-      results: outcomes by method; numbers are means over their seeds.
-    """
+    """Prints a table with a row for every method: means over seeds, before the first round and after the last."""
     model = f"in {args.model}, " if args.model else ""
-    title = f"{model}masses at {args.mass:g}X, mean over {len(args.seeds)} seed(s), {args.evaluation} walks each"
+    title = f"{model}masses start at {args.mass:g}X, mean over {len(args.seeds)} seed(s), {args.evaluation} walks each"
     table = Table(title=title)
-    for column in ("method", "return", "share that falls", "power, W", "masses at the end", "robot's walks", "falls"):
+    columns = "method", "return", "share that falls", "power, W", "masses at the end", "walks to tune", "falls in them"
+    for column in columns:
         table.add_column(column, justify="left" if column == "method" else "right")
     for name, runs in results.items():
         change = [

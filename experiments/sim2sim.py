@@ -166,6 +166,7 @@ class Runner:
             if index:
                 state, info = step(jax.random.fold_in(key_steps, index), state)
                 self._check_walked(info)
+            # The same key for every evaluation: commands and resets are the same, so returns compare.
             value, falls = self._learner.evaluate(key_evaluate, state.policy, self._play)
             line = {"method": name, "seed": seed, "tuning": index, "return": value, "falls": falls}
             line |= self._describe(state.dist) | (report.tuning(info) if info is not None else {})
@@ -173,6 +174,7 @@ class Runner:
 
     def _check_walked(self, info: tuner.Info) -> None:
         verdict = info.verdicts[int(info.calls) - 1] if info.calls else Verdict.ACCEPT
+        # Further tunings would measure the same falls, since nothing was learnt from these.
         if verdict == Verdict.NOT_FINITE and info.measured_falls == self._learner.preset.tuner.set_episodes:
             raise ValueError(
                 f"target: every measured episode fell or broke within {self._learner.preset.tuner.dvm.window} steps, "
@@ -185,6 +187,7 @@ class Runner:
         return {
             "estimate": {name: float(value) for name, value in centre.items()},
             "radii": {name: float(value) for name, value in dist.radius.items()},
+            # Relative for multipliers, absolute for offsets, which may be zero.
             "param_error": {
                 name: abs(float(value) / truth[name] - 1)
                 if self._learner.entries[name].log

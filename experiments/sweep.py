@@ -106,6 +106,7 @@ def program(args: Args, learner: Learner, policy: Policy) -> Callable:
         knobs = tuner.knobs().replace(step_size=step_size, widen_factor=widen_factor, level=level)
         begin = dist.replace(radius=dict.fromkeys(dist.radius, radius))
         state = fixed.init(policy, begin, knobs)
+        # Lanes are rows of one float array, so the seed comes as a float.
         state, info = fixed.run(jax.random.PRNGKey(seed.astype(int)), state, learner.preset.sweep_tunings)
         # The policy is the same in every lane, and returning it would copy it as often.
         return state.dist, info

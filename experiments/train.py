@@ -16,7 +16,7 @@ from experiments.walking.policies import policy_config, walk
 
 @dataclass(frozen=True, kw_only=True)
 class Args:
-    """Trains a policy that makes BITeno walk, from scratch, and saves it."""
+    """Trains BITeno to walk from scratch with PPO, and saves the policy for the other commands."""
 
     out: Path
     """Folder of the policy: orbax checkpoint, config.json, curve.json, curve.png."""

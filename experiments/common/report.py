@@ -45,6 +45,7 @@ def tuning(info: Info) -> dict:
     """
     calls = int(info.calls)
     order = dists.names(info.dist)
+    # Compiled arrays have room for the largest number of gate calls; only the first `calls` entries were made.
     gate = {name: np.asarray(value)[:calls] for name, value in info.gate.items()}
     update = {
         name: dict(zip(order, np.asarray(info.update[name]).tolist(), strict=True))

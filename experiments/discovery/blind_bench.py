@@ -1,7 +1,7 @@
-"""The blind benchmark: writes the log of a robot that hides something, has discovery answer, and scores the answer.
+"""The blind benchmark: writes the log of a robot with a hidden effect, lets discovery answer, and scores the answer.
 
-The truth goes into a folder of its own, `sealed`, which `Bench.scored` alone opens. Every case is a file, so a
-benchmark that is stopped goes on where it was, and several processes may share its cases.
+The truth goes into a folder of its own, `sealed`, which only `Bench.scored` opens. Every case is a file, so an
+interrupted benchmark continues where it stopped, and several processes may share its cases.
 """
 
 import json
@@ -31,17 +31,20 @@ from jaxtune.discovery import workflow
 from jaxtune.discovery.noise_floor import Calibration, left_by_prior, prior_slopes
 from jaxtune.discovery.simulation import residuals
 
-_HALVINGS = 6  # of the interval in which a size is searched: the severity is then right to a tenth
+_HALVINGS = 6  # of the interval in which an effect's size is searched; the severity is then right to about a tenth
 
 
 class Bench:
-    """The cases of one size: their logs, truths, answers and scores, each in a file.
+    """The cases of a benchmark: their logs, truths, answers and scores, each in a file.
+
+    Call `answer` for every case in `cases`, then `report`.
 
     Args:
       out: folder of the benchmark.
       size: one of `blind_cases.SIZES`.
-      seed: of everything random; a seed whose cases were looked at measures nothing any more.
-      nominal_error: by how much nominal parameters are wrong.
+      seed: of everything random. Use a new one for a measurement: after somebody has looked at the cases of a seed and
+        improved discovery with them, they are no test any more.
+      nominal_error: relative error of the nominal parameters.
     """
 
     def __init__(self, out: Path, size: str, seed: int, nominal_error: float):
@@ -64,25 +67,35 @@ class Bench:
         return [Case(number, *listed[index]) for number, index in enumerate(order)]
 
     def record(self, truth: Truth, seed: int, noise: bool = True) -> Log:
-        """Records the log of a robot that hides something (or nothing), with its own wrong nominal parameters."""
+        """Records the log of a robot with a hidden effect, or with none, and with its own wrong nominal parameters.
+
+        Args:
+          truth: what is hidden.
+          seed: of the robot's parameters and of noise.
+          noise: False leaves readings exact, to measure the effect alone.
+        """
         log = record(
             self.spec, self.size.joints, self.motions, self.controller, truth, self._nominal_error, seed, noise
         )
         return replace(log, robot=self.size.model)
 
     def build_question(self, log: Log, horizons: Sequence[float] = HORIZONS_S, null_logs: int = 0) -> Question:
-        """Builds the question that discovery is asked, from a log and the nominal model, with shared programs.
+        """Builds the question for discovery from a log and the nominal model; all cases share compiled programs.
 
         Args:
           log: of a case.
           horizons: lengths of the segments in s.
-          null_logs: number of simulated null logs; none where a calibration is at hand.
+          null_logs: number of simulated null logs; zero if `calibration` takes their place.
         """
         return build_question(log, self.spec, horizons, null_logs, plain=self.rig)
 
     @cached_property
     def calibration(self) -> Calibration:
-        """Noise floor and thresholds of this robot and motion, from simulated null logs; computed once and kept."""
+        """Noise floor and thresholds for this robot and these motions, from simulated null logs.
+
+        They are computed once and kept in `calibration.npz`, because computing them takes as long as a discovery and
+        all cases share robot, motions and noise.
+        """
         path = self._out / "calibration.npz"
         if not path.exists():
             question = self.build_question(self.record(Truth(None), 10_000), null_logs=self.size.null_logs)
@@ -107,7 +120,12 @@ class Bench:
             return Calibration(floors, float(saved["gain"]), float(saved["penalty"]))
 
     def truth(self, case: Case) -> tuple[Truth, float]:
-        """Draws where a case's effect hides and searches its size; returns both, and the severity that was reached."""
+        """Draws the place of a case's effect, and searches the size at which it has the severity of the case.
+
+        Returns:
+          The hidden effect with place and size, and the severity that was reached, in floor units. It may be less than
+          that of the case, because sizes are bounded.
+        """
         if case.effect is None:
             return Truth(None), 0.0
         rng = np.random.default_rng((self._seed, case.number))
@@ -115,10 +133,12 @@ class Bench:
         bodies = [self.spec.joint(name).parent.name for name in self.size.joints]
         places = tuple(bodies if on == "body" else self.size.joints)
         place = str(rng.choice(places))
+        # A loose mass hangs below a shank or a forearm.
         if case.effect == "loose_foot":
             place = str(rng.choice([name for name in self.size.joints if "knee" in name or "elbow" in name]))
         pair = place.replace("left", "right")
         chosen = (place, pair) if pair != place and rng.uniform() < 0.2 else (place,)
+        # Bisection of the logarithm, since sizes span orders of magnitude.
         severity = self.severity_of(case, chosen)
         low, high = np.log(SIZE_BOUNDS[case.effect])
         for _ in range(_HALVINGS):
@@ -130,8 +150,13 @@ class Bench:
     def severity_of(self, case: Case, places: tuple[str, ...]) -> Callable[[float], float]:
         """Makes the function from an effect's size to its severity at these places.
 
-        Severity is how far the effect moves the worst joint's positions, in floor units, without noise and after the
-        nominal parameters were fitted again: what they make up for within their priors cannot be seen by anyone.
+        Severity is the rms by which the effect changes the positions of the most affected joint, in floor units. It is
+        measured without noise and after the nominal parameters were fitted again: what they can imitate within their
+        priors no method can distinguish from wrong parameters.
+
+        Args:
+          case: its effect and seed.
+          places: joints or bodies that have the effect.
         """
         main = sorted(self.calibration.floors)[len(self.calibration.floors) // 2]
         (floors, weight), seed = self.calibration.floors[main], self.seed(case)
@@ -140,12 +165,13 @@ class Bench:
         zero = np.zeros(problem.axes)
         slope = prior_slopes(problem, main) / floor[..., None]
         plain = residuals(problem, zero, problem.data["train"][main])[0]
-        positions = slice(-len(self.size.joints), None)
+        positions = slice(-len(self.size.joints), None)  # the last columns of a residual are q
 
         def severity(size: float) -> float:
             log = self.record(Truth(case.effect, places, size), seed, noise=False)
             segments = self.build_question(log, (main,)).problem.data["train"][main]
             moved = (residuals(problem, zero, segments)[0] - plain) / floor
+            # A robot whose simulation diverges is more severe than any wanted severity.
             if not np.isfinite(moved).all():
                 return np.inf
             left = left_by_prior(moved, slope, weight)
@@ -154,11 +180,15 @@ class Bench:
         return severity
 
     def seed(self, case: Case) -> int:
-        """Returns the seed of a case's robot."""
+        """Returns the seed of a case's robot, which no other case and no benchmark with another seed has."""
         return 1000 * (self._seed + 1) + case.number
 
     def write(self, case: Case) -> Path:
-        """Writes a case's log, and its truth into the folder that only `scored` reads; returns the log's folder."""
+        """Writes a case's log, and its truth into the folder that only `scored` reads, unless they exist.
+
+        Returns:
+          Folder of the log.
+        """
         folder, sealed = self._out / "logs" / f"case_{case.number:03d}", self._sealed(case)
         if not sealed.exists():
             truth, severity = self.truth(case)
@@ -177,7 +207,13 @@ class Bench:
         return self._out / "sealed" / f"case_{case.number:03d}.json"
 
     def answer(self, case: Case) -> dict:
-        """Has discovery answer a case, or reads its answer; it sees the log, the nominal model and the calibration."""
+        """Lets discovery answer a case, or reads an earlier answer.
+
+        Discovery gets the log, the nominal model and the calibration, and nothing of the truth.
+
+        Returns:
+          Content of `summary.json`, and the best hypothesis that was rejected.
+        """
         path = self._out / "answers" / f"case_{case.number:03d}.json"
         if not path.exists():
             folder = self.write(case)
@@ -191,7 +227,11 @@ class Bench:
         return json.loads(path.read_text())
 
     def scored(self) -> list[dict]:
-        """Scores every case that is answered; the one place that opens the truth."""
+        """Scores every case that is answered. No other function opens the truth.
+
+        Returns:
+          Rows of `experiments.discovery.scores.score`, with the number of the `case`.
+        """
         rows = []
         for case in self.cases:
             path = self._out / "answers" / f"case_{case.number:03d}.json"
@@ -201,10 +241,13 @@ class Bench:
         return rows
 
     def report(self, identity: Mapping[str, object]) -> list[dict]:
-        """Writes scores, confusion matrix and page of the cases that are answered; returns the table of rates.
+        """Writes scores, confusion matrix and page of the cases that are answered so far.
 
         Args:
           identity: options of the benchmark, for the page.
+
+        Returns:
+          The table of rates (`experiments.discovery.scores.tally`).
         """
         rows, out = self.scored(), self._out
         lines = tally(rows)

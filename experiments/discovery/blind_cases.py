@@ -1,4 +1,4 @@
-"""What the blind benchmark hides: robots, effects, severities and how many of each, by size."""
+"""The cases of the blind benchmark: which robots, effects and severities, and how many of each, by size."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,6 +10,7 @@ from experiments.discovery.blind_robots import OUTSIDE
 from experiments.discovery.scores import SEVERITIES
 
 ARM = Path(__file__).parents[1] / "arm.xml"
+"""The two-joint arm that is the example of a user's own robot."""
 
 SIZE_BOUNDS = {
     "coulomb": (0.01, 10.0),
@@ -40,35 +41,44 @@ SIZE_BOUNDS = {
     "cable_stiffness": (0.1, 500.0),
     "loose_foot": (0.01, 1.5),
 }
-"""Sizes, in the unit of the effect's first parameter, between which a severity is searched; the harmless one first."""
+"""Sizes between which a severity is searched, in the unit of the effect's first parameter. The harmless size is first,
+so for a limit or a stiffness it is the larger one."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """One robot of the benchmark: which effect it hides, and how severe the effect should be."""
+    """One robot of the benchmark with its hidden effect; its place and size are drawn by `Bench.truth`."""
 
     number: int
+    """Position in the shuffled list of cases; it names the files."""
     effect: str | None
+    """Name of the hidden effect; None hides nothing."""
     severity: float
-    """In floor units, of what is hidden alone."""
+    """Intended size of the effect's trace in the log, in floor units; zero if nothing is hidden."""
 
 
 @dataclass(frozen=True)
 class Size:
-    """Which robot, how long its logs are, and what is hidden how often."""
+    """One size of the benchmark: the robot, the length of its logs, and how often what is hidden."""
 
     model: str
-    """Name or path."""
+    """Name of a built-in robot, or path of an MJCF file."""
     joints: tuple[str, ...]
+    """Names of the joints, in the log's order."""
     gains: tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]
-    """kp, kd and torque limit, one for every joint."""
+    """kp in Nm/rad, kd in Nm s/rad and torque limit in Nm, one for every joint."""
     runs: int
+    """Number of runs in a log."""
     seconds: float
+    """Length of a run in s."""
     hidden: tuple[tuple[str, float], ...]
-    """Effects and severities."""
+    """Effects of the library that are hidden, a case each, with their severity in floor units."""
     empty: int
+    """Number of cases that hide nothing, to count false alarms."""
     outside: tuple[tuple[str, float], ...]
+    """Effects outside the library, a case each, with their severity; the right answer is `unnamed`."""
     null_logs: int
+    """Number of simulated null logs, which set the noise floor and the thresholds."""
 
 
 def _spread(names: Sequence[str], count: int) -> tuple[tuple[str, float], ...]:
@@ -95,4 +105,5 @@ SIZES = {
         40,
     ),
 }
-"""`smoke` for CI, `arm` for an hour, `standard` for a night on a CPU, `full` for a GPU or a few nights."""
+"""Sizes by the name that `--size` takes: `smoke` for CI, `arm` for an hour, `standard` for a night on a CPU, `full` for
+a GPU or a few nights."""

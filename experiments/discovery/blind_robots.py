@@ -1,9 +1,10 @@
-"""Robots that hide something, for the blind benchmark.
+"""Robots with a hidden effect, for the blind benchmark.
 
-Nothing here uses what discovery fits. MuJoCo C moves the robot with a step, an integrator and friction cones of its
-own. The controller ticks at its rate, late by a jitter, and holds its torque. Friction is a bristle model (LuGre),
-motors saturate smoothly, lags are of second order, play and springs are joints of their own. Readings are noisy and
-rounded.
+This module shares no simulation code with discovery, and models effects in other forms than the library: a benchmark
+that shares forms with the fitter would measure the sharing. The robot is simulated in MuJoCo C with another time step,
+integrator and friction cone. The controller ticks with a jitter and holds its torque between ticks. Friction is a
+bristle model (LuGre), motors saturate smoothly, lags are of second order, and play and springs are additional joints.
+Readings are noisy and rounded.
 """
 
 from collections.abc import Sequence
@@ -18,8 +19,8 @@ from experiments.discovery.excitation import TargetRun, scaled
 
 _STEP_S = 0.0004
 _BRISTLE = 2000.0  # 1/rad: one over the displacement at which bristles slip
-_ENCODER_RAD = 2 * np.pi / 2**14
-_SPEED_NOISE, _SPEED_QUANTUM = 0.01, 0.005
+_ENCODER_RAD = 2 * np.pi / 2**14  # 14 bits, common for joint encoders
+_SPEED_NOISE, _SPEED_QUANTUM = 0.01, 0.005  # standard deviation and rounding of joint velocities, rad/s
 
 OUTSIDE = ("cogging", "temperature_fade", "cable_stiffness", "loose_foot")
 """Effects that the library does not have, so that the right verdict is `unnamed`."""
@@ -27,12 +28,14 @@ OUTSIDE = ("cogging", "temperature_fade", "cable_stiffness", "loose_foot")
 
 @dataclass(frozen=True)
 class Truth:
-    """What is hidden in a robot; only the scorer reads it."""
+    """What is hidden in a robot. Only the scorer reads it; discovery never does."""
 
     effect: str | None
+    """Name of the effect, of the library or of `OUTSIDE`; None hides nothing."""
     places: tuple[str, ...] = ()
+    """Names of the joints or bodies that have it."""
     size: float = 0.0
-    """Of the first parameter, in its unit."""
+    """Value of the effect's first parameter, in its unit."""
 
 
 def record(
@@ -45,17 +48,17 @@ def record(
     seed: int,
     noise: bool = True,
 ) -> Log:
-    """Plays target runs on a robot that hides something, and returns the log that a user would have recorded.
+    """Plays target runs on a robot with a hidden effect, and returns the log that a user would have recorded.
 
     Args:
       spec: the nominal model.
       joints: names, in the log's order.
-      motions: target runs.
-      controller: of the joints; runs have shares of its gains.
+      motions: target runs, of `experiments.discovery.excitation`.
+      controller: of the joints; each run uses its share of the gains.
       truth: what is hidden.
-      nominal_error: by how much masses, armatures, dampings, frictions and gains are wrong, as a share.
+      nominal_error: relative error of masses, armatures, dampings and frictions; gains are wrong by a third of it.
       seed: of everything random.
-      noise: whether readings are noisy and rounded; without, the effect alone can be measured.
+      noise: whether readings are noisy and rounded. False gives exact readings, to measure the effect alone.
     """
     rng = np.random.default_rng(seed)
     robot = _Robot(spec, joints, truth, nominal_error, rng)
@@ -83,7 +86,7 @@ def record(
 
 
 class _Robot:
-    """One robot, its wrong parameters and what it hides."""
+    """One robot with its wrong parameters and its hidden effect."""
 
     def __init__(self, spec, joints, truth: Truth, nominal_error: float, rng: np.random.Generator):
         self._truth, self._joints = truth, tuple(joints)
@@ -91,6 +94,7 @@ class _Robot:
         nominal = suspended(spec)
 
         def off() -> float:
+            """Draws a factor that is wrong by half to one and a half times `nominal_error`, up or down."""
             return float(np.exp(rng.choice([-1, 1]) * rng.uniform(0.5, 1.5) * nominal_error))
 
         masses = {nominal.body(i).name: off() for i in range(1, nominal.nbody)}
@@ -116,7 +120,8 @@ class _Robot:
         model.dof_armature[self.dof] *= [off() for _ in joints]
         model.dof_damping[self.dof] *= [off() for _ in joints]
         self._friction = model.dof_frictionloss[self.dof] * np.array([off() for _ in joints])
-        model.dof_frictionloss[:] = 0.0
+        model.dof_frictionloss[:] = 0.0  # `_rub` has it, as a bristle model
+        # Gains are set in a controller and not measured, so they are wrong by less.
         self._gain = np.array([off() for _ in joints]) ** 0.3
         self._at = np.array([name in truth.places for name in joints], float)
         if truth.effect in ("armature", "viscous"):
@@ -129,7 +134,7 @@ class _Robot:
         self._drag = [(model.body(name).id, truth.size) for name in truth.places if truth.effect == "drag"]
 
     def _on_body(self, spec) -> None:
-        """What sits on a link."""
+        """Adds what is hidden on a link: more mass, a payload, or a loose part."""
         truth = self._truth
         if truth.effect == "loose_foot":
             for name in truth.places:
@@ -157,7 +162,7 @@ class _Robot:
                 )
 
     def _split(self, spec, name: str):
-        """A second hinge in series with a joint: play within a range, or a spring."""
+        """Adds a second hinge in series with a joint: with play in a range, or with a spring."""
         joint = spec.joint(name)
         body = joint.parent
         spare = body.add_joint(name=f"{name}_play", axis=joint.axis, pos=joint.pos, type=joint.type)
@@ -172,7 +177,11 @@ class _Robot:
     def play(
         self, motion: TargetRun, controller: Controller, rng: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Plays a target run; returns positions in rad and speeds in rad/s, [rows, joints], before noise."""
+        """Plays a target run.
+
+        Returns:
+          Positions in rad and speeds in rad/s as the sensors see them, [rows, joints] each, before noise.
+        """
         truth, model, at = self._truth, self._model, self._at
         effect, size = truth.effect, truth.size
         data = mujoco.MjData(model)
@@ -185,6 +194,7 @@ class _Robot:
         seconds = size if effect in ("command_delay", "sensor_delay") else 0.0
         behind = round(seconds / _STEP_S)
         read = np.empty((count, 2, len(at)))
+        # Real controllers are late by a part of their period; discovery has to find the timing by itself.
         tick, jitter = 0.0, rng.uniform(0, 0.3) * period
         held = np.zeros(len(at))
         slewed = motion.target[0].copy()
@@ -204,7 +214,7 @@ class _Robot:
                 seen[0] += size * at
             if effect == "sensor_lag":
                 lag_read = np.stack([seen, seen]) if lag_read is None else lag_read
-                share = _STEP_S / (0.5 * size)
+                share = _STEP_S / (0.5 * size)  # two equal stages, each with half of the time constant
                 lag_read[0] += share * (seen - lag_read[0])
                 lag_read[1] += share * (lag_read[0] - lag_read[1])
                 seen = np.where(at > 0, lag_read[1], seen)
@@ -243,12 +253,14 @@ class _Robot:
         return position, speed
 
     def _past(self, seen, step, behind):
+        """Returns the readings of `behind` steps ago; before the start, those of the first step."""
         if step == 0:
             self._line = [seen] * (behind + 1)
         self._line.append(seen)
         return self._line[-1 - behind]
 
     def _motor(self, held, speed, limit, lag, share) -> np.ndarray:
+        """Returns the torque that the motors give for the torque that the controller holds, `share` into the run."""
         effect, size, at = self._truth.effect, self._truth.size, self._at
         torque = held
         if effect == "torque_lag":
@@ -269,7 +281,14 @@ class _Robot:
         return torque
 
     def _rub(self, bristle, speed, torque) -> tuple[np.ndarray, np.ndarray]:
-        """LuGre friction: returns the bristles' deflection and the torque of friction, [joints]."""
+        """Moves the bristles of the LuGre model by a step.
+
+        With deflection z and speed v: dz/dt = v - s |v| z / g(v), torque = s z + d dz/dt. The level is
+        g(v) = slide + (stick - slide) exp(-(v / 0.15)^2), which holds Coulomb, load and Stribeck friction.
+
+        Returns:
+          The bristles' deflection and the torque of friction in Nm, [joints] each.
+        """
         effect, size, at = self._truth.effect, self._truth.size, self._at
         slides = self._friction.copy()
         if effect == "coulomb":
@@ -289,6 +308,7 @@ class _Robot:
         return bristle, np.where(there, stiffness * bristle + damping * np.where(np.abs(speed) < 0.05, rate, 0.0), 0.0)
 
     def _outside(self, position, now) -> np.ndarray:
+        """Returns torques in Nm that depend on position alone: a push, cogging, or a cubic cable spring."""
         effect, size, at = self._truth.effect, self._truth.size, self._at
         if effect == "constant_push":
             return size * at

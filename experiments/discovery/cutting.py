@@ -1,4 +1,4 @@
-"""Logs cut into the segments that discovery works on, by split and horizon."""
+"""Cuts logs into the segments that discovery works on, by split (train, select, sealed) and horizon."""
 
 from collections.abc import Sequence
 
@@ -11,13 +11,15 @@ from envs.regimes import regimes
 from jaxtune.discovery.problem import Segments
 
 BIN_S = 0.01
-"""Time over which residuals are averaged."""
+"""Time in s over which residuals are averaged."""
 
-_LEAST_SEGMENTS = 3  # of a split: fewer cannot be resampled
+_LEAST_SEGMENTS = 3  # of a split: a bootstrap needs a few to draw from
 
 
 def cut_log(log: Log, dt: float, signals: Sequence[str], horizons: Sequence[float]) -> dict[str, dict[float, Segments]]:
-    """Cuts a log into segments, and labels every row with the regime of its joints.
+    """Cuts a log into segments of each horizon, and labels every row with the motion regime of its joints.
+
+    Each segment is simulated from its measured first state, so that errors do not add up over a whole run.
 
     Args:
       log: measured or simulated.
@@ -43,7 +45,7 @@ def cut_log(log: Log, dt: float, signals: Sequence[str], horizons: Sequence[floa
             if mine.sum() < _LEAST_SEGMENTS:
                 raise ValueError(
                     f"runs: '{split}' has {mine.sum()} segment(s) of {horizon:g} s, expected {_LEAST_SEGMENTS} or "
-                    "more: record longer runs, more of them, or ask for shorter horizons"
+                    "more: record longer runs or more of them, or choose shorter horizons"
                 )
             data[split][horizon] = Segments(
                 inputs=jax.tree.map(lambda leaf, mine=mine: leaf[mine], cut.segments),

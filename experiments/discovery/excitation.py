@@ -1,8 +1,9 @@
-"""Motion in which missing effects can be distinguished, for a robot that is suspended or clamped.
+"""Designs motions that make missing effects distinguishable, for a robot that is suspended or clamped.
 
-Every run is a medley about one posture at one controller gain: slow triangular reversals, a chirp to 10 Hz, steps that
-saturate where the controller can, and a swing with the motors off. Postures and gains differ from run to run, so that a
-log splits by condition with every kind of motion in every part.
+Every run moves about one posture with one controller gain. It consists of slow triangular reversals (friction,
+backlash), a chirp to 10 Hz (delay, lag, inertia), steps that may saturate the motors (torque limits), and a swing with
+the motors off (mass and friction without the actuators). Posture and gain differ from run to run, so that a log can be
+split by condition, with every kind of motion in every part.
 """
 
 from collections.abc import Sequence
@@ -15,18 +16,21 @@ from envs.logs import Controller
 from envs.models import suspended
 
 _CHIRP_HZ = (0.5, 10.0)
-_SHARES = {"triangle": 0.35, "chirp": 0.3, "steps": 0.2, "swing": 0.15}
+_SHARES = {"triangle": 0.35, "chirp": 0.3, "steps": 0.2, "swing": 0.15}  # of a run's time
 
 
 @dataclass(frozen=True)
 class TargetRun:
-    """What the robot is asked to do in one run of an excitation."""
+    """The joint targets of one run, before anything is measured; a robot or a simulation plays it."""
 
     name: str
+    """Name of the run, which is that of its file."""
     condition: str
+    """Posture and gain of the run; runs of one condition belong to one split."""
     gain: float
-    """Share of the controller's gains."""
+    """Factor on kp and kd of the joint controllers in this run."""
     split: str
+    """train, select (validation) or sealed (held-out test)."""
     time: np.ndarray
     """[rows] s"""
     target: np.ndarray
@@ -44,8 +48,8 @@ def excitation(
       spec: the robot; postures are drawn within its joint ranges.
       joints: names, in the order of the targets' columns.
       runs: number of runs, 4 or more.
-      seconds: length of a run.
-      rate_hz: rows a second.
+      seconds: length of a run in s.
+      rate_hz: rows per second.
       seed: of postures, paces and steps.
 
     Returns:
@@ -55,7 +59,7 @@ def excitation(
       ValueError: fewer runs than can be split.
     """
     if runs < 4:
-        raise ValueError(f"runs: got {runs}, expected 4 or more: two to train on, one to select by and one to seal")
+        raise ValueError(f"runs: got {runs}, expected 4 or more: two for train, one for select and one for sealed")
     rng = np.random.default_rng(seed)
     low, high, home = _ranges(suspended(spec), joints)
     splits = ("train", "select", "train", "sealed")
@@ -65,7 +69,7 @@ def excitation(
         room = np.minimum(np.minimum(high - posture, posture - low), 0.6)
         target, enabled = _medley(posture, np.maximum(room, 0.05), seconds, rate_hz, rng)
         split = splits[number % len(splits)]
-        # Every split gets both gains, the one run of four to select by the lower.
+        # The gain alternates within every split. Of four runs one is for select, and it has the lower gain.
         earlier = sum(motion.split == split for motion in motions)
         gain = (1.0, 0.5)[(earlier + (split == "select")) % 2]
         motions.append(
@@ -118,6 +122,9 @@ def _medley(posture, room, seconds, rate_hz, rng) -> tuple[np.ndarray, np.ndarra
 
 
 def scaled(controller: Controller, gain: float) -> Controller:
-    """Returns a controller with a share of its proportional and damping gains; limits stay."""
+    """Returns a controller whose proportional and derivative gains are multiplied by a factor; limits stay.
+
+    Two gains make effects of the controller (delay, gain error) distinguishable from those of the body.
+    """
     gains = {name: values * (gain if name in ("kp", "kd") else 1.0) for name, values in controller.gains.items()}
     return Controller(kind=controller.kind, rate_hz=controller.rate_hz, gains=gains)

@@ -1,4 +1,4 @@
-"""What discovery tries: every effect of the library at every place alone, at left/right pairs, and at all places."""
+"""Lists the hypotheses of discovery: every effect at every place alone, at left and right pairs, and at all places."""
 
 from collections.abc import Mapping, Sequence
 
@@ -12,14 +12,14 @@ from jaxtune.types import Effect
 def hypotheses(
     axes: Sequence[Axis], places: Mapping[str, Sequence[str]], rows: Mapping[str, Effect]
 ) -> tuple[Hypothesis, ...]:
-    """Lists the hypotheses about a rig, in the order of the library.
+    """Lists the hypotheses about a robot, in the order of the library.
 
-    An effect at several places has the same physical size at each of them, so a hypothesis is one direction per
-    parameter through all its places.
+    An effect at several places has the same physical size at each of them. So a hypothesis has one direction in the
+    rig's coordinates for each parameter, and this direction passes through all its places.
 
     Args:
-      axes: coordinates of the rig.
-      places: names of places by what an effect may be on.
+      axes: coordinates of the rig (the simulator with all effects built in).
+      places: names of all joints, bodies and so on, by the kind of place that an effect may be on.
       rows: effects that are tried, by name.
     """
     index = {(axis.effect, axis.parameter, axis.place): number for number, axis in enumerate(axes)}
@@ -29,20 +29,28 @@ def hypotheses(
 
 
 def place_sets(places: Sequence[str]) -> list[tuple[str, ...]]:
-    """Lists where an effect is tried: each place alone, a left place with its right one, and all together."""
+    """Lists the sets of places at which an effect is tried: each place alone, left and right pairs, and all together.
+
+    Pairs and all places are common in robots (the same motor in both knees), and one size for all of them is easier to
+    confirm than a size for each.
+    """
     pairs = [(one, one.replace("left", "right")) for one in places if "left" in one]
     sets = [(place,) for place in places] + [pair for pair in pairs if pair[1] in places]
     return sets if len(places) < 2 or tuple(places) in sets else [*sets, tuple(places)]
 
 
 def timing_directions(axes: Sequence[Axis], control_hz: float) -> np.ndarray:
-    """Returns half a period of the controller as a delay of all readings, and as one of all targets, [2, axes].
+    """Returns two directions in the rig's coordinates: a delay of all readings, and a delay of all targets.
 
-    Nobody knows when the controller looked and acted within its period, so discovery leaves both free everywhere.
+    A log does not say when within its period the controller read and acted. So discovery leaves both delays free under
+    every hypothesis; otherwise `command_delay` or `sensor_delay` would be named for a robot that has neither.
 
     Args:
       axes: coordinates of the rig.
-      control_hz: rate of the controller.
+      control_hz: rate of the controller in Hz.
+
+    Returns:
+      [2, axes], each of the size of half a period.
     """
     late = [[axis.effect == effect for axis in axes] for effect in ("sensor_delay", "command_delay")]
     return np.array(late, float) * 0.5 / control_hz
@@ -73,8 +81,11 @@ def _hypothesis(axes: Sequence[Axis], index: Mapping, row: Effect, places: tuple
 
 
 def _probes(row: Effect) -> np.ndarray:
-    """Coordinates [probes, parameters] at which the screen looks: shapes stay zero, several parameters are tried
-    singly."""
+    """Returns the coordinates [probes, parameters] at which the screen simulates an effect.
+
+    Shape parameters, such as the speed scale of Stribeck friction, stay zero, since they mean nothing without a size.
+    If an effect has several sizes (x, y, z), each is tried alone.
+    """
     free = [number for number, parameter in enumerate(row.parameters) if not parameter.shape]
     if len(free) > 1:
         probes = np.zeros((len(free), len(row.parameters)))

@@ -1,4 +1,4 @@
-"""Tells a person what discovery found: a page with its pictures in it, and tables on the console."""
+"""Reports a discovery to a person: an HTML page with its plots, and tables on the console. Verdict and advice first."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,16 +17,16 @@ VERDICTS = {
     "no_missing_effect": "Nothing is missing: the model explains these logs down to the noise floor.",
     "unnamed": "Something is missing that no effect of the library explains.",
 }
-"""What each verdict means."""
+"""What each verdict means, in one sentence."""
 
 ADVICE = {
-    "named": "Train and tune in the corrected model (--model OUT/model). Where an effect is not distinguishable from "
-    "others, record the experiment in its row first if the difference matters to you.",
+    "named": "Train and tune in the corrected model (--model OUT/model). If an effect is not distinguishable from "
+    "others and the difference matters to you, first record the experiment in its row.",
     "parameter_change": "Use the corrected model (--model OUT/model), and check the parameter on the robot.",
     "no_missing_effect": "Keep the model. If a policy still fails on the robot, look at what these logs cannot show: "
     "contact, the free base, commands and delays on the way to the controller.",
-    "unnamed": "Look at the joint and regime where the gap is largest. The model that was saved has a torque without a "
-    "name there: it may simulate better, and it explains nothing.",
+    "unnamed": "Look at the joint and regime where the gap is largest. The saved model has a torque without a name "
+    "there. It explains nothing; use it only if its gap is smaller than the nominal model's.",
 }
 """What to do next, by verdict."""
 
@@ -37,9 +37,9 @@ def write(path: Path, log: Log, question: Question, result: Result, summary: dic
     """Writes the page; text that comes from the log is escaped.
 
     Args:
-      path: of the HTML file, which holds its pictures.
+      path: of the HTML file; its plots are embedded.
       log: what was measured.
-      question: what was asked; its rig knows the effects' sentences.
+      question: the problem that discovery worked on; its rig has the sentences that describe effects.
       result: what was found.
       summary: of `experiments.discovery.summary.summarise`.
       free: of `experiments.discovery.summary.free_runs`.
@@ -74,13 +74,13 @@ def show(console: Console, question: Question, summary: dict, free: dict) -> Non
 
     Args:
       console: where it is printed.
-      question: what was asked.
+      question: the problem that discovery worked on.
       summary: of `experiments.discovery.summary.summarise`.
       free: of `experiments.discovery.summary.free_runs`.
     """
     console.print(f"[bold]{summary['verdict']}[/bold]: {VERDICTS[summary['verdict']]}")
     console.print(ADVICE[summary["verdict"]])
-    table = Table("effect", "place", "value (95 % interval)", "not distinguishable from", "experiment")
+    table = Table("effect", "place", "value (95 % interval)", "not distinguishable from", "experiment to decide")
     for effect in _presented(summary, question):
         values = ", ".join(
             f"{name} {value['value']:.4g} ({value['low']:.4g} to {value['high']:.4g})"
@@ -90,17 +90,17 @@ def show(console: Console, question: Question, summary: dict, free: dict) -> Non
         table.add_row(effect["name"], effect["place"], values, others, effect["experiment"])
     if table.row_count:
         console.print(table)
-    table = Table("sealed runs", "nominal", "parameters fitted", "corrected")
+    table = Table("error on held-out runs", "nominal model", "parameters fitted", "corrected model")
     gap, error = summary["gap"], free["error_rad"]["sealed"]
-    table.add_row("gap, floor units", *(f"{gap[name]:.2f}" for name in ("before", "null", "after")))
-    table.add_row("error of whole runs, rad", *(f"{error[name]:.4f}" for name in ("before", "null", "after")))
+    table.add_row("short segments, floor units", *(f"{gap[name]:.2f}" for name in ("before", "null", "after")))
+    table.add_row("whole runs, mean in rad", *(f"{error[name]:.4f}" for name in ("before", "null", "after")))
     console.print(table)
     if summary["not_testable"]:
-        console.print(f"these logs cannot show: {', '.join(summary['not_testable'])}")
+        console.print(f"effects that these logs could not show: {', '.join(summary['not_testable'])}")
 
 
 def _presented(summary: dict, question: Question) -> list[dict]:
-    """Effects and parameter changes with their place in words, the experiment there, and the effect's sentence."""
+    """Returns effects and parameter changes with place in words, experiment there, and a sentence for the effect."""
     found = []
     for effect in [*summary["effects"], *summary["parameter_changes"]]:
         row = question.rig.effects[effect["name"]]
@@ -111,12 +111,12 @@ def _presented(summary: dict, question: Question) -> list[dict]:
 
 
 def in_words(places: Sequence[str], every: Sequence[str], kind: str) -> str:
-    """Names places briefly: `all joints` instead of six names.
+    """Names places briefly, such as `all joints` in the place of six names, for tables and pages.
 
     Args:
       places: where an effect is.
       every: all places where it could be.
-      kind: what they are (joint, body, foot, robot).
+      kind: of places: joint, body, foot or robot.
     """
     plural = {"body": "bodies", "foot": "feet"}.get(kind, f"{kind}s")
     return f"all {plural}" if len(places) > 1 and set(places) == set(every) else ", ".join(places)

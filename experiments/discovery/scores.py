@@ -1,4 +1,4 @@
-"""Scores of the blind benchmark: what was right in a case, rates with intervals over cases, and a page."""
+"""Scores the blind benchmark: what was right in each case, rates with intervals over all cases, and a page."""
 
 from collections.abc import Mapping, Sequence
 
@@ -15,8 +15,8 @@ def score(truth: dict, answer: dict) -> dict:
     """Compares the answer of one case with its truth.
 
     Args:
-      truth: what was hidden, and how severe it came out.
-      answer: what discovery said, as `summary.json` has it.
+      truth: what was hidden, with its intended severity (`asked`) and the severity that was reached.
+      answer: the answer of discovery, as in `summary.json`.
 
     Returns:
       What was hidden and named; whether name, family, place and reported set are right; gaps in floor units.
@@ -65,8 +65,15 @@ def wilson(hits: int, count: int, z: float = 1.96) -> tuple[float, float]:
 
 
 def tally(rows: Sequence[dict]) -> list[dict]:
-    """Computes the table of rates and means over scored cases, each with its interval and the value to reach."""
-    # Some effects cannot be made as severe as asked.
+    """Computes the table of rates and means over scored cases, each with its interval and the value to reach.
+
+    Args:
+      rows: of `score`.
+
+    Returns:
+      Rows with `measure`, `value`, the ends `low` and `high` of the interval, `count` of cases and `goal`.
+    """
+    # Some effects cannot be made as severe as intended; a weak one that is missed must not count as a strong one.
     hidden = [row for row in rows if row["effect"] in LIBRARY and row["severity"] > 0.7 * row["asked"]]
     outside = [row for row in rows if row["effect"] in OUTSIDE]
     empty = [row for row in rows if row["effect"] is None]
@@ -111,7 +118,7 @@ def _mean(label: str, values: Sequence[float], goal: str) -> dict:
 
 
 def shown(lines: Sequence[dict]) -> list[tuple[str, ...]]:
-    """Formats the table of `tally` as text: measure, value, interval, number of cases and goal."""
+    """Formats the table of `tally` as text for console and page: measure, value, interval, number of cases and goal."""
     return [
         (
             line["measure"],
@@ -138,11 +145,11 @@ def page(identity: Mapping[str, object], done: int, count: int, lines: Sequence[
     return f"""# Blind benchmark of discovery, size `{identity["size"]}`
 
 `python -m experiments.discovery_bench {options}`, {done} of {count} robots.
-Intervals are Wilson's; what was hidden and what was said of every robot is in `scores.json`.
+Intervals are Wilson's. `scores.json` holds, for every robot, what was hidden and what discovery answered.
 
 | measure | value | 95 % interval | cases | to reach |
 |---|---|---|---|---|
 {table}
 
-![what was hidden against what was named](confusion.png)
+![hidden effects against named effects](confusion.png)
 """

@@ -1,4 +1,4 @@
-"""From measured logs and a model to the problem that discovery works on."""
+"""Turns measured logs and a nominal model into the problem that discovery works on."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -19,26 +19,29 @@ from experiments.discovery.hypotheses import hypotheses, timing_directions
 from jaxtune.discovery.problem import Problem
 
 HORIZONS_S = (0.05, 0.15, 0.45)
-"""Lengths of the segments that are simulated, by default."""
+"""Default lengths in s of the segments that are simulated. Short ones stay close to the measurement; long ones show
+biases and delays."""
 
-_LATE_S = 0.004  # a velocity that lags its position by more was filtered, and would pass for a sensor's lag
+_LATE_S = 0.004  # a velocity that lags its position by more was filtered, and would be mistaken for a sensor's lag
 
 
 @dataclass(frozen=True)
 class Question:
-    """A problem, and the robot and runs that its numbers are about."""
+    """A discovery problem together with the robot and the runs that its numbers refer to."""
 
     problem: Problem
+    """What `jaxtune.discovery` works on; it knows numbers, but no robot."""
     rig: Rig
+    """The simulator with every effect built in, which gives coordinates their names and units."""
     splits: Mapping[str, tuple[str, ...]]
-    """Names of the runs by split."""
+    """Names of the runs by split: train, select (validation) and sealed (held-out test)."""
     notes: tuple[str, ...]
-    """Signals that are not used, and why."""
+    """Sentences about signals that are not used, and why."""
 
 
 @dataclass(frozen=True)
 class _Simulator:
-    """Simulates some signals of a rig; equal, so that programs are shared, where the rig is the same."""
+    """Simulates some signals of a rig. Two with the same rig and signals are equal, so they share compiled programs."""
 
     rig: Rig
     signals: tuple[str, ...]
@@ -91,7 +94,9 @@ def build_question(
     seed: int = 0,
     plain: Rig | None = None,
 ) -> Question:
-    """Turns a log and a nominal model into a problem: hypotheses, measured segments, simulated null logs.
+    """Turns a log and a nominal model into a problem: hypotheses, measured segments and simulated null logs.
+
+    It checks that the log can be simulated, before anything is compiled.
 
     Args:
       log: what was measured.
@@ -99,7 +104,10 @@ def build_question(
       horizons: lengths of the segments in s.
       null_logs: number of simulated null logs, which set the noise floor and the thresholds.
       seed: of the null logs.
-      plain: a rig of the same robot and controller rate, from an earlier question, whose compiled programs are used.
+      plain: a rig of the same robot and controller rate, from an earlier question, to reuse its compiled programs.
+
+    Returns:
+      The question.
 
     Raises:
       ValueError: the runs cannot be split, are too short for a horizon, or lack what discovery needs.
@@ -110,6 +118,7 @@ def build_question(
     plain = plain or Rig(spec, log.joints, rate)
     plain.check_matches(log.joints, rate)
     rig = plain.scaled(measure_scales(plain, unsealed))
+    # A signal that some runs lack is not compared, since segments of all runs share one layout.
     signals = tuple(name for name in ("dq", "gravity", "q") if all(name in run.signals for run in log.runs))
     axes = {(axis.effect, axis.place): number for number, axis in enumerate(rig.axes)}
     library = {name: row for name, row in rig.effects.items() if name in LIBRARY}
@@ -153,21 +162,31 @@ def _checked_rate(log: Log, least_s: float) -> float:
 
 
 def without_sealed(log: Log) -> Log:
-    """Returns the log without its sealed runs, which nothing but the proof may see."""
+    """Returns the log without its sealed runs (the held-out test), which only the final proof may use.
+
+    Whatever is estimated from a log, scales and filters included, must be estimated from this.
+    """
     parts = splits(log)
     return replace(log, runs=(*parts["train"], *parts["select"]))
 
 
 def drop_filtered(log: Log) -> tuple[Log, tuple[str, ...]]:
-    """Leaves out velocities that were filtered, because their lag would pass for one of the robot's own.
+    """Leaves out joint velocities that were filtered, because their lag would be mistaken for a sensor's.
+
+    A velocity counts as filtered if it lags the derivative of the position by more than 4 ms in the median run.
+
+    Args:
+      log: as it was read.
 
     Returns:
-      The log, with the rate that its time stamps have, and a note for every signal that was left out.
+      The log, with the row rate of its time stamps in the place of the declared one, and a note for every signal that
+      was left out.
     """
     notes = []
+    # Sealed runs are left out here too: nothing may be decided by them.
     late = [segments.velocity_lag(run) for run in without_sealed(log).runs if "dq" in run.signals]
     if late and np.median(late) > _LATE_S:
-        notes.append(f"dq lags q by {1e3 * np.median(late):.0f} ms: it is filtered, and not used")
+        notes.append(f"dq lags q by {1e3 * np.median(late):.0f} ms, so it was filtered and is not used")
         runs = [replace(run, signals={k: v for k, v in run.signals.items() if k != "dq"}) for run in log.runs]
         log = replace(log, runs=tuple(runs))
     rate = 1.0 / float(np.median([np.median(np.diff(run.time)) for run in log.runs]))

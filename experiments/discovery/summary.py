@@ -1,5 +1,4 @@
-"""What a discovery found: the contents of `summary.json` and `details.json`, and whole runs simulated before and
-after."""
+"""Prepares the result of a discovery for files and pages: `summary.json`, `details.json`, and whole simulated runs."""
 
 from collections.abc import Mapping, Sequence
 
@@ -15,14 +14,14 @@ from jaxtune.discovery.fit import Fit
 from jaxtune.discovery.problem import Hypothesis
 from jaxtune.discovery.result import Result
 
-_SHOWN = 12  # cells in the summary
+_SHOWN = 12  # places with the largest gap that the summary lists
 
 
 def summarise(question: Question, result: Result) -> dict:
-    """Returns the content of `summary.json`, but for times and versions.
+    """Returns the content of `summary.json`, except for times and versions.
 
     Args:
-      question: what was asked.
+      question: the problem that discovery worked on.
       result: what was found.
 
     Returns:
@@ -56,13 +55,14 @@ def summarise(question: Question, result: Result) -> dict:
 
 
 def _effect(rig: Rig, hypothesis: Hypothesis, fit: Fit, errors: np.ndarray, others: Sequence[str]) -> dict:
-    """Describes an effect of a fit: physical values with 95 % intervals, and what would distinguish it from others."""
+    """Describes a fitted effect: physical values with 95 % intervals, and what would distinguish it from its rivals."""
     row = rig.effects[hypothesis.name]
     parameters = {}
     for parameter, direction in zip(row.parameters, hypothesis.directions, strict=True):
         mine = [i for i, free in enumerate(fit.free.directions) if ((free != 0) & (direction != 0)).any()]
         number = int(np.flatnonzero(direction)[0])
         value, scale = fit.vector[number], rig.axes[number].scale
+        # Standard errors of the directions through this coordinate add up in quadrature; 1.96 makes it a 95 % interval.
         error = 1.96 * float(np.sqrt(sum((errors[i] * fit.free.directions[i][number]) ** 2 for i in mine)))
         # A limit or a stiffness that may as well not be there has no upper end.
         least = max(value - error, 1e-12) if parameter.form == "reciprocal" else value - error
@@ -81,11 +81,12 @@ def _effect(rig: Rig, hypothesis: Hypothesis, fit: Fit, errors: np.ndarray, othe
 def free_runs(log: Log, question: Question, result: Result) -> dict:
     """Simulates every run from its first state to its end, with the nominal, the fitted and the corrected model.
 
-    A run that is simulated whole shows what a user of the model will get; discovery itself works on short segments.
+    Discovery works on short segments. Whole runs show how well the model predicts a motion without being corrected by
+    measured states, which is what a user of the model needs.
 
     Args:
       log: what was measured.
-      question: what was asked.
+      question: the problem that discovery worked on.
       result: what was found.
 
     Returns:
@@ -95,6 +96,7 @@ def free_runs(log: Log, question: Question, result: Result) -> dict:
     rig = question.rig
     cut = segments.whole(log.runs, rig.dt)
     play = jax.jit(jax.vmap(lambda value, inputs: rig.simulate(rig.tree(value), inputs)["q"], (None, 0)))
+    # All three models are simulated by one compiled program, which takes their coordinates as an argument.
     vectors = {
         "before": np.zeros(len(rig.axes)),
         "null": result.null.vector,
@@ -134,9 +136,9 @@ def details(question: Question, result: Result, free: dict) -> dict:
     """Returns the content of `details.json`: evidence, tests and proofs behind the summary.
 
     Args:
-      question: what was asked.
+      question: the problem that discovery worked on.
       result: what was found.
-      free: of `free_runs`.
+      free: whole simulated runs, of `free_runs`.
     """
     return {
         "notes": question.notes,

@@ -1,4 +1,4 @@
-"""Checks of a robot's log before anything is learnt from it: what it means, and whose walks it holds."""
+"""Checks a robot's log before anything is learnt from it: what its numbers mean, and which policy has walked."""
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -12,22 +12,27 @@ from envs.logs import Log
 from jaxtune.types import Trajectory
 
 _STRANGE = 0.25
-"""Largest difference between recorded actions and the policy's, rms over rms, that sensor noise and late targets
-cause."""
+"""Largest difference between recorded actions and those of the policy, as rms over rms, that is put down to sensor
+noise and late targets. Beyond it another policy must have walked."""
 
 
 def check_runs(place: Path, log: Log, episodes: int) -> None:
-    """Checks that a log holds one run for every walk that was asked for.
+    """Checks that a log holds one run for every walk that was requested.
 
-    A run that nobody asked for, or that is missing, would change how often the robot is said to have fallen.
+    An additional or a missing run would distort the measured share of falls.
+
+    Args:
+      place: folder of the round, with `request.json` and `log`.
+      log: as it was read.
+      episodes: number of walks that were requested.
 
     Raises:
-      ValueError: names the log, the number of runs and the request.
+      ValueError: the numbers differ; names the log, the number of runs and the request.
     """
     if len(log.runs) != episodes:
         raise ValueError(
             f"{place / 'log'}: got {len(log.runs)} run(s), expected the {episodes} walks that "
-            f"{place / 'request.json'} asks for, in a run each"
+            f"{place / 'request.json'} asks for, as one run each"
         )
 
 
@@ -39,18 +44,20 @@ def check_meaning(
     act: Callable[[jax.Array], jax.Array],
     suspicions: Sequence[tuple[Finding, list[str]]],
 ) -> None:
-    """Checks that a log's numbers mean what they say, and that the round's policy has walked.
+    """Checks that a log's numbers have the meaning that its `meta.yaml` declares, and that the round's policy walked.
+
+    Learning from swapped joints, wrong units or another policy's walks would move the distribution to wrong physics.
 
     Args:
       place: folder of the log, for messages.
       log: as it was read.
       walks: its episodes, [episodes, time].
       task: of the policy that was exported.
-      act: what that policy does for observations [steps, obs], without noise.
-      suspicions: what the log doctor says, with the runs that share it.
+      act: actions [steps, act] of that policy for observations [steps, obs], without noise.
+      suspicions: findings of the log doctor, each with the names of the runs that share it.
 
     Raises:
-      ValueError: most runs have a finding after which numbers mean something else, the log is of a policy with another
+      ValueError: most runs have a finding that changes what the numbers mean, the log is of a policy with another
         reference or scale, or its actions are not the policy's. Names everything that is wrong.
     """
     wrong = [finding.sentence for finding, runs in suspicions if finding.wrong and 2 * len(runs) > len(log.runs)]
@@ -59,7 +66,7 @@ def check_meaning(
     if strange > _STRANGE:
         wrong.append(f"actions differ from what this round's policy does by {strange:.0%} of their size")
     if wrong:
-        raise ValueError(f"{place}: {'; '.join(wrong)} (trust_log learns from it all the same)")
+        raise ValueError(f"{place}: {'; '.join(wrong)} (to learn from it nevertheless, set trust_log)")
 
 
 def _other_policy(found: Mapping, expected: Mapping) -> list[str]:

@@ -1,4 +1,7 @@
-"""How a robot is asked for walks, and how it answers: through files in a folder that both can see."""
+"""Requests walks from a robot and waits for its answer, through files in a folder that both can see.
+
+Files need no network protocol on the robot, and they remain as a record of what was requested and what was answered.
+"""
 
 import time
 from pathlib import Path
@@ -7,20 +10,20 @@ from experiments.common.checkpoint import write_json
 
 _LOOK_S = 1.0  # pause between two looks at the folder
 _QUIET_LOOKS = 3  # a log that has not changed for so many looks is complete
-_RESTLESS_S = 60.0  # how long a log may go on changing after the timeout
+_RESTLESS_S = 60.0  # how long a log may continue to change after the timeout
 _SPARE_S = 0.05  # added to a walk: the reader drops its first tick, and its last where the robot did not fall
 
 
 def request(place: Path, episodes: int, seconds: float, seed: int) -> None:
-    """Asks the robot for walks with the policy in the same folder, by writing `request.json`.
+    """Requests walks with the policy in the same folder, by writing `request.json`.
 
-    The file is written last, so a robot that finds it finds the policy too and may begin at once.
+    Call it after the policy was exported: a robot that finds the request may begin at once.
 
     Args:
       place: folder of the round.
-      episodes: number of walks, a run of the log each.
-      seconds: how much of a walk is wanted.
-      seed: for whatever the robot draws (commands, its own noise in a simulation).
+      episodes: number of walks; each becomes one run of the log.
+      seconds: length of the walks that will be compared, in s; a little more is requested.
+      seed: for whatever the robot draws (commands, and its noise if it is simulated).
     """
     write_json(place / "request.json", {"episodes": episodes, "seconds": seconds + _SPARE_S, "seed": seed})
 
@@ -32,7 +35,7 @@ def wait(place: Path, timeout_s: float) -> None:
 
     Args:
       place: folder of the round, in which the robot writes `log`.
-      timeout_s: how long to wait for the log to appear.
+      timeout_s: how long to wait for the log to appear, in s.
 
     Raises:
       ValueError: the robot has refused (`refused.txt`), has not answered in time, or does not stop writing.
@@ -46,23 +49,23 @@ def wait(place: Path, timeout_s: float) -> None:
             return
         refused = place / "refused.txt"
         if not there and refused.exists():
-            raise ValueError(f"{refused}: {refused.read_text().strip()} (remove the file to ask again)")
+            raise ValueError(f"{refused}: {refused.read_text().strip()} (to repeat the request, remove the file)")
         if not there and waited > timeout_s:
             raise ValueError(
                 f"{place / 'log'}: no log after {timeout_s:g} s, expected one as {place / 'request.json'} asks for; "
-                "put it there and give the same command again"
+                "put the log there and give the same command again"
             )
         if waited > timeout_s + _RESTLESS_S:
             raise ValueError(
-                f"{place / 'log'}: still changes {_RESTLESS_S:g} s after the time that it had, expected files that are "
-                "closed before meta.yaml is written"
+                f"{place / 'log'}: still changes {_RESTLESS_S:g} s after the timeout, expected files that are complete "
+                "before meta.yaml is written"
             )
         before = files
         time.sleep(_LOOK_S)
 
 
 def _content(folder: Path) -> dict[Path, tuple[int, int]]:
-    """Size and time of change of every file, which tell whether anything was written between two looks."""
+    """Returns size and modification time of every file, which show whether anything was written between two looks."""
     found = {}
     for path in folder.rglob("*"):
         try:

@@ -1,8 +1,8 @@
-"""How many of a robot's next walks are expected to end in a fall, and whether simulation may be believed about it.
+"""Estimates how many of a robot's next walks will end in a fall, before they are requested.
 
-Falls are what a robot pays with, so simulation alone counts only where it has earned it: where the gate has accepted
-the last log, and where the tuned simulator has the policy that walked fall about as often as it did. Elsewhere what
-was measured is expected again.
+A fall may break a robot, so the simulated fall rate alone is used only under two conditions. The gate has accepted the
+last log, and in the tuned simulator the policy that walked falls about as often as it did on the robot. Otherwise the
+expected rate is at least the measured one.
 """
 
 from scipy.stats import binom
@@ -13,17 +13,17 @@ from experiments.robot.records import Measured, Prediction, Suspicion, Tuning
 from experiments.walking.learner import summarise_walks
 
 _SURPRISE = 0.2
-"""Smallest p-value at which measured falls agree with simulation. It is large because a handful of walks can rule out
-little: believing a simulator that they merely fail to contradict may cost a robot, doubting it costs one walk."""
+"""Smallest p-value at which measured falls count as agreeing with simulation. It is large because a handful of walks
+can refute little: to trust a wrong simulator may cost a robot, to doubt a right one costs a few walks."""
 
 
 def summarise_log(recorded: Recorded, steps: int, suspected: tuple[Suspicion, ...] = ()) -> Measured:
-    """Summarises the walks of a log, each to its own end.
+    """Summarises the walks of a log: return, falls, power, and records that end too early.
 
     Args:
       recorded: episodes of the log.
-      steps: policy steps that a walk was asked to last.
-      suspected: what the log doctor says of the log.
+      steps: policy steps of a walk as it was requested.
+      suspected: findings of the log doctor, which are passed on to the report.
     """
     walks, power = whole(recorded, steps)
     means = summarise_walks(walks, power)
@@ -41,24 +41,32 @@ def summarise_log(recorded: Recorded, steps: int, suspected: tuple[Suspicion, ..
 def surprise(measured: Measured, simulated: Prediction) -> float:
     """Returns the probability of as many falls as were measured, or more, if the tuned simulator were right.
 
-    A binomial tail, `P(X >= k)` for `X ~ Binomial(n, p)` with the k falls of n walks. The simulated rate p is Laplace's
-    `(falls + 1) / (episodes + 2)`, because few simulated walks without a fall do not make falls impossible.
+    It is the binomial tail `P(X >= k)`, `X ~ Binomial(n, p)`, where k of the n measured walks fell. The simulated rate
+    is p = (falls + 1) / (episodes + 2), Laplace's rule of succession: a few simulated walks without a fall do not make
+    falls impossible.
+
+    Args:
+      measured: the robot's walks.
+      simulated: walks of the same policy in the tuned simulator.
     """
     rate = (simulated.fall_rate * simulated.episodes + 1) / (simulated.episodes + 2)
     return float(binom.sf(measured.ended_early - 1, measured.episodes, rate))
 
 
 def fall_risk(predicted: Prediction, measured: Measured | None = None, tuning: Tuning | None = None) -> float:
-    """Returns the share of the next walks that are expected to end in a fall.
+    """Returns the share of the next walks that are expected to end in a fall, which decides whether they are requested.
 
-    Where the gate has accepted the last log and its falls agree with the tuned simulator, that is the simulated rate.
-    Else it is the larger of the simulated and the measured rate; a record that is cut short counts as a fall. Before
-    anything was measured there is nothing but simulation.
+    If the gate has accepted the last log and its falls agree with the tuned simulator, this is the simulated rate.
+    Otherwise it is the larger of the simulated and the measured rate; a record that is cut short counts as a fall.
+    Before anything was measured, only the simulated rate is available.
 
     Args:
       predicted: simulated walks of the policy that is to walk.
       measured: the last walks of the robot, if there were any.
       tuning: what was learnt from them.
+
+    Returns:
+      A share between 0 and 1.
     """
     if measured is None or tuning is None:
         return predicted.fall_rate

@@ -1,12 +1,12 @@
-"""Plays an exported policy on a robot's computer: NumPy and this file are enough.
+"""Runs an exported policy on a robot's computer, which needs only NumPy and this file.
 
     player = Player("policy.npz")
-    while walking:  # 100 times a second
+    while walking:  # 100 times per second
         target = player.step(velocity=..., command=..., gyro=..., gravity=..., joint=..., joint_velocity=...)
         player.tick()
 
-Numbers and layout come with the policy (`python -m experiments.export`). What is written here a second time, without
-JAX, is compared with the simulator's own observation, clock and reference in the tests.
+`python -m experiments.export` writes the policy with all numbers that are needed here. Observation, clock and reference
+exist a second time in this file, without JAX; tests compare them with the simulator's own.
 """
 
 import json
@@ -16,7 +16,9 @@ import numpy as np
 
 
 class Player:
-    """A policy, its gait clock and what it remembers of its last step.
+    """A policy with its gait clock and its memory of the last step (action and joint target, which it observes).
+
+    Call `step` and then `tick`, once per policy period, and send the targets to the joint controllers.
 
     Args:
       path: of the `.npz` that was exported.
@@ -32,7 +34,7 @@ class Player:
         self.reset(phase)
 
     def reset(self, phase: float = 0.0) -> None:
-        """Forgets the last step, as before a walk.
+        """Forgets the last step and restarts the gait clock; call it before every walk.
 
         Args:
           phase: where the left foot's clock starts, in cycles.
@@ -52,20 +54,23 @@ class Player:
         joint: np.ndarray,
         joint_velocity: np.ndarray,
     ) -> np.ndarray:
-        """Asks the policy what the joints should do until the next step.
+        """Computes the joint targets that hold until the next step.
+
+        The target is `base + action_scale * action`, where the action is the network's output for the observation, and
+        `base` is the reference walk or the standing pose.
 
         Args:
           velocity: [3] m/s, of the trunk's origin, body frame.
-          command: [3] m/s, m/s, rad/s.
+          command: [3] forward in m/s, sideways in m/s, turning in rad/s.
           gyro: [3] rad/s, body frame.
-          gravity: [3] direction of gravity in the body frame.
+          gravity: [3] direction of gravity, unit vector in the body frame.
           joint, joint_velocity: [joints] rad, rad/s, in the order of `meta["joints"]`.
 
         Returns:
           Joint targets [joints], rad. `action` and `phase` are those of this step until `tick` is called.
 
         Raises:
-          ValueError: a reading is not finite; the player remembers what it did before.
+          ValueError: a reading is not finite. The player's memory is unchanged, so the step can be repeated.
         """
         meta = self.meta
         error = np.zeros(len(joint)) if self.target is None else self.target - joint
@@ -80,22 +85,22 @@ class Player:
         return self.target.copy()
 
     def tick(self) -> None:
-        """Advances the gait clock by one policy step. Call it after every `step`, once the targets were sent."""
+        """Advances the gait clock by one policy period; call it once after every `step`."""
         clock = self.meta["clock"]
         self.phase = np.mod(self.phase + clock["hz"] / self.meta["rate_hz"], 1.0)
 
     def network(self, obs: np.ndarray) -> np.ndarray:
-        """Computes the action [act] for an observation [obs]: normaliser, dense layers with ELU, no output
-        squashing."""
+        """Returns the action [act] for an observation [obs]: a normaliser, then dense layers with ELU in between."""
         value = (obs - self._mean) / self._std
         for number, (kernel, bias) in enumerate(self._layers):
             value = value @ kernel + bias
             if number + 1 < len(self._layers):
+                # ELU. Without the minimum, the exponential would overflow in the branch that `where` discards.
                 value = np.where(value > 0, value, np.expm1(np.minimum(value, 0.0)))
         return value
 
     def observe(self, velocity, command, gyro, gravity, joint, joint_velocity, action, error, phase) -> np.ndarray:
-        """Builds the observation [obs] from readings, laid out and scaled as `meta["observation"]` says.
+        """Returns the observation [obs], with the order and the scales that `meta["observation"]` lists.
 
         Args:
           velocity, command, gyro, gravity, joint, joint_velocity: as in `step`.
@@ -118,11 +123,13 @@ class Player:
         return np.concatenate([np.asarray(parts[row["name"]]) * row["scale"] for row in self.meta["observation"]])
 
     def reference(self, phase: np.ndarray, command: np.ndarray) -> np.ndarray:
-        """Computes joint angles [joints], rad, of feet that follow the clock (Raibert's heuristic), by inverse
-        kinematics.
+        """Returns joint angles [joints] in rad of a reference walk in which the feet follow the clock.
+
+        It is Raibert's heuristic: the foot is placed ahead by half of the way that the commanded velocity covers in
+        stance. Inverse kinematics of a leg with two links of equal length give the angles.
 
         Args:
-          phase: [2] cycles; a foot stands below `duty` and swings above.
+          phase: [2] cycles of left and right foot; a foot is in swing above `duty`.
           command: [3] m/s, m/s, rad/s.
         """
         leg, clock = self.meta["leg"], self.meta["clock"]

@@ -1,7 +1,7 @@
-"""Policy files that a robot's computer can run without JAX.
+"""Writes policy files that a robot's computer can run without JAX.
 
-`policy.onnx` is the network with its normaliser, observation in and action out; `policy.npz` holds the same numbers for
-`player.py`, which needs NumPy alone. Both carry under `meta`, as JSON, what is around the network.
+`policy.onnx` is the network from observation to action, with its normaliser. `policy.npz` holds the same numbers for
+`player.py`, which needs only NumPy. Both contain under `meta`, as JSON, everything around the network.
 """
 
 import json
@@ -22,6 +22,9 @@ from jaxtune.ppo import PPO, PPOState
 
 def meta(sizes: Preset) -> dict:
     """Describes everything around the network, for the metadata of the exported files.
+
+    Args:
+      sizes: the preset that the policy was trained with.
 
     Returns:
       Joints, rate, layout and scales of the observation, the gait clock, the reference that an action is added to, and
@@ -72,7 +75,7 @@ def export(out: Path, ppo: PPOState, sizes: Preset) -> None:
     Args:
       out: folder for them, made where it is missing.
       ppo: the learnt policy.
-      sizes: the preset that it was trained with, for what is around the network.
+      sizes: the preset that it was trained with; `meta` takes reference and action scale from it.
 
     Raises:
       ValueError: the package `onnx` is not installed.

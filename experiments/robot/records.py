@@ -1,7 +1,8 @@
-"""What a round predicted, measured and expects, as typed records.
+"""Typed records of what a round predicted, measured and learnt.
 
-The files of a run (`prediction.json`, `measured.json`, `tuning.json`, `summary.json`) hold these records in JSON;
-`experiments.common.checkpoint.as_json` and `from_json` convert. Whether a robot may walk is decided by them alone.
+The files of a run (`prediction.json`, `measured.json`, `tuning.json`, `summary.json`) hold these records as JSON;
+`experiments.common.checkpoint.as_json` and `from_json` convert. The decision whether a robot may walk uses nothing
+else.
 """
 
 from dataclasses import dataclass, field
@@ -9,19 +10,19 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True, kw_only=True)
 class WalkMeans:
-    """Means over walks, simulated or measured, so that a prediction and its measurement have the same fields."""
+    """Means over walks, the same for simulated and measured ones, so that they compare."""
 
     mean_return: float = field(metadata={"key": "return"})
-    """Of a walk, under the weights of Table I."""
+    """Return of a walk, with the reward weights of the paper's Table I."""
     fall_rate: float
     """Share of walks that end in a fall."""
     power_w: float
-    """Mechanical power while the robot is on its feet."""
+    """Mechanical power in W while the robot is on its feet."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Prediction(WalkMeans):
-    """Simulated walks of a policy on robots drawn from a distribution: what the robot's walks should be like."""
+    """A policy's simulated walks on robots drawn from a distribution, which predict the robot's walks."""
 
     episodes: int
     """Number of simulated walks."""
@@ -29,42 +30,42 @@ class Prediction(WalkMeans):
 
 @dataclass(frozen=True, kw_only=True)
 class Suspicion:
-    """Something that the log doctor suspects, once for all runs that share it."""
+    """A suspicion of the log doctor, such as a flipped sign, listed once for all runs that share it."""
 
     sentence: str
-    """What is suspected, for a person."""
+    """The suspicion as a sentence for a person."""
     runs: tuple[str, ...]
-    """Names of the runs."""
+    """Names of the runs that share it."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Measured(WalkMeans):
-    """How the robot walked: means over the walks that it was asked for, and what the log doctor suspects of them."""
+    """Summary of a robot's log: how it walked, and what is suspicious in its records."""
 
     episodes: int
     """Number of walks."""
     seconds: float
-    """Time that the robot was on its feet, summed over the walks."""
+    """Time in s that the robot was on its feet, summed over the walks."""
     cut_short: int
-    """Walks whose record ends before its time and not in a fall; they may have been falls."""
+    """Number of records that end too early although no fall was seen. They may have been falls."""
     suspected: tuple[Suspicion, ...] = ()
-    """What the log doctor suspects."""
+    """Suspicions of the log doctor."""
 
     @property
     def ended_early(self) -> int:
-        """Number of walks that fell, or whose record is cut short."""
+        """Number of walks that fell or whose record is cut short, which is how many count as falls."""
         return round(self.fall_rate * self.episodes) + self.cut_short
 
 
 @dataclass(frozen=True, kw_only=True)
 class Moved:
-    """A parameter before and after a tuning, in physical values: multiples of nominal, or offsets with a unit."""
+    """A parameter before and after a tuning, in physical values (mostly multiples of nominal)."""
 
     before: float
     after: float
     low: float | None
-    """Lower end of the calibrated interval; None where no set was accepted, or the interval leaves the simulated
-    box."""
+    """Lower end of the calibrated 90 % interval. None if no set was accepted, or if the interval reaches past the
+    simulated range."""
     high: float | None
     """Upper end of the interval."""
 
@@ -74,38 +75,48 @@ class Tuning:
     """What a round's tuning did: every call of the gate, the update, and the tuned simulator's own prediction."""
 
     verdicts: tuple[str, ...]
-    """Of every gate call; the last one is how the tuning ended."""
+    """Verdict of every gate call; the last one says how the tuning ended."""
     radius: tuple[float, ...]
-    """Largest radius at every call, in coordinates."""
+    """Largest radius of any parameter at every call, in coordinates."""
     novelty: tuple[float | None, ...]
+    """Score of the measured set at every call: a mean rank, about 0.5 if simulation covers it, near 1 if not."""
     threshold: tuple[float | None, ...]
+    """Novelty above which the gate rejects, at every call."""
     p_value: tuple[float | None, ...]
+    """Conformal p-value at every call; None for a method without a gate."""
     uncovered: tuple[float | None, ...]
-    """Share of measured windows without a simulated neighbour."""
+    """Share of measured windows without a simulated neighbour, at every call."""
     elbo: tuple[float | None, ...]
+    """Evidence lower bound that the verification model reached in training, in nats per window, at every call."""
     step: dict[str, float | None]
-    """Of the centre, in radii."""
+    """How far the centre moved, by parameter, in radii."""
     interval: dict[str, float | None]
-    """Half width, in radii."""
+    """Half width of the interval, by parameter, in radii."""
     identifiable: dict[str, bool]
+    """Whether the log narrows a parameter down."""
     spm_loss: float | None
+    """Final loss of the search-parameter model."""
     measured_falls: int
+    """Number of falls in the part of the walks that was compared."""
     not_finite: int
+    """Number of episodes with values that are not finite."""
     training: dict[str, float]
+    """Metrics of the policy's training; empty here, because a round trains after its tuning."""
     moved: dict[str, Moved]
+    """Every parameter before and after."""
     compared_s: float
-    """How much of every walk was compared."""
+    """How many seconds of every walk were compared, from its start."""
     explained: Prediction
-    """The same policy in the tuned simulator."""
+    """Prediction for the policy that walked, in the tuned simulator; it should agree with the measurement."""
 
     @property
     def verdict(self) -> str | None:
-        """How the tuning ended; None where the gate was never asked (a method without a gate)."""
+        """How the tuning ended; None for a method without a gate."""
         return self.verdicts[-1] if self.verdicts and self.p_value[-1] is not None else None
 
     @property
     def unidentified(self) -> tuple[str, ...]:
-        """Parameters of which an accepted log says no more than was known before it."""
+        """Parameters that an accepted log does not narrow down; they stay where they were."""
         if self.verdict != "accept":
             return ()
         return tuple(name for name, known in self.identifiable.items() if not known)
@@ -113,14 +124,17 @@ class Tuning:
 
 @dataclass(frozen=True, kw_only=True)
 class Round:
-    """One round, from the prediction before the robot walked to the one for its next walks."""
+    """One round, from the prediction before the robot walked to the prediction for its next walks."""
 
     index: int = field(metadata={"key": "round"})
+    """Number of the round, from 0."""
     predicted: Prediction
-    """Of the policy that walked, before it walked."""
+    """Prediction for the policy that walked, made before it walked."""
     measured: Measured
+    """How the robot walked."""
     tuning: Tuning
+    """What was learnt from these walks."""
     next_predicted: Prediction = field(metadata={"key": "next"})
-    """Of the policy that was trained in what the tuning left."""
+    """Prediction for the next walks, with the policy that was trained in the tuned distribution."""
     expected_falls: float
     """Share of the next walks that are expected to end in a fall (`experiments.robot.fall_risk`)."""

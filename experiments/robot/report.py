@@ -1,4 +1,4 @@
-"""Tells a person about a round: a page with its picture in it, and two tables on the console."""
+"""Reports a round to a person: an HTML page with its plot, and two tables on the console. Verdict and advice first."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,19 +17,20 @@ VERDICTS = {
     "unexplained": "The simulator does not cover what was measured, and a wider distribution brings it no closer: "
     "physics is missing in the model.",
     "radius_exhausted": "The simulator does not cover what was measured, and its distribution cannot grow any wider.",
-    "not_finite": "Nothing could be compared: no walk lasted as long as a window, or a number is not finite.",
-    None: "This method does not ask whether the simulator covers what was measured.",
+    "not_finite": "Nothing could be compared: every walk was shorter than a window (0.5 s), or a value is not finite.",
+    None: "This method does not check whether the simulator covers what was measured.",
 }
-"""What each verdict of the gate means."""
+"""What each verdict of the gate means; None stands for a method without a gate."""
 
 ADVICE = {
-    "accept": "Go on: tune and walk again, as far as the expected falls allow it.",
-    "unexplained": "Suspend the robot, record the log that experiments.excite writes targets for, and ask "
-    "experiments.discover what is missing.",
-    "radius_exhausted": "Check the bounds of the parameters and the log; if both are right, ask experiments.discover.",
+    "accept": "Continue with the next round, if the expected falls allow it.",
+    "unexplained": "Suspend the robot, play the targets that experiments.excite writes, and run experiments.discover "
+    "on the log: it names what is missing.",
+    "radius_exhausted": "Check the bounds of the parameters and the log. If both are right, suspend the robot and run "
+    "experiments.discover.",
     "not_finite": "Start from a policy that stands longer: one that was trained in a wider distribution (--method dr), "
     "or with the robot held by a rope.",
-    None: "Use method ours if you want to know.",
+    None: "Use --method ours if you want to know.",
 }
 """What to do next, by verdict."""
 
@@ -41,9 +42,9 @@ def write(path: Path, history: Sequence[Round], terms: Terms) -> None:
     """Writes the page of the last round; text that comes from the log is escaped.
 
     Args:
-      path: of the HTML file, which holds its pictures.
+      path: of the HTML file; its plot is embedded.
       history: all rounds so far.
-      terms: what the robot was asked for.
+      terms: conditions of the walks, for the largest fall rate and the length of a walk.
     """
     last = history[-1]
     page = report.render(
@@ -65,11 +66,16 @@ def write(path: Path, history: Sequence[Round], terms: Terms) -> None:
 
 
 def show(console: Console, last: Round) -> None:
-    """Prints a round: the verdict and what to do, what was measured, what moved, and what the next walks risk."""
+    """Prints a round: verdict and advice, prediction and measurement, what moved, and the expected falls.
+
+    Args:
+      console: where it is printed.
+      last: the round.
+    """
     verdict = last.tuning.verdict
-    console.print(f"[bold]round {last.index}: {verdict or 'not asked'}[/bold]: {VERDICTS[verdict]}")
+    console.print(f"[bold]round {last.index}: {verdict or 'no gate'}[/bold]: {VERDICTS[verdict]}")
     console.print(ADVICE[verdict])
-    table = Table("", "predicted", "measured", "same policy, tuned simulator", "predicted of the next")
+    table = Table("", "predicted", "measured", "same policy, tuned simulator", "predicted for the next round")
     columns = [as_json(one) for one in (last.predicted, last.measured, last.tuning.explained, last.next_predicted)]
     for name, label in _QUANTITIES.items():
         table.add_row(label, *(f"{column[name]:.2f}" for column in columns))

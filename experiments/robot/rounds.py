@@ -1,19 +1,19 @@
-"""Rounds of walking and learning, kept in a folder so that a run may be stopped anywhere and goes on where it was.
+"""Plays rounds of walking and learning in a folder, so that a run may be stopped anywhere and continues where it was.
 
     RUN/round_000/start/           policy and distribution that the round begins with
-                  learner/         the policy alone, as experiments.train writes one
-                  prediction.json  what simulation says of them
-                  policy/          the policy, for the robot's computer
-                  request.json     what the robot is asked for: how many walks, how long, and a seed
+                  learner/         the policy alone, in the form that experiments.train writes
+                  prediction.json  how it should walk: return, falls and power in simulation
+                  policy/          the policy, exported for the robot's computer
+                  request.json     number and length of the requested walks, and a seed
                   log/             the robot's answer; or refused.txt, which says why there is none
                   measured.json    how the robot walked, and what the log doctor suspects
-                  tuned/           the distribution after the verdict
-                  tuning.json      the verdict, what moved, and what the tuned simulator says of the same policy
-                  report.html
-    RUN/round_001/start/           the policy, trained on in what the tuning left; and so on
+                  tuned/           the distribution after the tuning
+                  tuning.json      verdicts, what moved, and how the same policy walks in the tuned simulator
+                  report.html      all of it for a person
+    RUN/round_001/start/           the policy, trained further in the tuned distribution; and so on
 
-Every step of a round writes a file, and a step whose file exists is not made again. A robot is asked for nothing where
-too many of its walks are expected to end in a fall (`experiments.robot.fall_risk`).
+Every step of a round writes a file, and a step whose file exists is skipped. No walks are requested if too many of
+them are expected to end in a fall (`experiments.robot.fall_risk`).
 """
 
 import json
@@ -44,10 +44,12 @@ from jaxtune.tuner import Tuner, TunerState
 
 @dataclass(frozen=True)
 class Strategy:
-    """How a method tunes a distribution, and how wide its policy trains in it."""
+    """One tuning method: how it changes the default tuner and the policy that training starts from."""
 
     tuner: Callable[[Tuner], Tuner | baselines.Untuned]
+    """Makes the method's tuner from the default one."""
     policy: Callable[[Policy, float], Policy] = lambda policy, radius: policy
+    """Adapts the first policy to the first radius; `dr` lets it train on all of the distribution."""
 
 
 STRATEGIES = {
@@ -58,16 +60,18 @@ STRATEGIES = {
         lambda policy, radius: policy.replace(radius=jnp.full_like(policy.radius, radius)),
     ),
 }
-"""By the name that the command line gives a method."""
+"""Strategies by the name that `--method` takes."""
 
-_KEYS = 7  # keeps the rounds' random keys apart from others that begin with the same seed
+_KEYS = 7  # keeps the random keys of rounds different from others that begin with the same seed
 
 
 class Programs:
-    """A learner with the compiled programs of a round; runs that share it compile them once.
+    """A learner with the compiled programs of a round: tune, train, predict, act.
+
+    Compiling takes minutes. A benchmark that plays many runs shares one `Programs`, so that each is compiled once.
 
     Args:
-      learner: BITeno's side of the tuner.
+      learner: gives the tuner its functions.
     """
 
     def __init__(self, learner: Learner):
@@ -83,32 +87,32 @@ class Programs:
 
 @dataclass(frozen=True, kw_only=True)
 class Terms:
-    """What a robot is asked for in a round, and the conditions under which it is asked and its log is believed."""
+    """Conditions under which a robot walks, and under which its log is used."""
 
     walk_s: float = 10.0
-    """Length of a walk that the robot is asked for."""
+    """Length of a walk in s."""
     max_fall_rate: float = 0.2
-    """The robot is asked for nothing where a larger share of its walks is expected to end in a fall."""
+    """Largest share of the next walks that may be expected to end in a fall; above it no walks are requested."""
     force: bool = False
-    """Ask all the same."""
+    """Request walks even if more falls are expected than max_fall_rate allows."""
     trust_log: bool = False
-    """Learn from a log even if the doctor thinks it means something else, or another policy has walked."""
+    """Learn from a log even if the log doctor finds its numbers wrong, or another policy seems to have walked."""
     timeout_s: float = 3600.0
-    """How long to wait for a log."""
+    """How long to wait for the robot's log, in s."""
     seed: int = 0
-    """Seed of everything random."""
+    """Random seed of simulation and training; it is also part of the request."""
 
 
 class Rounds:
-    """Plays the rounds of one run, or reads what an earlier call left of them.
+    """Plays the rounds of one run, or reads those that an earlier call has played.
 
     Args:
       out: folder of the run.
-      terms: what the robot is asked for.
+      terms: conditions of the walks.
       programs: the learner and its compiled programs.
       method: one of `STRATEGIES`.
-      policy: what the first round begins with.
-      start: middle of the first distribution, physical values by name.
+      policy: policy of the first round.
+      start: centre of the first distribution, physical values by name.
       radius: of the first distribution, in coordinates.
     """
 
@@ -129,14 +133,17 @@ class Rounds:
         self._steps = round(terms.walk_s / constants.POLICY_DT_S)
 
     def play(self, index: int, last: Round | None) -> Round:
-        """Plays a round: predict, ask, wait, check, tune, and train the policy for the next one.
+        """Plays a round: predict, request, wait, check, tune, and train the policy for the next one.
 
         Args:
           index: of the round, from 0.
-          last: the round before it, if any; its measurements decide whether simulation is believed about falls.
+          last: the round before it, if any; its measurements decide whether the simulated fall rate is trusted.
+
+        Returns:
+          The record of the round.
 
         Raises:
-          ValueError: too many falls are expected, the robot has not answered, or its log cannot be learnt from.
+          ValueError: too many falls are expected, the robot has not answered, or its log cannot be used.
         """
         place = self._place(index)
         state = self._start(index, lambda: self._first)
@@ -164,6 +171,7 @@ class Rounds:
         return self._out / f"round_{index:03d}"
 
     def _key(self, index: int, use: int) -> jax.Array:
+        # `use` is 0 for the prediction, 1 for tuning, 2 for training, 3 for the prediction in the tuned simulator.
         key = jax.random.fold_in(jax.random.PRNGKey(self._terms.seed), _KEYS)
         return jax.random.fold_in(jax.random.fold_in(key, index), use)
 
@@ -173,13 +181,13 @@ class Rounds:
             state = make()
             checkpoint.save(place / "learner", state.policy.learner, policy_config(self._learner))
             checkpoint.save(place / "start", state, {})
-        # Read back even where it was just made, so that a run that goes on has the state of one that never stopped.
+        # Read back even if it was just made, so that an interrupted run has the same state as one that never stopped.
         return checkpoint.load(place / "start", self._first, {})
 
     def _predict(self, key: jax.Array, state: TunerState) -> Prediction:
         count = self._learner.preset.foreseen_episodes
         found = self._programs.predict(key, state.policy, state.dist, count, self._steps)
-        # A fifth in single precision is more than a fifth, so the rate is rounded to whole episodes.
+        # 0.2 in single precision is more than 0.2 in double, and would exceed max_fall_rate by rounding alone.
         fall_rate = round(count * float(found["fall_rate"])) / count
         return Prediction(
             mean_return=float(found["return"]), fall_rate=fall_rate, power_w=float(found["power_w"]), episodes=count
@@ -195,13 +203,15 @@ class Rounds:
         rate = fall_risk(predicted, *((last.measured, last.tuning) if last else ()))
         most = self._terms.max_fall_rate
         if last is None:
-            console.print(f"nothing is measured in this run yet; simulation alone expects {rate:.0%} of walks to fall")
+            console.print(
+                f"nothing has been measured in this run yet; in simulation, {rate:.0%} of the walks end in a fall"
+            )
         if rate > most and not self._terms.force:
-            # An earlier call may have asked on other terms.
+            # An earlier call, with a larger max_fall_rate or with force, may have left a request that holds no more.
             (self._place(index) / "request.json").unlink(missing_ok=True)
             raise ValueError(
-                f"round {index}: the robot is not asked to walk: {rate:.0%} of its walks are expected to end in a fall "
-                f"({predicted.fall_rate:.0%} in simulation), and {most:.0%} may (max_fall_rate; force overrides)"
+                f"round {index}: no walks are requested: {rate:.0%} of them are expected to end in a fall "
+                f"({predicted.fall_rate:.0%} in simulation), at most {most:.0%} may (max_fall_rate; force overrides)"
             )
 
     def _request(self, index: int, state: TunerState) -> None:
@@ -211,7 +221,7 @@ class Rounds:
         policy_files.export(place / "policy", state.policy.learner, self._learner.preset)
         episodes, seconds = self._learner.preset.tuner.set_episodes, self._terms.walk_s
         request(place, episodes, seconds, 1000 * self._terms.seed + index)
-        console.print(f"round {index}: the robot is asked for {episodes} walks of {seconds:g} s in {place}")
+        console.print(f"round {index}: requested {episodes} walks of {seconds:g} s in {place}, waiting for the log")
 
     def _learn(self, index: int, state: TunerState) -> None:
         """Turns the robot's log into the next distribution, and writes what was measured and what moved."""
@@ -226,6 +236,7 @@ class Rounds:
         suspected = tuple(Suspicion(sentence=one.sentence, runs=tuple(runs)) for one, runs in suspicions)
         write_json(place / "measured.json", summarise_log(walks, self._steps, suspected))
         start = recorded.beginning(walks, preset.episode_steps)
+        # Simulated episodes must have the robot's commands; otherwise the gate would measure these and not the physics.
         repeating = state.replace(policy=state.policy.replace(asked=start.commands))
         tuned, info = self._tune(self._key(index, 1), repeating, start.trajectory)
         tuned = tuned.replace(policy=state.policy)
@@ -237,7 +248,7 @@ class Rounds:
             compared_s=preset.episode_steps * constants.POLICY_DT_S,
             explained=self._predict(self._key(index, 3), tuned),
         )
-        # Written last: a round that has it need not be learnt from again.
+        # Written last, because a round with this file counts as learnt.
         write_json(place / "tuning.json", tuning)
 
 

@@ -1,7 +1,8 @@
-"""The body of the stand-in robot: what a real robot has and the learner's simulator lacks.
+"""The body of the stand-in robot, with effects that real robots have and the learner's simulator lacks.
 
-MuJoCo C moves it. Targets arrive late, motors lag and give less torque the faster they turn, encoders round, the IMU is
-noisy and biased, the velocity estimate drifts, and the floor has another friction. `experiments.robot_stub` plays it.
+It is simulated in MuJoCo C. Targets arrive late, motors lag and give less torque the faster they turn, encoders round,
+the IMU is noisy and biased, the velocity estimate drifts, and the feet have another friction.
+`experiments.robot_stub` connects it to requests and logs.
 """
 
 from collections import deque
@@ -15,51 +16,51 @@ from envs.logs import Controller, Run
 from envs.models import suspended as fixed_base
 from experiments.robot.player import Player
 
-_STEP_S = 0.0005
+_STEP_S = 0.0005  # of the physics; shorter than the learner's, so that the engine differs too
 _TICK_S = 0.001  # period of the joint controllers
 ROW_S = 0.002
-"""Time between the rows of its logs."""
-_TASK = TaskConfig()  # the commands that it draws
+"""Time between the rows of its logs, in s."""
+_TASK = TaskConfig()  # ranges and timing of the commands that it draws
 
 
 @dataclass(frozen=True, kw_only=True)
 class Body:
-    """Properties of the robot, each as a multiplier of the nominal model unless its name has a unit."""
+    """Properties of the robot; a name without a unit is a multiple of the nominal model's value."""
 
     trunk_mass: float = 1.0
-    """Mass of the trunk."""
+    """Mass of the trunk, as a multiple of nominal."""
     leg_mass: float = 1.0
-    """Mass of the six moving links."""
+    """Mass of each of the six leg links, as a multiple of nominal."""
     foot_friction: float = 0.75
-    """Friction of the feet."""
+    """Friction of the feet, as a multiple of nominal."""
     transport_s: float = 0.01
-    """How late targets arrive."""
+    """Delay of joint targets on their way to the controllers, in s."""
     motor_lag_s: float = 0.004
-    """Time constant of the torque."""
+    """Time constant of the motors' torque, a first-order lag, in s."""
     no_load_rad_s: float = 30.0
-    """Speed at which a motor gives nothing."""
+    """Joint speed at which a motor gives no torque, in rad/s; its limit falls linearly up to there."""
     torque_scale: float = 1.0
-    """Torque for the same current."""
+    """Torque that a motor gives, as a multiple of the torque that its controller wants."""
     encoder_rad: float = 2 * np.pi / 2**14
-    """Resolution of the encoders."""
+    """Resolution of the encoders in rad."""
     velocity_noise_rad_s: float = 0.05
-    """Standard deviation of the noise of joint velocities."""
+    """Standard deviation of the noise of joint velocities, in rad/s."""
     gyro_noise_rad_s: float = 0.02
-    """Standard deviation of the gyro's noise."""
+    """Standard deviation of the gyro's noise, in rad/s."""
     gyro_bias_rad_s: float = 0.01
-    """Standard deviation of the gyro's bias, drawn for every run."""
+    """Standard deviation of the gyro's bias, in rad/s; one bias is drawn for every run."""
     tilt_bias_rad: float = 0.01
-    """Standard deviation of the error of the estimated direction of gravity, drawn for every run."""
+    """Standard deviation of the error of the estimated direction of gravity, in rad; one is drawn for every run."""
     drift_mps: float = 0.05
-    """Standard deviation of the velocity estimate's wandering error."""
+    """Standard deviation of the drifting error of the velocity estimate, in m/s."""
 
 
 class Robot:
-    """The robot, one run at a time.
+    """The simulated robot with its controllers and sensors; it records one run at a time.
 
     Args:
       body: its properties.
-      suspended: whether it hangs in the air, to `play` targets; else it stands on the ground, to `walk`.
+      suspended: True fixes the base in the air, to `play` targets; False puts the robot on the ground, to `walk`.
     """
 
     def __init__(self, body: Body, suspended: bool = False):
@@ -85,7 +86,9 @@ class Robot:
         model = fixed_base(spec) if suspended else model
         model.opt.timestep = _STEP_S
         model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+        # The solver converges here, while the learner's few iterations trade accuracy for speed.
         model.opt.iterations, model.opt.ls_iterations = 100, 50
+        # The model's own actuators are off, because torques with lag and limits are applied by `_push`.
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION
         self.model = model
         joints = [model.joint(name) for name in constants.JOINTS]
@@ -94,16 +97,16 @@ class Robot:
         self._feet = [model.geom(foot).id for foot in constants.FEET]
 
     def walk(self, name: str, player: Player, seconds: float, rng: np.random.Generator) -> tuple[Run, bool]:
-        """Walks from standing until the time is over or the robot has fallen.
+        """Walks with a policy from a standing start until the time is over or the robot has fallen.
 
         Args:
           name: of the run.
           player: the exported policy.
-          seconds: length of the walk.
-          rng: of commands, start and noise.
+          seconds: length of the walk in s.
+          rng: random generator of commands, start and noise.
 
         Returns:
-          The run, and whether it fell.
+          The recorded run, and whether the robot fell. After a fall the last row has the motors off (`enabled` 0).
         """
         self._stand_up(rng)
         player.reset(rng.uniform())
@@ -136,6 +139,7 @@ class Robot:
             mujoco.mj_step(self.model, self.data)
             if self._fallen():
                 fell = True
+                # A last row with the motors off tells the reader of the log that the walk ended in a fall.
                 rows.append(rows[-1] | self._look(rng) | {"enabled": 0.0})
                 break
         signals = {signal: np.stack([row[signal] for row in rows]).astype(float) for signal in rows[0]}
@@ -150,17 +154,17 @@ class Robot:
         return walked, fell
 
     def play(self, targets: Run, rng: np.random.Generator) -> Run:
-        """Plays a run's targets while it is suspended, from rest at the first of them.
+        """Plays the targets of a run on the suspended robot, from rest at the first target.
 
         Args:
-          targets: a run without measurements.
-          rng: of noise.
+          targets: a run without measurements, from `experiments.excite`.
+          rng: random generator of noise.
 
         Returns:
-          The run with what its encoders measured.
+          The run with measured joint positions and velocities.
 
         Raises:
-          ValueError: the run's controller is of another kind, or its ticks are no multiple of the physics' step.
+          ValueError: the run's controller is no PD controller, or its period is no multiple of the physics' step.
         """
         tick_s = 1.0 / targets.controller.rate_hz
         per_tick = round(tick_s / _STEP_S)
@@ -189,7 +193,7 @@ class Robot:
         return replace(targets, signals=dict(targets.signals) | self._joints(position, speed, rng))
 
     def _begin(self, tick_s: float) -> None:
-        """Starts at rest, as if the present position had been its target for long."""
+        """Starts at rest, as if the present position had been the target for longer than the delay."""
         mujoco.mj_forward(self.model, self.data)
         late = round(self.body.transport_s / tick_s)
         self._torque = np.zeros(len(self._qpos))
@@ -208,12 +212,12 @@ class Robot:
         }
 
     def _look(self, rng: np.random.Generator) -> dict[str, np.ndarray]:
-        """Reads all sensors."""
+        """Returns the readings of all sensors at this moment, with their noise, bias and drift."""
         body, data = self.body, self.data
         turn = np.zeros(9)
         mujoco.mju_quat2Mat(turn, data.qpos[3:7])
         into_body = turn.reshape(3, 3).T
-        # The error of the velocity estimate wanders over seconds.
+        # The error of the velocity estimate is a first-order autoregressive process with a time constant of 2 s.
         stays = np.exp(-_TICK_S / 2.0)
         wander = body.drift_mps * np.sqrt(1 - stays**2) * rng.standard_normal(3)
         self._bias["vel"] = stays * self._bias["vel"] + wander
@@ -239,6 +243,7 @@ class Robot:
         return np.clip(torque, -gains["torque_limit_nm"], gains["torque_limit_nm"])
 
     def _push(self, wanted: np.ndarray) -> None:
+        """Applies the wanted torque as the motors give it: lagged, and limited by speed."""
         body, speed = self.body, self.data.qvel[self._dof]
         share = 1.0 - np.exp(-_STEP_S / max(body.motor_lag_s, 1e-9))
         self._torque += share * (body.torque_scale * wanted - self._torque)

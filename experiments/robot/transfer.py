@@ -1,4 +1,7 @@
-"""A whole run of rounds with a robot: its options, their checks, and the loop over the rounds."""
+"""A whole run of rounds with a robot: its options, their checks, and the loop over the rounds.
+
+`experiments.sim2real` is this module as a command. `experiments.sim2real_bench` plays many runs with it.
+"""
 
 import sys
 from dataclasses import asdict, dataclass, field, replace
@@ -22,36 +25,43 @@ from jaxtune.mjx import Entry, nominal
 
 @dataclass(frozen=True, kw_only=True)
 class Transfer:
-    """Tunes a simulator to a robot that answers through log files, round by round."""
+    """Options of a run that tunes BITeno's simulator to a robot that answers through log files, round by round."""
 
     out: Path = Path("runs/sim2real")
-    """Folder of the run; the same command with the same folder goes on where it was."""
+    """Folder of the run. The same command with the same folder continues where it was."""
     rounds: int = 5
-    """Rounds in all; a later call may ask for more."""
+    """Number of rounds; a later call may raise it."""
     method: str = "ours"
-    """ours, spm (the paper's rule without the gate) or dr (a wide distribution that stays)."""
+    """Tuning method: ours, spm (the paper's update without the gate) or dr (wide domain randomisation without
+    tuning)."""
     policy: str = "walk"
     """First policy: walk (ships with the package), scratch (trained first), or a folder of experiments.train."""
     parameters: str = "whole_body"
-    """Parameters that are tuned: legs6, whole_body, or names joined by commas."""
+    """Parameters that are tuned: legs6 (foot friction and the six link masses), whole_body (friction, trunk mass, link
+    masses with left and right tied), or names joined by commas."""
     start: tuple[str, ...] = ()
-    """Where the distribution starts, as name=value; nominal where not given."""
+    """Centre of the first distribution, as name=value, such as trunk_mass=0.5 (a multiple of nominal); nominal if not
+    given."""
     radius: float = 0.2
-    """First radius in log space; dr trains on all of it."""
+    """First radius (half width of the distribution), in log space: 0.2 spans 0.82 to 1.22 times the centre. dr trains
+    its policy on all of it."""
     model: Path | None = None
-    """Folder of a corrected model that discovery wrote (`OUT/model`), to tune instead of the nominal one."""
+    """Folder of a corrected model that discovery wrote (`OUT/model`), to tune instead of the nominal model."""
     noise: float = 0.2
-    """Noise of simulated sensors, in units of `sensing.NOISE`."""
+    """Noise of simulated sensors, as a multiple of envs.sensing.NOISE."""
     preset: str = "cpu"
-    """Sizes: smoke, cpu or gpu."""
+    """Size of the run: smoke (minutes, to see that it works), cpu (two cores) or gpu (one GPU)."""
     epochs: int | None = None
-    """PPO updates in a round; twice the preset's where not given, after the paper's Fig. 6."""
+    """PPO updates in a round; twice the preset's epochs if not given, as in the paper's Fig. 6."""
     terms: Annotated[Terms, tyro.conf.arg(name="")] = field(default_factory=Terms)
-    """What the robot is asked for."""
+    """Conditions of the walks."""
 
 
 def check(transfer: Transfer) -> tuple[Preset, dict[str, Entry], dict[str, float]]:
-    """Checks the options before anything is compiled.
+    """Checks the options before anything is compiled, and looks up what they name.
+
+    Args:
+      transfer: options of the run.
 
     Returns:
       Sizes of the run, the table of parameters that are tuned, and where they start (physical values by name).
@@ -76,7 +86,14 @@ def check(transfer: Transfer) -> tuple[Preset, dict[str, Entry], dict[str, float
 
 
 def compile_programs(transfer: Transfer) -> Programs:
-    """Makes the learner of a run and its programs, which runs with the same sizes, parameters and model may share."""
+    """Makes the learner of a run and its programs; runs with the same sizes, parameters and model may share them.
+
+    Args:
+      transfer: options of the run.
+
+    Raises:
+      ValueError: an option is wrong, or the corrected model cannot be read.
+    """
     sizes, entries, _ = check(transfer)
     return Programs(Learner(sizes, entries, correction=transfer.model and corrected.read(transfer.model)))
 
@@ -97,7 +114,7 @@ def play(transfer: Transfer, programs: Programs) -> list[Round]:
     start = check(transfer)[2]
     policy_files.require_onnx()
     learner = programs.learner
-    # A policy that cannot be loaded is an error before there is a folder; one from scratch is kept in the folder.
+    # A policy that cannot be loaded must be an error before the folder is made. One from scratch is kept in the folder.
     policy = None if transfer.policy == "scratch" else starting_policy(transfer.policy, learner)
     checkpoint.open_run(transfer.out, _identity(transfer, learner.preset))
     policy = policy or starting_policy(transfer.policy, learner, transfer.out)
@@ -114,11 +131,12 @@ def play(transfer: Transfer, programs: Programs) -> list[Round]:
 
 
 def _identity(transfer: Transfer, sizes: Preset) -> dict:
-    """What must stay as it was when a run goes on."""
+    """Lists the options that must be unchanged when a run continues; a later call may change all others."""
     terms = {"walk_s": transfer.terms.walk_s, "seed": transfer.terms.seed}
     identity = {**asdict(transfer), "sizes": sizes, "terms": terms}
-    # The folder of a model may hold another one by the time a run goes on.
+    # The folder may hold another model by the time that a run continues, so the model's hash is compared.
     identity["model_sha256"] = transfer.model and corrected.read(transfer.model).digest
+    # A later call may find the folder moved, and may play more rounds.
     for option in ("out", "rounds"):
         del identity[option]
     return identity

@@ -69,6 +69,7 @@ def check_case(
             f"parameters: got '{parameter_option}', but case '{name}' needs one whose value differs in its target"
         )
     check_positive(start=start)
+    # A true value outside the bounds could never be found.
     for parameter in filter(case.scaled, entries):
         low, high = entries[parameter].bounds
         if not low <= 1.0 / start <= high:

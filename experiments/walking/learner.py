@@ -103,6 +103,7 @@ class Learner:
         robots = self._env.reset(jax.random.split(key_robots, count))
         return Policy(
             learner=ppo,
+            # Strong types, as training returns them; with weak ones its second call would compile again.
             robots=jax.tree.map(lambda leaf: jnp.asarray(leaf, leaf.dtype), robots),
             radius=jnp.asarray(self.preset.policy_radius, jnp.float32),
             hidden={name: jnp.asarray(value, jnp.float32) for name, value in parameters.nominal(self._hidden).items()},

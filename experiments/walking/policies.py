@@ -85,4 +85,5 @@ def starting_policy(name: str, learner: Learner, out: Path | None = None) -> Pol
             checkpoint.save(place, policy.learner, policy_config(learner))
             write_json(place / "curve.json", {"curve": curve})
     ppo = checkpoint.load(place, fresh.learner, policy_config(learner))
+    # Disk holds networks, optimiser and statistics alone. Robots are reset, so they may have another model by now.
     return learner.init(jax.random.PRNGKey(0), ppo)

@@ -104,7 +104,7 @@ def test_a_log_that_never_rests_is_refused(tmp_path, monkeypatch):
 
     monkeypatch.setattr(exchange.time, "sleep", sleep)
     monkeypatch.setattr(exchange.time, "monotonic", lambda: float(len(looks)))
-    with pytest.raises(ValueError, match="log: still changes 60 s after the time that it had"):
+    with pytest.raises(ValueError, match="log: still changes 60 s after the timeout"):
         exchange.wait(tmp_path, 5.0)
     assert len(looks) == 66
 
@@ -207,7 +207,7 @@ def test_the_page_says_what_matters_and_runs_nothing_of_the_log(tmp_path):
     text = page.read_text()
     assert "<script>" not in text
     assert "&lt;script&gt;alert(1)&lt;/script&gt; is cut off (&lt;b&gt;)" in text
-    assert "Not identifiable from this log, and left as they were: foot_friction." in text
+    assert "Not identifiable from this log, and not moved: foot_friction." in text
     assert "0.800 to 1.000" in text
     assert "should not walk again" in text
     assert "experiments.discover" not in text
@@ -217,13 +217,13 @@ def test_the_page_says_what_matters_and_runs_nothing_of_the_log(tmp_path):
     assert "experiments.discover" in text
     assert "may walk again" in text
     assert "So far it has walked 10 times,\nand 4 of these walks ended in a fall" in text
-    assert "before their time" not in text
+    assert "end too early" not in text
     report.write(page, [line(["not_finite"], 1.0, 0.1, cut_short=3)], TERMS)
     text = page.read_text()
     assert "a policy that stands longer" in text
-    assert "records of 3 walks end before their time" in text
+    assert "records of 3 walks end too early" in text
     report.write(page, [line([], 0.4, 0.1)], TERMS)
-    assert "This method does not ask" in page.read_text()
+    assert "This method does not check" in page.read_text()
 
 
 @pytest.fixture(scope="module")
@@ -299,14 +299,14 @@ def first(programs, tmp_path):
     return lambda terms: Rounds(tmp_path, terms, programs, "ours", policy, start, 0.2)
 
 
-def test_a_robot_that_would_fall_is_not_asked_to_walk(first, answered, tmp_path, monkeypatch):
+def test_no_walks_are_requested_if_too_many_falls_are_expected(first, answered, tmp_path, monkeypatch):
     prediction = Prediction(mean_return=0.0, fall_rate=0.25, power_w=1.0, episodes=4)
     monkeypatch.setattr(Rounds, "_predicted", lambda self, index, state: prediction)
     careful, place = replace(TERMS, force=False), tmp_path / "round_000"
     place.mkdir()
-    # Asked for by an earlier call on other terms.
+    # Requested by an earlier call under other conditions.
     (place / "request.json").write_text("{}")
-    with pytest.raises(ValueError, match=r"round 0: the robot is not asked to walk: 25% .* and 20% may"):
+    with pytest.raises(ValueError, match=r"round 0: no walks are requested: 25% .* at most 20%"):
         first(careful).play(0, None)
     assert not (place / "request.json").exists()
     assert first(TERMS).play(0, None).expected_falls >= 0.25
