@@ -4,7 +4,7 @@ Discovery accepts an effect only if it improves the measured log by more than ef
 effects one always improves the fit a little, because it imitates differences that are not physics: an engine's step,
 its integrator, the moment at which a controller reads the joint. A null log therefore has such differences too:
 
-- the nominal model is simulated by MuJoCo C, with half the step, another integrator and a controller whose ticks jitter;
+- MuJoCo C simulates the nominal model with half the step, another integrator and a controller whose ticks jitter;
 - its masses, armatures, dampings and frictions are drawn from the prior;
 - the readings get the noise and the rounding that are found in the measured log.
 """

@@ -33,7 +33,7 @@ def measure_scales(rig: Rig, runs: Sequence[Run]) -> dict[str, np.ndarray]:
 
     Args:
       rig: the robot.
-      runs: of the log, without sealed ones: scales decide which effects are tried, so they must not see the test.
+      runs: of the log, without sealed ones: they set the sizes at which effects are tried, and must not see the test.
 
     Returns:
       [places] by the name of the scale (`jaxtune.types.Scale`).
