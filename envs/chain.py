@@ -1,6 +1,7 @@
 """Simulates one step of a robot with effects between its targets and its readings, on the test rig and in a walk.
 
-The effects are rows of `envs.effects`; this is the only place that applies them.
+The effects are rows of `envs.effects`, which draws the stages that they act at; this is the only place that applies
+them. `envs.rig` uses it for a robot whose base is fixed, `envs.corrected` for a BITeno that walks.
 """
 
 from collections.abc import Sequence
@@ -15,29 +16,37 @@ from mujoco import mjx
 from jaxtune.types import Effect
 
 MIN_FRICTION_NM = 1e-6
-"""Smallest bound of dry friction. With a bound of exactly zero MJX brakes a joint."""
+"""Smallest bound of dry friction, in Nm: small enough to change nothing, and not zero.
+
+MJX solves for friction only in joints that had some when the model was put on the device, and brakes a joint whose
+bound is exactly zero."""
 
 
 @chex.dataclass(frozen=True)
 class Now:
-    """What an effect may depend on beside its own values, its signal and its memory."""
+    """State of the robot at one step, as far as an effect may depend on it beside its values, signal and memory.
 
-    dt: float
+    While the history of a segment is replayed, the motor's motion is measured, not simulated (`measured`). It already
+    contains how controller and rotor reacted to an offset between motor and joint, so `stiffness`, `damping` and
+    `rotor` are zero then.
+    """
+
+    dt: float  # step of the simulation in s
     position: jax.Array  # [joints] rad
     speed: jax.Array  # [joints] rad/s
     load: jax.Array  # [joints] Nm on the gears: the larger of motor torque and of gravity and Coriolis torque
-    limit: jax.Array  # [joints] Nm, the controller's
-    stiffness: jax.Array  # [joints] Nm/rad, of the controller; zero where the motor's motion was measured
-    damping: jax.Array  # [joints] Nm s/rad, of controller and back electromotive force; zero likewise
+    limit: jax.Array  # [joints] Nm, largest torque of the controller
+    stiffness: jax.Array  # [joints] Nm/rad, of the controller
+    damping: jax.Array  # [joints] Nm s/rad, of controller and back electromotive force
     measured: bool  # whether the motor's motion was measured, and so is not simulated
-    rotor: jax.Array  # [joints] kg m^2, the rotor's part of the joint's inertia; zero where its motion was measured
-    carried: jax.Array  # [joints] Nm that accelerate the rotor with the joint
+    rotor: jax.Array  # [joints] kg m^2, the rotor's part of the joint's inertia
+    carried: jax.Array  # [joints] Nm, the part of the torque that accelerates the rotor along with the joint
     body_velocity: jax.Array  # [bodies, 3] m/s of the centres of mass
 
 
 @chex.dataclass(frozen=True)
 class Wrench:
-    """Forces on the robot from outside; effects of the stage `wrench` add to it."""
+    """Forces on the robot from outside its motors: the signal of the stage `wrench`, to which effects add."""
 
     torque: jax.Array  # [joints] Nm
     force: jax.Array  # [bodies, 3] N at the centres of mass
@@ -47,12 +56,15 @@ class Wrench:
 class Chain:
     """A controller, its motors and its sensors, with effects in the order in which they act.
 
-    Three arguments of its methods are always the same. `values` holds [places] by effect and parameter, in the form
-    that effects read (zero: the effect is not there). A memory is a dictionary by effect, and `held`, the controller's
-    last torque. `x` is the controller's input of one step, [joints] each: `target` rad, `feed` Nm (torque sent
-    directly), `stiffness` Nm/rad, `damping` Nm s/rad, `limit` Nm, `emf` Nm s/rad (back electromotive force, not
-    limited), and `sample`, a scalar that is true where the controller reads the joint anew. Its law is
-    `envs.logs.Impedance`'s.
+    Three arguments of its methods are always the same:
+
+    - `values` holds [places] by effect and parameter, in the form that effects read. Zero means no effect.
+    - `memory` is a dictionary: what each effect remembers, by its name, and `held`, the controller's last torque.
+    - `x` holds the controller's inputs of one step, [joints] each: `target` rad, `feed` Nm (torque sent directly),
+      `stiffness` Nm/rad, `damping` Nm s/rad, `limit` Nm, `emf` Nm s/rad (back electromotive force, not limited), and
+      `sample`, a scalar that is true where the controller reads the joint anew.
+
+    The controller's law is that of `envs.logs.Impedance`.
     """
 
     dt: float
@@ -79,9 +91,11 @@ class Chain:
         """
         joint = self.joints(data)
         bias, rotor = data.qfrc_bias[self.dof], model.dof_armature[self.dof]
+        # Encoders sit on the motor, which may run ahead of its joint.
         motor = joint.at[0].add(self.ahead(memory)[0])
         memory, (torque, read) = self.drive(values, memory, motor, x, rotor * data.qacc[self.dof], rotor)
         now = self._now(x, joint, jnp.maximum(jnp.abs(torque), jnp.abs(bias)), model, data)
+        # Effects of friction and of forces from outside have no memory.
         friction, _ = self.stage("friction", values, model.dof_frictionloss[self.dof], now, memory)
         calm = Wrench(torque=jnp.zeros(len(self.dof)), force=jnp.zeros((len(self.bodies), 3)))
         wrench, _ = self.stage("wrench", values, calm, now, memory)
@@ -112,11 +126,14 @@ class Chain:
         return self.stage("sensor", values, motor, self._now(x, motor), memory)[0].at[1].add(fast)
 
     def joints(self, data: mjx.Data) -> jax.Array:
-        """Takes positions and velocities of the joints from a robot, [2, joints] rad and rad/s."""
+        """Takes positions and velocities of the joints from MJX's data, [2, joints] rad and rad/s.
+
+        They are the true ones, before any effect of transmission or sensors.
+        """
         return jnp.stack([data.qpos[self.qpos], data.qvel[self.dof]])
 
     def entering(self, stage: str) -> list[Effect]:
-        """Lists the effects that enter a stage, in the order in which they act."""
+        """Lists the effects that enter a stage (`jaxtune.types.Effect.enters`), in the order in which they act."""
         return [row for row in self.rows if row.enters == stage]
 
     def stage(self, stage, values, signal, now, memory):
@@ -135,13 +152,15 @@ class Chain:
         memory = dict(memory)
         for row in self.entering(stage):
             signal, kept = row.act(values[row.name], signal, now, memory.get(row.name))
+            # Without a start there is no memory; an entry of None would change the structure of a scan's carry.
             if row.start is not None:
                 memory[row.name] = kept
         return signal, memory
 
     def start(self, values, state, x) -> dict:
-        """Makes the memories of a robot that has been in one state, with one target, for longer than any effect
-        remembers.
+        """Makes the memories in steady state: of a robot that has been in one state, with one target, for a long time.
+
+        Use it before the first step. A segment of a log then replays its history to get the real ones (`envs.rig`).
 
         Args:
           values: of the effects.
@@ -149,6 +168,7 @@ class Chain:
           x: the controller's inputs.
         """
         torque = self._law(x, x["target"] - state[0], state[1])
+        # What reaches each of these stages in steady state, other effects left aside.
         signals = {"command": x["target"], "sensor": state, "torque": torque, "transmission": torque}
         memory = {"held": torque}
         for stage, signal in signals.items():
@@ -166,6 +186,8 @@ class Chain:
     def drive(self, values, memory, motor, x, carried, rotor=None):
         """Computes torques on the joints, from the motors' state through sensors, controller and transmission.
 
+        `step` calls it on simulated motors. `envs.rig` also calls it on measured ones, to fill the memories.
+
         Args:
           values: of the effects.
           memory: before the step.
@@ -181,6 +203,7 @@ class Chain:
         readings, memory = self.stage("sensor", values, motor, now, memory)
         target, memory = self.stage("command", values, x["target"], now, memory)
         error, memory = self.stage("error", values, target - readings[0], now, memory)
+        # A controller holds its torque from one reading of the joint to the next.
         held = jnp.where(x["sample"], self._law(x, error, readings[1]), memory["held"])
         memory["held"] = held
         torque, memory = self.stage("torque", values, held, now, memory)
@@ -188,13 +211,14 @@ class Chain:
         free = {"stiffness": none, "damping": none} if rotor is None else {"rotor": rotor}
         now = now.replace(carried=carried, measured=rotor is None, **free)
         running = self.ahead(memory)[1]
+        # Back electromotive force acts continuously, so it is not part of the held torque.
         torque, memory = self.stage("transmission", values, torque - x["emf"] * motor[1], now, memory)
         return memory, (torque, {"q": readings[0], "dq": readings[1] + running, "tau": torque})
 
     def ahead(self, memory) -> jax.Array:
-        """Sums how far and how fast the motors run ahead of their joints, [2, joints] rad and rad/s.
+        """Computes how far and how fast the motors run ahead of their joints, [2, joints] rad and rad/s.
 
-        The sum is over the effects of the transmission, from their memories.
+        It is the sum over the effects of the transmission, whose memories are just that.
         """
         rows = self.entering("transmission")
         return sum((memory[row.name] for row in rows), start=jnp.zeros((2, len(self.dof))))

@@ -1,4 +1,8 @@
-"""The model of a robot, by the name that a log gives it, and the same robot suspended: without its free base."""
+"""Loads the model of a robot by the name that a log gives it, and suspends it on a test rig.
+
+A suspended robot has no free base and no contacts. Discovery works on it, because the motion of a base is rarely
+measured and contact is chaotic.
+"""
 
 from pathlib import Path
 
@@ -15,7 +19,7 @@ BUILT_IN = {
 
 
 def spec(robot: str) -> mujoco.MjSpec:
-    """Loads the MJCF of a robot, so that it can be compiled or changed before.
+    """Loads the MJCF of a robot as a spec, which can be changed before it is compiled.
 
     Args:
       robot: the name of a built-in robot, or the path of an MJCF file, as in a log's `meta.yaml`.
@@ -30,10 +34,13 @@ def spec(robot: str) -> mujoco.MjSpec:
 
 
 def suspended(spec: mujoco.MjSpec) -> mujoco.MjModel:
-    """Compiles a robot as it hangs on a test rig: without its free joints and without contacts.
+    """Compiles a robot as it is on a test rig: without its free joints, and with contacts switched off.
 
     Args:
-      spec: of the robot; it is copied. Keyframes are dropped where a free joint is, because they contain its pose.
+      spec: of the robot; it is copied, not changed.
+
+    Returns:
+      The compiled model. It has no keyframes if a free joint was removed, because they contain the base's pose.
     """
     spec = spec.copy()
     free = [joint for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_FREE]

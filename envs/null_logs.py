@@ -1,10 +1,13 @@
 """Simulated null logs: what a measured log would look like if the model lacked nothing.
 
-Discovery compares the gain of an effect with the gains that it has on such logs. Among many effects one always fits
-differences that are no physics: an engine's step, its integrator, the moment at which a controller reads the joint.
-A null log therefore has such differences too. The nominal model is simulated by MuJoCo C with half the step, another
-integrator and a controller whose ticks jitter; its masses, armatures, dampings and frictions are drawn from the prior,
-while the controller's gains stay as logged; and the readings get the noise and the rounding found in the measured log.
+Discovery accepts an effect only if it improves the measured log by more than effects improve null logs. Among many
+effects one always improves the fit a little, because it imitates differences that are not physics: an engine's step,
+its integrator, the moment at which a controller reads the joint. A null log therefore has such differences too:
+
+- MuJoCo C simulates the nominal model with half the step, another integrator and a controller whose ticks jitter;
+- its masses, armatures, dampings and frictions are drawn from the prior, its controller's gains
+  are those of the log;
+- the readings get the noise and the rounding that are found in the measured log.
 """
 
 from collections.abc import Sequence
@@ -18,7 +21,7 @@ from envs.logs import Log, Run
 from envs.models import suspended
 from envs.segments import noise, quantum_of, smoothed
 
-_STEP_S = 0.0005
+_STEP_S = 0.0005  # half the step of `Rig`
 _SPREAD = 0.1  # standard deviation of the logarithm of every drawn parameter, as in `Axis.prior_sd`
 
 
@@ -28,11 +31,11 @@ def simulate_null_log(log: Log, spec: mujoco.MjSpec, seed: int) -> Log:
     Args:
       log: the measured log; its targets are played again and its noise is imitated.
       spec: MJCF of the nominal robot.
-      seed: of the drawn parameters, the controller's jitter and the noise.
+      seed: of the drawn parameters, the controller's jitter and the noise. Other seeds give other null logs.
 
     Returns:
-      A log of the same runs, joints and signals. A signal of the controller (targets, supply, enabling) is kept;
-      measured ones are simulated.
+      A log of the same runs, joints and signals. Signals of the controller (targets, supply, enabling) are copied,
+      signals of sensors are simulated.
     """
     rng = np.random.default_rng(seed)
     model = _drawn(spec, rng)
@@ -44,8 +47,10 @@ def _drawn(spec: mujoco.MjSpec, rng: np.random.Generator) -> mujoco.MjModel:
     model = suspended(spec)
     model.opt.timestep = _STEP_S
     model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    # The controller's torque is applied to the joints directly, so the model's own actuators are switched off.
     model.opt.iterations, model.opt.ls_iterations = 100, 50
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION
+    # A heavier link of the same shape: its inertia grows in proportion.
     masses = _factors(rng, model.nbody)
     model.body_mass[:] *= masses
     model.body_inertia[:] *= masses[:, None]
@@ -79,6 +84,7 @@ def replay(run: Run, model: mujoco.MjModel, joints: Sequence[str], rng: np.rando
     qpos = np.array([model.joint(name).qposadr[0] for name in joints])
     dof = np.array([model.joint(name).dofadr[0] for name in joints])
     damping = model.dof_damping[dof].copy()
+    # Smoothed, so that noise in the first row does not become an error of the start.
     data.qpos[qpos], data.qvel[dof] = smoothed(run)[0]
     controller, driven = run.impedance(), "target" in run.signals
     steps = int(np.ceil(1.0 / run.controller.rate_hz / _STEP_S - 1e-9))
@@ -104,6 +110,7 @@ def replay(run: Run, model: mujoco.MjModel, joints: Sequence[str], rng: np.rando
     model.dof_damping[dof] = damping
     signals = dict(run.signals)
     for name, values in {"q": states[:, 0], "dq": states[:, 1], "tau": torques}.items():
+        # Without targets the torques are what was sent, not what was measured.
         if name in signals and (driven or name != "tau"):
             read = np.stack([np.interp(run.time, times, column) for column in values.T], axis=1)
             signals[name] = _as_read(read, run.signals[name], rng)
@@ -114,8 +121,9 @@ def replay(run: Run, model: mujoco.MjModel, joints: Sequence[str], rng: np.rando
 
 
 def _as_read(values: np.ndarray, like: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Gives exact values the noise and the rounding of measured ones."""
+    """Adds the noise and the rounding of measured values to exact ones."""
     quantum = quantum_of(like)
+    # Rounding brings a variance of quantum^2 / 12 of its own, which `noise` has measured as well.
     extra = max(noise(like) ** 2 - quantum**2 / 12.0, 0.0) ** 0.5
     values = values + extra * rng.standard_normal(values.shape)
     return np.round(values / quantum) * quantum if quantum else values

@@ -1,4 +1,7 @@
-"""Sorts the rows of a run by what each joint was doing, so that a misfit can be localised."""
+"""Sorts the rows of a run by what each joint was doing, so that a misfit can be localised.
+
+Effects show in different regimes: dry friction near a reversal, a torque limit where the controller saturates.
+"""
 
 import numpy as np
 
@@ -6,9 +9,9 @@ from envs.logs import Run
 from envs.segments import smoothed
 
 REGIMES = ("steady", "fast", "loaded", "reversal", "saturated", "motor off")
-"""Names of the regimes; where two apply, the later one counts."""
+"""Names of the regimes; where two apply to a row, it gets the later one."""
 
-# Of a joint's own root mean square of speed or torque.
+# In units of the joint's own rms speed or rms torque in the run.
 _FAST, _LOADED, _STILL = 1.5, 1.5, 0.15
 _SATURATED = 0.98  # share of the controller's limit
 
@@ -40,11 +43,11 @@ def regimes(run: Run) -> np.ndarray:
 def control_torque(run: Run, position: np.ndarray, speed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Computes the torque that the controller commanded, and the largest that it could have commanded.
 
-    Of a run without targets the recorded torque is what was commanded, and nothing limited it.
+    In a run without targets the recorded torques are the commanded ones, and nothing limited them.
 
     Args:
       run: as it was read.
-      position: [rows, joints] rad, what the controller is taken to have read.
+      position: [rows, joints] rad, as the controller read it; mostly smoothed readings of the log.
       speed: [rows, joints] rad/s, likewise.
 
     Returns:

@@ -1,10 +1,11 @@
 """A robot on the test rig, suspended or clamped, with every effect of the library built in.
 
-Every effect has coordinates, which are zero where it is not there. A hypothesis about what a model lacks is therefore a
-vector, and one compiled program simulates all of them.
+Every effect has coordinates, which are zero where the effect is absent. A hypothesis about what a model lacks is
+therefore a vector, and one compiled program simulates all of them.
 
-Three forms of the same numbers occur. *Coordinates* are what is searched. *Values* are what effects read
-(`Rig.values`). *Physical values*, in units, are what reports and files hold (`jaxtune.types.Parameter.value`).
+Three forms of the same numbers occur. *Coordinates* are searched, and are of order one. *Values* are what the functions
+of the effects read (`Rig.values`). *Physical values*, in units, stand in reports and files
+(`jaxtune.types.Parameter.value`).
 """
 
 import copy
@@ -29,13 +30,14 @@ from jaxtune.types import Effect, Parameter
 ByEffect = Mapping[str, Mapping[str, jax.Array]]
 """Coordinates or values by effect and parameter, [places] each."""
 
-# Of the solver. With friction in every joint the error is 0.003 of a floor unit (the rms of the noise floor) against
-# twice as many; with four line searches it would be 0.2.
+# Of MJX's solver. With friction in every joint, readings differ from those with twice as many iterations by 0.003 floor
+# units (rms over the rms of the noise floor). With four line searches it would be 0.2.
 _ITERATIONS, _LINE_SEARCHES = 4, 6
 _LONGEST_STEP_S = 0.001
 
-# Parameters that every model has, by the effect that changes them. Each may be off by a tenth of its nominal value, and
-# discovery fits them under all hypotheses, so that an inaccurate number is not taken for a missing effect.
+# Parameters that every model has, by the effect that changes them: link masses, the proportional gain, armature,
+# damping and dry friction. Each may be wrong by a tenth of its nominal value (one prior standard deviation). Discovery
+# fits them under all hypotheses, the null included, so that an inaccurate number is not taken for a missing effect.
 _PRIOR_SHARE = 0.1
 _NOMINAL_RATIOS = ("link_mass", "gain_error")
 _NOMINAL_FIELDS = {"armature": "dof_armature", "viscous": "dof_damping", "coulomb": "dof_frictionloss"}
@@ -43,9 +45,9 @@ _NOMINAL_FIELDS = {"armature": "dof_armature", "viscous": "dof_damping", "coulom
 
 @dataclass(frozen=True)
 class Axis:
-    """One coordinate of a rig: one parameter of one effect at one place, and what a unit of it stands for.
+    """One coordinate of a rig: one parameter of one effect at one place.
 
-    A coordinate of zero leaves the robot as it is. `Rig.scaled` changes what units stand for, and with them `scale`,
+    A coordinate of zero leaves the robot as it is. `Rig.scaled` changes the unit of a coordinate, and with it `scale`,
     `least` and `prior_sd`.
     """
 
@@ -54,17 +56,18 @@ class Axis:
     place: str
     """A joint, a body, or `robot`."""
     index: int
-    """Of the place, among all places where the effect may sit."""
+    """Number of the place among all places where the effect may sit."""
     scale: float
     """What one unit of the coordinate stands for, in the unit of the parameter."""
     least: float
-    """Smallest coordinate. A field of the model keeps at least a tenth of its nominal value, so that it stays
-    positive."""
+    """Smallest coordinate. An effect that subtracts from a field of the model (armature, damping) may take nine tenths
+    of it at most, so that the field stays positive."""
     prior_sd: float
-    """Prior standard deviation, in coordinates, of a parameter that every model has; zero for an effect it lacks."""
+    """Prior standard deviation, in coordinates, of a parameter that every model has (a nuisance that every hypothesis
+    fits); zero for an effect that models lack."""
     joints: tuple[int, ...]
-    """Indices of the joints beside which something at this place shows: the joint itself, or those that carry a
-    link."""
+    """Indices of the joints in which an effect at this place shows directly: the joint itself, or for a link all joints
+    that carry it."""
 
 
 class Rig:
@@ -79,7 +82,8 @@ class Rig:
     Args:
       spec: of the robot; free joints are removed, contacts and its own actuators switched off.
       joints: names of the joints that are controlled and read, in the log's order.
-      control_hz: rate of the controller; its period is a multiple of the simulation's step, which is 1 ms at most.
+      control_hz: rate of the controller. The simulation's step is the longest that divides the controller's period and
+        is no longer than 1 ms.
     """
 
     def __init__(
@@ -106,11 +110,12 @@ class Rig:
         self._bodies = np.array(moving)
         self.bodies = tuple(model.body(i).name for i in moving)
         self.mj_model = model
-        # Joints that move but are neither controlled nor read.
+        # Joints that move but are neither controlled nor read; `check_matches` refuses a model that has some.
         self.others = tuple(
             model.joint(i).name or f"joint {i}" for i in range(model.njnt) if model.jnt_qposadr[i] not in self.qpos
         )
-        # MJX solves for friction only in joints that had some when the model was put on the device.
+        # Another copy for MJX, which solves for friction only in joints that had some when the model was put on the
+        # device. `mj_model` keeps the nominal friction, from which priors and saved models are computed.
         device = suspended(spec)
         device.opt.timestep, device.opt.disableflags = self.dt, model.opt.disableflags
         device.opt.iterations, device.opt.ls_iterations = _ITERATIONS, _LINE_SEARCHES
@@ -118,6 +123,7 @@ class Rig:
         self._model = mjx.put_model(device)
         self._data = mjx.make_data(self._model)
         self._scales: Mapping[str, np.ndarray] = {}
+        # A robot on a rig has no feet on the ground, so effects of contact have no place and drop out below.
         self.places = {"joint": self.joints, "body": self.bodies, "foot": (), "robot": ("robot",)}
         self.effects = {row.name: row for row in EVERY.values() if self.places[row.on] and row.needs != "free"}
         self.chain = Chain(self.dt, tuple(self.effects.values()), self.qpos, self.dof, self._bodies)
@@ -167,6 +173,7 @@ class Rig:
 
     def _describe(self, row: Effect, parameter: Parameter, place: str, index: int, scale: float) -> Axis:
         least, prior_sd, fields = parameter.bounds[0], 0.0, parameter.fields
+        # Armature and damping must stay positive.
         if parameter.form == "added" and row.on == "joint" and fields:
             least = max(least, -0.9 * getattr(self.mj_model, fields[0])[self.dof[index]] / scale)
         if row.name in _NOMINAL_RATIOS:
@@ -186,7 +193,10 @@ class Rig:
         )
 
     def tree(self, vector: jax.Array) -> dict[str, dict[str, jax.Array]]:
-        """Splits a vector [axes] into [places] by effect and parameter, in the order of `axes`."""
+        """Splits a vector of coordinates [axes] into arrays [places] by effect and parameter.
+
+        The vector is in the order of `axes`. Use it where a search, which knows vectors alone, meets the effects.
+        """
         tree, start = {}, 0
         for name, row in self.effects.items():
             count = len(self.places[row.on])
@@ -197,7 +207,10 @@ class Rig:
         return tree
 
     def scale(self, effect: Effect, parameter: Parameter) -> np.ndarray:
-        """Returns what a coordinate of one stands for at every place, [places], in the parameter's own unit."""
+        """Returns the size of one unit of a coordinate at every place of an effect, [places], in the parameter's unit.
+
+        It is one where `scaled` was given no such scale.
+        """
         ones = np.ones(len(self.places[effect.on]), np.float32)
         return np.asarray(self._scales.get(parameter.scale, 1.0) * ones, np.float32)
 
@@ -229,6 +242,7 @@ class Rig:
         if on == "joint":
             return {self.joints.index(place)}
         found, body = set(), self.mj_model.body(place).id if on == "body" else 0
+        # From the body up to the world, whose id is 0; the whole robot is no body and finds nothing.
         while body > 0:
             mine = self.mj_model.jnt_bodyid[[self.mj_model.joint(joint).id for joint in self.joints]] == body
             found |= set(np.flatnonzero(mine).tolist())
@@ -236,7 +250,11 @@ class Rig:
         return found
 
     def model(self, values: ByEffect) -> mjx.Model:
-        """Makes the MJX model whose fields have the values of the effects that enter the model."""
+        """Makes the MJX model whose fields have the values of the effects that enter the model.
+
+        Every parameter of such an effect becomes a row of a table for `jaxtune.mjx.apply`, which recomputes the derived
+        fields as well.
+        """
         entries, params = {}, {}
         for name, row in self.effects.items():
             if row.enters != "model":
@@ -257,12 +275,18 @@ class Rig:
         return parameters.apply(self._model, params, entries)
 
     def inner(self, vectors: np.ndarray) -> np.ndarray:
-        """Translates vectors of coordinates [n, axes] into values [n, axes], the form that effects read."""
+        """Translates vectors of coordinates [n, axes] into values [n, axes], the form that effects read.
+
+        It is `values` for flat vectors, in the order of `axes`.
+        """
         trees = [self.values(self.tree(vector)) for vector in vectors]
         return np.array([np.concatenate([leaf for row in tree.values() for leaf in row.values()]) for tree in trees])
 
     def values(self, coords: ByEffect) -> ByEffect:
-        """Translates coordinates into values, the form that effects read (`jaxtune.types.Parameter.inner`)."""
+        """Translates coordinates into values, the form that effects read (`jaxtune.types.Parameter.inner`).
+
+        Both are [places] by effect and parameter; zero coordinates give values with which no effect acts.
+        """
         return {
             name: {
                 parameter.name: parameter.inner(coords[name][parameter.name], self.scale(row, parameter))
@@ -274,8 +298,8 @@ class Rig:
     def simulate(self, values: ByEffect, segment: Segment) -> dict[str, jax.Array]:
         """Simulates a segment of a log under one hypothesis.
 
-        The history of the segment fills the memories of the effects; then the robot starts from its measured state,
-        with the errors of its sensors undone, and is simulated to the segment's end.
+        First the measured history before the segment fills the memories of the effects. Then the robot starts from its
+        measured state, with the errors of its sensors undone, and is simulated to the segment's end.
 
         Args:
           values: of all effects, as `values` returns them.
@@ -285,6 +309,7 @@ class Rig:
           Readings at the segment's rows by signal: `q`, `dq` and `tau` [rows, joints], `gravity` [rows, 3].
         """
         model = self.model(values)
+        # Measured states go on for `LONGEST_S` after the start, because undoing a delay needs later readings.
         before = len(segment.measured) - 1 - round(LONGEST_S / self.dt)
         drive = {
             name: getattr(segment, name)
@@ -292,13 +317,15 @@ class Rig:
         }
         past = jax.tree.map(lambda x: x[:before], drive)
         future = jax.tree.map(lambda x: x[before:], drive)
+        # The readings as they would have been without this hypothesis' sensor errors.
         truth = segment.measured
         chain = self.chain
         for row in chain.entering("sensor"):
             if row.undo is not None:
                 truth = row.undo(values[row.name], truth, self.dt)
+        # Part of a motor's torque accelerates its own rotor and does not press on the gears (`envs.effects`).
         rotor, acceleration = model.dof_armature[self.dof], jnp.gradient(truth[:, 1], self.dt, axis=0)
-        # Until backlash and wind-up are known, the motor's readings are taken for the joint's.
+        # Encoders sit on the motor. Until its offset from the joint is known, its readings stand for the joint's.
         memory = chain.start(values, truth[0], jax.tree.map(lambda x: x[0], drive))
 
         def remember(memory, inputs):
@@ -307,6 +334,7 @@ class Rig:
 
         memory, _ = jax.lax.scan(remember, memory, (truth[:before], rotor * acceleration[:before], past))
         start = truth[before] - chain.ahead(memory)
+        # The chain's first step needs an acceleration, for the rotors' torque.
         data = self._data.replace(
             qpos=self._data.qpos.at[self.qpos].set(start[0]),
             qvel=self._data.qvel.at[self.dof].set(start[1]),
@@ -319,9 +347,10 @@ class Rig:
             return (data, memory), read
 
         _, read = jax.lax.scan(move, (data, memory), future)
-        # Rows lie between steps of the simulation.
+        # The rows of a log lie between steps of the simulation, so readings are interpolated.
         step, share = segment.row_step, segment.row_share[:, None]
         following = jnp.minimum(step + 1, len(future["sample"]) - 1)
         read = jax.tree.map(lambda x: x[step] + share * (x[following] - x[step]), read)
+        # The base does not move, so the IMU reads the same at all rows.
         gravity, _ = chain.stage("gravity", values, self._gravity, None, {})
         return read | {"gravity": jnp.broadcast_to(gravity, (len(step), 3))}

@@ -1,4 +1,8 @@
-"""What one unit of each coordinate stands for, measured on what the robot did."""
+"""Measures the scales of a rig's coordinates: the physical size that one unit of each stands for.
+
+Discovery searches many effects at once, whose units differ (Nm, kg, s). Scaled by what the robot did in the log, a
+coordinate of one is a large effect for all of them, on a servo as on a biped.
+"""
 
 from collections.abc import Sequence
 
@@ -11,14 +15,25 @@ from envs.segments import smoothed
 
 
 def measure_scales(rig: Rig, runs: Sequence[Run]) -> dict[str, np.ndarray]:
-    """Measures scales that make coordinates of one unit matter about equally, whatever the robot's size.
+    """Measures scales with which one unit of every coordinate matters about equally, whatever the robot's size.
 
-    A unit of friction is the torque that the joint had, a unit of inertia what it felt of the robot, and so on. Hand
-    the result to `Rig.scaled`.
+    With rms values over all rows, tau the controller's torque and dq the joint's speed, per joint or body:
+
+        torque     rms(tau)                    Nm
+        damping    rms(tau) / rms(dq)          Nm s/rad
+        stiffness  rms(tau) / 0.02             Nm/rad
+        inertia    diagonal of the joint-space inertia in the mean pose, kg m^2
+        mass       mass of the body            kg
+        drag       9.81 mass                   N s/m
+        speed      rms(dq)                     rad/s
+        slow       0.1 rms(dq)                 rad/s
+        motor      largest limit / rms(dq)     Nm s/rad
+
+    Hand the result to `Rig.scaled`.
 
     Args:
       rig: the robot.
-      runs: what it did; sealed runs must not be among them.
+      runs: of the log, without sealed ones: they set the sizes at which effects are tried, and must not see the test.
 
     Returns:
       [places] by the name of the scale (`jaxtune.types.Scale`).
@@ -29,16 +44,17 @@ def measure_scales(rig: Rig, runs: Sequence[Run]) -> dict[str, np.ndarray]:
         wanted, most = control_torque(run, position, velocity)
         torque.append(wanted)
         speed.append(velocity)
+        # An infinite limit is no limit; without any, `motor` is tiny.
         limit.append(np.where(np.isfinite(most), most, 0.0))
         pose.append(position)
     mass, inertia = rig.inertias(np.concatenate(pose).mean(axis=0))
     return {
         "torque": _rms(torque),
         "damping": _rms(torque) / _rms(speed),
-        "stiffness": _rms(torque) / 0.02,  # a joint that winds up by 20 mrad under the torque that it had
+        "stiffness": _rms(torque) / 0.02,  # of a spring that winds up by 20 mrad under the rms torque
         "inertia": inertia,
         "mass": mass,
-        "drag": mass * 9.81,  # N s/m that weigh as much as the link at 1 m/s
+        "drag": mass * 9.81,  # a drag that equals the link's weight at 1 m/s
         "speed": _rms(speed),
         "slow": 0.1 * _rms(speed),
         "motor": np.maximum(np.concatenate(limit).max(axis=0), 1e-6) / _rms(speed),

@@ -1,8 +1,8 @@
 """Cuts logs into segments: short pieces, each simulated from a measured state.
 
-Over a short piece the simulation stays close to the robot, and a wrong effect cannot compensate for a missing one over
-time. Each segment carries the history before it, so that effects with a memory (delays, lags, backlash) start with what
-they would remember. The module also estimates states and noise of a run, which segments are made with.
+Over a short piece the simulation stays close to the robot. In a long one a wrong effect can compensate for a missing
+one. Each segment carries the history before it, so that effects with a memory (delays, lags, backlash) start with what
+they would remember. The module also estimates the states and the noise of a run, from which segments are made.
 """
 
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ from envs.effects.memory import LONGEST_S
 from envs.logs import Run
 
 _SMOOTHING_S = 0.012  # half width of the local fit behind `smoothed`
-_MIN_HALF_ROWS = 2
+_MIN_HALF_ROWS = 2  # a parabola needs three rows
 HISTORY_S = LONGEST_S + 0.02
 """Length of the history before a segment, in s: the longest delay and some time for lags to settle."""
 
@@ -44,7 +44,10 @@ class Segment:
 
 @dataclass(frozen=True)
 class Cut:
-    """Segments of several runs, all of one length, and the measured signals at their rows."""
+    """Segments of several runs, all of one length, and the measured signals at their rows.
+
+    Simulate `segments` in one batch (`Rig.simulate`) and compare the readings with `signals`.
+    """
 
     segments: Segment
     """[segments, ...] on every field."""
@@ -72,6 +75,7 @@ def smoothed(run: Run) -> np.ndarray:
     """
     time, position = run.time, run.signals["q"]
     half = max(_MIN_HALF_ROWS, round(_SMOOTHING_S / np.median(np.diff(time))))
+    # At both ends of the run the fit is one-sided: the first or last row counts several times.
     index = np.clip(np.arange(len(time))[:, None] + np.arange(-half, half + 1), 0, len(time) - 1)
     offset = time[index] - time[:, None]
     ones, zeros = np.ones_like(offset), np.zeros_like(offset)
@@ -82,7 +86,7 @@ def smoothed(run: Run) -> np.ndarray:
         slopes = np.stack([zeros, ones, offset], axis=-1) / sd
         design, value = np.concatenate([design, slopes], axis=1), np.concatenate([value, velocity[index] / sd], axis=1)
     width = half * np.median(np.diff(time))
-    scale = np.array([1.0, 1.0 / width, 1.0 / width**2])  # or the normal equations would be badly conditioned
+    scale = np.array([1.0, 1.0 / width, 1.0 / width**2])  # without it the normal equations are badly conditioned
     design = design * scale
     normal = np.einsum("rki,rkj->rij", design, design) + 1e-9 * np.eye(3)
     fit = np.linalg.solve(normal, np.einsum("rki,rkj->rij", design, value)) * scale[:, None]
@@ -92,12 +96,14 @@ def smoothed(run: Run) -> np.ndarray:
 def velocity_lag(run: Run) -> float:
     """Estimates by how many seconds recorded velocities lag behind the slopes of recorded positions.
 
-    A lag means that the robot filtered its velocities before they were logged. It is searched on a grid of 1 ms from
-    -10 to 50 ms, by least squares over all joints.
+    A lag means that the robot filtered its velocities before they were logged. Discovery then leaves them out, because
+    their lag would pass for one of the robot's own. The search is on a grid of 1 ms from -10 to 50 ms, by least
+    squares over all joints.
 
     Args:
       run: with `q` and `dq`.
     """
+    # Slopes of the positions alone: with `dq` among the signals the fit would follow it.
     own = smoothed(replace(run, signals={"q": run.signals["q"]}))[:, 1]
     lags = np.arange(-0.01, 0.051, 0.001)
     misfit = [
@@ -116,7 +122,7 @@ def noise(values: np.ndarray) -> float:
         1.4826 median |third difference| / sqrt(20)
 
     Motion that is smooth over four rows drops out of a third difference, whose variance is 20 times that of the noise.
-    The estimate is at least that of the signal's rounding, and never zero.
+    The estimate is never below the noise of the signal's rounding, quantum / sqrt(12), and never zero.
 
     Args:
       values: [rows, ...].
@@ -133,7 +139,7 @@ def quantum_of(values: np.ndarray) -> float:
       values: [rows, ...].
 
     Returns:
-      The smallest step between consecutive rows where the other steps are its multiples, else zero.
+      The smallest step between consecutive rows if the other steps are multiples of it; zero for an unrounded signal.
     """
     steps = np.unique(np.round(np.abs(np.diff(values, axis=0)), 9))
     steps = steps[steps > 1e-7]
@@ -154,7 +160,8 @@ def cut(runs: Sequence[Run], horizon_s: float, dt: float, bin_s: float = 0.01) -
       bin_s: length of the bins that residuals are averaged over later; a segment is a whole number of them.
 
     Returns:
-      The segments and the signals that all runs have. `tau` is left out where it is what was sent, not measured.
+      The segments and the signals that all runs have. `tau` is left out if a run has no targets, because its torques
+      were then sent, not measured.
 
     Raises:
       ValueError: no run is longer than a segment and its history.
@@ -164,6 +171,7 @@ def cut(runs: Sequence[Run], horizon_s: float, dt: float, bin_s: float = 0.01) -
     rows = max(1, round(horizon_s / period / together)) * together
     pieces = []
     for number, run in enumerate(runs):
+        # Every segment needs a history, the first one too.
         first = int(np.searchsorted(run.time, run.time[0] + HISTORY_S))
         pieces += [(number, start) for start in range(first, len(run.time) - rows, rows)]
     if not pieces:
@@ -219,7 +227,7 @@ def whole(runs: Sequence[Run], dt: float) -> Cut:
 
 
 def rows_together(period_s: float, bin_s: float) -> int:
-    """Returns how many rows a bin has, one at least.
+    """Computes how many rows a bin has, one at least. Residuals are averaged over a bin (`cut`).
 
     Args:
       period_s: time between rows.

@@ -36,7 +36,7 @@ def rotate_inverse(quat: jax.Array, vector: jax.Array) -> jax.Array:
 def projected_gravity(quat: jax.Array) -> jax.Array:
     """Computes the direction of gravity in the body frame, a unit vector [3]; (0, 0, -1) of an upright body.
 
-    It is what an accelerometer gives of orientation, without heading.
+    It is the part of the orientation that an accelerometer at rest can measure: roll and pitch, without heading.
 
     Args:
       quat: orientation of the body, [4] (w, x, y, z).
@@ -47,9 +47,10 @@ def projected_gravity(quat: jax.Array) -> jax.Array:
 def clock(phase: jax.Array) -> jax.Array:
     """Encodes each foot's phase, [2] cycles, as sine and cosine, [4]: left sine, left cosine, right sine, right cosine.
 
-    A phase itself jumps from one to zero, which a network should not see.
+    The phase itself jumps from one to zero once a stride. A network would see two neighbouring moments as far apart.
     """
     angle = 2.0 * jnp.pi * phase
+    # Stacked along the last axis, so that sine and cosine of one foot stand side by side.
     return jnp.stack([jnp.sin(angle), jnp.cos(angle)], axis=-1).reshape(-1)
 
 

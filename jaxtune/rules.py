@@ -117,7 +117,7 @@ class Collected:
     """
 
     trajectory: Trajectory  # D_q, [episodes, time]
-    coords: dict  # true coordinates of the episodes of D_q, [episodes] by name
+    sampled_coords: dict  # true coordinates of the episodes of D_q, [episodes] by name
     held_out: Trajectory  # [sets, set_episodes, time]
     held_out_coords: dict  # true coordinates of the held-out sets, [sets] by name
 
@@ -237,7 +237,7 @@ def vote_update(
       dist: the distribution that the episodes were drawn from.
       knobs: `step_size`, in radii per unit of vote.
     """
-    model, loss = spm.train(key, config.spm, collected.trajectory, collected.coords, dist)
+    model, loss = spm.train(key, config.spm, collected.trajectory, collected.sampled_coords, dist)
     step = knobs.step_size * spm.vote(config.spm, model, measured)
     unknown = jnp.full_like(step, jnp.nan)
     info = UpdateInfo(step=step, interval=unknown, identifiable=jnp.ones_like(step, bool), loss=loss)
@@ -270,7 +270,7 @@ def posterior_update(
       dist: the distribution that the episodes were drawn from.
       knobs: not used.
     """
-    model, loss = spm.train(key, config.spm, collected.trajectory, collected.coords, dist)
+    model, loss = spm.train(key, config.spm, collected.trajectory, collected.sampled_coords, dist)
     held_out = jax.lax.map(lambda episodes: spm.estimate(config.spm, model, episodes), collected.held_out)
     # The errors on robots with known coordinates stand for the error on the measured one.
     truth = dists.normalise(dist, collected.held_out_coords)

@@ -300,7 +300,7 @@ class Tuner:
         trajectory = self.simulate(key_simulate, policy, every)
         return Collected(
             trajectory=jax.tree.map(lambda leaf: leaf[: self.config.episodes], trajectory),
-            coords=coords,
+            sampled_coords=coords,
             held_out=jax.tree.map(
                 lambda leaf: leaf[self.config.episodes :].reshape(sets, each, *leaf.shape[1:]), trajectory
             ),

@@ -134,7 +134,7 @@ def collect(key: jax.Array, dist: ParamDist, config: TunerConfig = TUNER) -> Col
     shape = config.held_out_sets, config.set_episodes
     return Collected(
         trajectory=Slider().simulate(key_simulate, policy(), coords),
-        coords=coords,
+        sampled_coords=coords,
         held_out=jax.tree.map(lambda leaf: leaf.reshape(*shape, *leaf.shape[1:]), held_out),
         held_out_coords=truths,
     )

@@ -1,4 +1,7 @@
-"""A batch of BITenos behind Brax's environment interface, for PPO."""
+"""A batch of BITenos behind Brax's environment interface, for PPO (`jaxtune.ppo`).
+
+Every robot has its own physical parameters, and starts a new episode by itself when one ends.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -62,8 +65,11 @@ class BraxBiteno(BraxEnv):
         """
         params = state.info["params"]
         robots = jax.vmap(self._robot.step)(params, state.pipeline_state, action)
+        # An episode that ends by a fall in the very step of the time limit counts as a fall: its value is zero.
         truncation = (robots.steps >= self._limit) * (1.0 - robots.done)
         ended = (robots.done + truncation) > 0
+        # New random states, where Brax's own wrapper would go back to one cached state. All robots are reset in every
+        # step and most of the results thrown away; a state without an `mjx.Data` keeps that cheap.
         fresh = jax.vmap(self._robot.reset)(params, robots.key)
         following = jax.tree.map(
             lambda new, old: jnp.where(ended.reshape(-1, *[1] * (old.ndim - 1)), new, old), fresh, robots
@@ -84,15 +90,15 @@ class BraxBiteno(BraxEnv):
 
     @property
     def observation_size(self) -> int:
-        """Number of components of an observation: 40."""
+        """Number of components of an observation, 40; `envs.sensing.LAYOUT` lists them."""
         return self._robot.observation_size
 
     @property
     def action_size(self) -> int:
-        """Number of components of an action: 6."""
+        """Number of components of an action, 6: one per joint, in the order of `constants.JOINTS`."""
         return self._robot.action_size
 
     @property
     def backend(self) -> str:
-        """Name of the physics engine, which Brax asks for."""
+        """Name of the physics engine; Brax's environment interface requires it, and nothing here reads it."""
         return "mjx"

@@ -55,7 +55,7 @@ and a half touchdowns a step."""
 
 
 def _mass(name: str, *bodies: str) -> Entry:
-    # A heavier link of the same shape: inertia grows with mass.
+    # A heavier link of the same shape: its inertia grows in proportion to its mass.
     return Entry(name=name, kind="body", targets=bodies, fields=("body_mass", "body_inertia"), bounds=(0.2, 5.0))
 
 
@@ -101,7 +101,7 @@ ENTRIES = {
             column=0,
             bounds=(0.5, 4.0),
         ),
-        # For as long, the joints still follow the previous target.
+        # Time for which the joints still follow the previous target.
         Entry(name="action_delay_s", kind="control", targets=(), fields=(), bounds=(0.0, POLICY_DT_S), log=False),
     )
 }

@@ -23,19 +23,23 @@ from envs.chain import MIN_FRICTION_NM
 from jaxtune.mjx import parameters
 
 ACTION_LIMIT = 10.0
+"""Actions are clipped to +- this. The policy's Gaussian is not squashed: tanh would hold the knee within 0.25 rad of
+the stand, and a lift of 8 cm needs 0.55 rad."""
 _MIN_HEIGHT_M = 0.35
 _MAX_TILT_COS = np.cos(np.pi / 4)
 
 _BASES = ("stand", "raibert")
-# time step in s, steps in a policy step, solver iterations, line-search iterations
+# Time step in s, steps in a policy step, solver iterations, line-search iterations. At 1 ms, three iterations agree
+# with more of them to five decimals after 0.3 s; one is off by up to 0.023 rad.
 _PHYSICS = {"exact": (0.001, 10, 3, 5), "fast": (0.002, 5, 2, 5)}
 
 
 class Biteno:
-    """BITeno and its task as pure functions of a state: `reset`, `step`, and the parts that other engines replace.
+    """BITeno and its task as pure functions of a state: `reset`, `step`, and the parts of a step.
 
-    A step is `settle(state, drive, simulate(params, state, drive))`. Another engine simulates a `Drive` and hands its
-    `Motion` to `settle` (`envs.targets.host`), so observation, reward and termination are the same code everywhere.
+    A step has three parts. `drive` turns the action into joint targets, `simulate` moves the robot in MJX, and `settle`
+    computes observation, reward and termination. Another engine replaces `simulate` alone (`envs.targets.host`), so
+    everything else is the same code everywhere.
 
     Args:
       config: the task.
@@ -77,7 +81,7 @@ class Biteno:
         self._data = mjx.make_data(model)
 
     def _prepare(self, model: mujoco.MjModel) -> None:
-        """Changes what MJX needs to find in a model when it is put on the device."""
+        """Prepares a model before it is put on the device, since MJX fixes then which constraints it will solve."""
         for entry in self.entries.values():
             if "dof_frictionloss" in entry.fields:
                 # MJX solves for friction only in joints that had some when the model was put on the device.
@@ -89,7 +93,10 @@ class Biteno:
             model.opt.ls_iterations *= 2
 
     def model(self, params: parameters.Params) -> mjx.Model:
-        """Makes the MJX model of the robot with these physical parameters (`jaxtune.mjx.apply`)."""
+        """Makes the MJX model of the robot with these physical parameters (`jaxtune.mjx.apply`).
+
+        Every step makes its model anew, so parameters may differ between robots of a batch and change in an episode.
+        """
         return parameters.apply(self._model, params, self.entries)
 
     def reset(self, params: parameters.Params, key: jax.Array) -> State:
@@ -113,6 +120,7 @@ class Biteno:
             qvel=qvel,
             qacc_warmstart=jnp.zeros_like(qvel),
             command=self._draw_command(key_command),
+            # The legs are half a cycle apart.
             phase=jnp.mod(jax.random.uniform(key_phase) + jnp.array([0.0, 0.5]), 1.0),
             action=zeros,
             joint_error=zeros,
@@ -154,6 +162,7 @@ class Biteno:
         reference = gait.joint_reference(state.phase, state.command)
         base = reference if self.config.base == "raibert" else jnp.asarray(constants.STAND_RAD)
         target = base + self.config.action_scale * action
+        # The error is the last target less the reading, so the sum is the last target.
         held = state.joint_error + self.perceive(state)["joint"]
         delay = params.get("action_delay_s", 0.0) / self.mj_model.opt.timestep
         # In the sub-step in which the delay ends, the two targets are averaged by their shares of time.
@@ -164,6 +173,7 @@ class Biteno:
     def simulate(self, params: parameters.Params, state: State, drive: Drive) -> Motion:
         """Simulates one policy step in MJX; the only part of a step that other engines replace."""
         model = self.model(params)
+        # The solver starts from the last step's accelerations, as it would in one continuous simulation.
         data = self._data.replace(qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.qacc_warmstart)
         data, _ = jax.lax.scan(lambda data, ctrl: (mjx.step(model, data.replace(ctrl=ctrl)), None), data, drive.targets)
         return Motion(
@@ -175,7 +185,8 @@ class Biteno:
         )
 
     def _foot_force(self, model: mjx.Model, data: mjx.Data) -> jax.Array:
-        # Only the floor touches a shank, so the external force on it is the floor's on the foot.
+        # Only the floor touches a shank, so the external force on it is the floor's on the foot. `cfrc_ext` holds the
+        # torque first, then the force.
         return mjx.rne_postconstraint(model, data)._impl.cfrc_ext[self._shanks, 3:]
 
     def settle(self, state: State, drive: Drive, motion: Motion) -> State:
@@ -198,8 +209,10 @@ class Biteno:
         )
         key, key_command, key_noise, key_push = jax.random.split(state.key, 4)
         steps = state.steps + 1
+        # Of a broken step no memory is kept: the effects go on from the one before.
         memory = jax.tree.map(lambda new, old: jnp.where(finite, new, old), motion.memory, state.memory)
         moved = state.replace(qpos=qpos, qvel=self._push(key_push, qvel, steps), memory=memory)
+        # The reward is of the true state; sensor errors and noise are in the observation alone.
         readings = self._readings(moved)
         values = rewards.terms(
             **readings,
@@ -210,11 +223,13 @@ class Biteno:
             last_action=state.action,
             joint_reference=drive.reference,
         )
+        # Contact is that of the last sub-step, so it is compared with the clock at the end of the step.
         phase = gait.advance(state.phase)
         shaped = rewards.shaping(foot_force=motion.foot_force, phase=phase)
         values |= {name: shaped[name] for name in self.config.shaping}
         values = {name: jnp.where(finite, value, 0.0) for name, value in values.items()}
         trained = rewards.weigh(values, self.config.weights) + rewards.weigh(values, self.config.shaping)
+        # MuJoCo's position of the free joint is the trunk's origin, which lies on the hip axis.
         fell = fallen(readings["gravity"], qpos[2])
         done = (fell | ~finite).astype(jnp.float32)
 

@@ -14,7 +14,8 @@ _PRESS_N = 10.0  # normal force from which on the ratio of tangential to normal 
 def advance(phase: jax.Array, steps: int = 1) -> jax.Array:
     """Advances phases [...] in cycles by a number of policy steps, which may be negative.
 
-    Each foot's phase is in stance below 0.5 and in swing above; it runs at 1.75 cycles a second.
+    Each foot's phase is in stance below 0.5 and in swing above; it runs at 1.75 cycles a second. The clock never stops,
+    not even for a command of zero, because a robot on point feet cannot stand still.
     """
     return jnp.mod(phase + steps * constants.CLOCK_HZ * constants.POLICY_DT_S, 1.0)
 
@@ -40,6 +41,7 @@ def foot_reference(phase: jax.Array, command: jax.Array) -> jax.Array:
     Returns:
       [2, 3] m, in the trunk's axes, from each hip.
     """
+    # 0.5 at touchdown and -0.5 at lift-off, in strides of one stance.
     reach = jnp.abs(1.0 - 2.0 * phase) - 0.5
     stance_s = constants.DUTY / constants.CLOCK_HZ
     x = reach * (command[0] - command[2] * constants.HIP_Y_M) * stance_s
@@ -98,9 +100,11 @@ def foot_motion(qpos: jax.Array, qvel: jax.Array) -> tuple[jax.Array, jax.Array]
     joint, joint_velocity = (values.reshape(2, 3) for values in (qpos[7:], qvel[6:]))
     turn = jax.vmap(lambda axis: sensing.rotate(qpos[3:7], axis), out_axes=1)(jnp.eye(3))
     centre, centre_velocity = jax.jvp(_foot_in_trunk, (joint,), (joint_velocity,))
+    # MuJoCo gives a free joint's angular velocity in the body's frame, its linear velocity in the world's.
     spin = turn @ qvel[3:6]
     abduction, knee = turn[:, 0], jax.vmap(lambda angle: turn @ _about_x(angle)[:, 1])(joint[:, 0])
     shank_spin = spin + joint_velocity[:, :1] * abduction + joint_velocity[:, 1:].sum(axis=1, keepdims=True) * knee
+    # The foot is a sphere fixed to the shank, so its lowest point moves with the shank's rotation too.
     lowest = jnp.array([0.0, 0.0, -constants.FOOT_RADIUS_M])
     offset = centre @ turn.T
     velocity = qvel[:3] + jnp.cross(spin, offset) + centre_velocity @ turn.T + jnp.cross(shank_spin, lowest)
@@ -147,7 +151,10 @@ def quality(
     alive: np.ndarray,
     fell: np.ndarray,
 ) -> dict[str, float]:
-    """Measures a gait. These numbers distinguish a walk from a buzz of the feet, which earns nearly the same return.
+    """Measures a gait in numbers that distinguish a walk from a buzz of the feet.
+
+    A buzz (many short steps that hardly lift the feet) earns nearly the same return, so the return alone shows too
+    little.
 
     Args:
       qpos: [episodes, time, 13], as in `Motion`; a recording (`envs.targets.protocol.Recording`), as are the next five.

@@ -1,15 +1,16 @@
 """The reward: terms of the paper's Table I, unweighted, and terms that shape learning beside it.
 
-Two slips in print are corrected. Orientation is the horizontal part of projected gravity: |g|^2 is always one, and a
-policy that pays for it learns to fall. Joint acceleration is squared; the square is missing in print. As in legged_gym,
-whose form this is, acceleration is a finite difference over a policy step, and every term is multiplied by the length
-of that step.
+Two slips in print are corrected. Orientation is the horizontal part of projected gravity, g_xy. In print it is |g|^2,
+which is always one: a constant cost per step, under which a policy learns to fall. Joint acceleration is squared; the
+square is missing in print. The form is that of legged_gym: acceleration is a finite difference over a policy step, and
+every term is multiplied by the length of that step.
 
 Table I's weights score a walk, but training with them alone does not produce one. Training therefore differs in four
 things, each with a weight or a size of its own: Raibert's term weighs more and the action rate less
 (`constants.WALKING`), actions are added to Raibert's reference (`TaskConfig.base`), contact outside the clock's stance
-costs (`shaping`, `constants.SHAPING`), and the robot is pushed (`TaskConfig.push_mps`). With the clock's term a walk
-lands once a step, without it one and a half times; policies trained with pushes hardly fall under them.
+costs (`shaping`, `constants.SHAPING`), and the robot is pushed (`TaskConfig.push_mps`). With the term for contact a
+foot touches down once a step, without it one and a half times. Policies that were trained with pushes hardly ever fall
+when they are pushed.
 """
 
 from collections.abc import Mapping

@@ -25,7 +25,7 @@ class TaskConfig:
     action_scale: float = 0.25
     """Joint target in rad per unit of action."""
     noise: float = 0.0
-    """Width of the observation noise in units of `sensing.NOISE`."""
+    """Factor on the observation noise of `sensing.NOISE`; zero is none."""
     weights: Mapping[str, float] = field(default_factory=lambda: dict(constants.WALKING))
     """Trained reward: weight of every term of Table I."""
     shaping: Mapping[str, float] = field(default_factory=lambda: dict(constants.SHAPING))
@@ -52,12 +52,12 @@ class State:
 
     qpos: jax.Array  # [13]
     qvel: jax.Array  # [12]
-    qacc_warmstart: jax.Array  # [12]
-    command: jax.Array  # [3] m/s, m/s, rad/s
+    qacc_warmstart: jax.Array  # [12] accelerations from which the solver starts
+    command: jax.Array  # [3] m/s, m/s, rad/s, of the next step
     phase: jax.Array  # [2] cycles
-    action: jax.Array  # [6]
-    joint_error: jax.Array  # [6] rad
-    obs: jax.Array  # [40]
+    action: jax.Array  # [6], the last one, clipped
+    joint_error: jax.Array  # [6] rad, last target less the joint's reading
+    obs: jax.Array  # [40], from which the policy chooses the next action
     reward: jax.Array  # trained reward
     score: jax.Array  # reward under the weights of Table I
     done: jax.Array  # 1 where the robot fell or is not finite
@@ -70,7 +70,10 @@ class State:
 
 @chex.dataclass(frozen=True)
 class Drive:
-    """Joint targets of one policy step, as an action sets them; what an engine is given."""
+    """Joint targets of one policy step, as an action sets them.
+
+    `Biteno.drive` makes it. An engine reads `targets`; `Biteno.settle` reads the other fields.
+    """
 
     action: jax.Array  # [6] clipped
     target: jax.Array  # [6] rad
@@ -80,7 +83,10 @@ class Drive:
 
 @chex.dataclass(frozen=True)
 class Motion:
-    """Where an engine leaves the robot after a policy step; what an engine must answer."""
+    """Where an engine leaves the robot after a policy step.
+
+    Every engine must return one (`Biteno.simulate`, `envs.targets.host.Engine`); `Biteno.settle` reads it.
+    """
 
     qpos: jax.Array  # [13] m, quaternion (w, x, y, z) and rad, in MuJoCo's order
     qvel: jax.Array  # [12] m/s in the world, rad/s in the trunk, rad/s

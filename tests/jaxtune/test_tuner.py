@@ -64,7 +64,7 @@ def scripted_gate(key, config, collected, measured, knobs):
 
     Of 128 uniform draws the outermost is at more than 0.9 of the radius, so it tells how often the radius grew.
     """
-    outermost = jnp.abs(dists.ravel(collected.coords)).max()
+    outermost = jnp.abs(dists.ravel(collected.sampled_coords)).max()
     widenings = jnp.round(jnp.log(outermost / FIRST_RADIUS) / jnp.log(1.5)).astype(int)
     nan = jnp.asarray(jnp.nan)
     threshold = jnp.where(jnp.isnan(knobs.threshold), 1.0, knobs.threshold)
@@ -210,10 +210,10 @@ def test_collected_episodes_keep_to_their_coordinates():
     assert collected.trajectory.obs.shape == (7, 60, 2)
     assert collected.held_out.obs.shape == (4, 3, 60, 2)
     assert collected.held_out.fell.shape == (4, 3)
-    np.testing.assert_array_equal(collected.trajectory.obs[:, 0], dists.ravel(collected.coords))
+    np.testing.assert_array_equal(collected.trajectory.obs[:, 0], dists.ravel(collected.sampled_coords))
     for episode in range(3):
         np.testing.assert_array_equal(collected.held_out.obs[:, episode, 0], dists.ravel(collected.held_out_coords))
-    everything = np.concatenate([collected.coords["mass"], collected.held_out_coords["mass"]])
+    everything = np.concatenate([collected.sampled_coords["mass"], collected.held_out_coords["mass"]])
     assert len(np.unique(everything)) == 11
     assert np.abs(everything).max() <= 0.2
 
@@ -237,7 +237,7 @@ def drawn_gate(key, config, collected, measured, knobs):
 
 
 def drawn_update(key, config, collected, measured, dist, knobs):
-    step = knobs.step_size * jax.random.normal(key, (len(dist.centre),)) + collected.coords["mass"].mean()
+    step = knobs.step_size * jax.random.normal(key, (len(dist.centre),)) + collected.sampled_coords["mass"].mean()
     info = UpdateInfo(step=step, interval=step, identifiable=step > 0, loss=jnp.zeros(()))
     return dists.move(dist, step), info
 
@@ -411,7 +411,7 @@ def test_novelty_is_a_rank_among_the_windows_of_all_sets(monkeypatch):
     monkeypatch.setattr(dvm, "train", lambda key, config, trajectory: (None, jnp.zeros(())))
     monkeypatch.setattr(dvm, "novelty", lambda config, model, episodes: episodes)
     collected = tuners.Collected(
-        trajectory=None, coords={}, held_out=(held_out, valid, jnp.ones((3, 3), bool)), held_out_coords={}
+        trajectory=None, sampled_coords={}, held_out=(held_out, valid, jnp.ones((3, 3), bool)), held_out_coords={}
     )
     config = dataclasses.replace(toys.TINY, held_out_sets=3)
     score = tuners.calibrated_gate(jax.random.key(0), config, collected, measured, knobs(level=0.5))
