@@ -44,7 +44,7 @@ class Args:
     set: tuple[str, ...] = ()
     """Parameters that are not nominal, as name=value, such as foot_friction=0.5 (a multiple of nominal)."""
     preset: str = "cpu"
-    """Preset that the policy was trained with, which fixes its network: smoke, cpu or gpu."""
+    """Preset whose network and time limit are used: smoke (episodes of 0.8 s), cpu or gpu (20 s)."""
     physics: str = "exact"
     """Physics: exact (sub-steps of 1 ms) or fast (2 ms)."""
     episodes: int = 100
