@@ -211,7 +211,8 @@ class Rounds:
             (self._place(index) / "request.json").unlink(missing_ok=True)
             raise ValueError(
                 f"round {index}: no walks are requested: {rate:.0%} of them are expected to end in a fall "
-                f"({predicted.fall_rate:.0%} in simulation), at most {most:.0%} may (--max-fall-rate; --force overrides)"
+                f"({predicted.fall_rate:.0%} in simulation), expected at most {most:.0%} (--max-fall-rate; --force "
+                "overrides)"
             )
 
     def _request(self, index: int, state: TunerState) -> None:

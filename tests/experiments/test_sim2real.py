@@ -306,7 +306,7 @@ def test_no_walks_are_requested_if_too_many_falls_are_expected(first, answered, 
     place.mkdir()
     # Requested by an earlier call under other conditions.
     (place / "request.json").write_text("{}")
-    with pytest.raises(ValueError, match=r"round 0: no walks are requested: 25% .* at most 20%"):
+    with pytest.raises(ValueError, match=r"round 0: no walks are requested: 25% .* expected at most 20%"):
         first(careful).play(0, None)
     assert not (place / "request.json").exists()
     assert first(TERMS).play(0, None).expected_falls >= 0.25
