@@ -1,8 +1,8 @@
-"""Corrected models: what discovery found missing in a model, written to a folder and brought back to life.
+"""Corrected models: what discovery found missing in a model, saved to a folder and simulated again from it.
 
-A corrected model is a folder of two files. `model.xml` is the MJCF with every correction that MuJoCo has a form for
+A corrected model is a folder of two files. `model.xml` is the MJCF with every correction that MJCF can express
 (masses, armatures, friction); `effects.json` holds the rest (delays, backlash, sensor errors, ...), in physical units,
-by effect, place and parameter. `save` and `load` write and read it as a robot on the test rig (`envs.rig`); `read`
+by effect, place and parameter. `save` and `load` write and read it as a robot on the test rig (`envs.rig`). `read`
 returns it as a `Correction`, which `make` turns into a BITeno that walks with these effects.
 """
 

@@ -1,4 +1,7 @@
-"""A walking BITeno with discovered effects between its targets, its joints and its sensors' readings."""
+"""A walking BITeno with discovered effects between its targets, its joints and its sensors' readings.
+
+Train or tune a policy in it as in the nominal robot, `envs.biteno.Biteno`.
+"""
 
 from collections.abc import Mapping
 
@@ -41,6 +44,7 @@ class CorrectedBiteno(Biteno):
             "robot": ("robot",),
         }
         self._values = correction.values(places)
+        # One step of the chain for each step of the physics; the controller reads the joints in every one.
         step = float(model.opt.timestep)
         self._chain = Chain(step, self._rows, self.joint_qpos, self.joint_dof, np.array(bodies))
 
@@ -64,7 +68,10 @@ class CorrectedBiteno(Biteno):
         return state.replace(obs=self._observe(state, jax.random.fold_in(key, 1)))
 
     def simulate(self, params: parameters.Params, state: State, drive: Drive) -> Motion:
-        """Simulates a policy step in MJX, through the effects; see `Biteno.simulate`."""
+        """Simulates a policy step in MJX, through the effects; see `Biteno.simulate`.
+
+        The `Motion` has the memories of the effects as well, and the torques that act on the joints, friction apart.
+        """
         model = self.model(params)
         data = self._data.replace(
             qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.qacc_warmstart, qacc=state.qacc_warmstart
@@ -82,7 +89,7 @@ class CorrectedBiteno(Biteno):
             qvel=data.qvel,
             qacc_warmstart=data.qacc_warmstart,
             torque=torque[-1],
-            # What the library does to a shank is not the floor's.
+            # Forces of effects on a shank are not the floor's.
             foot_force=self._foot_force(model, data.replace(xfrc_applied=jnp.zeros_like(data.xfrc_applied))),
             memory=memory,
         )

@@ -1,4 +1,4 @@
-"""A corrected model as it lies in a folder: an MJCF, and a JSON of the effects that MuJoCo has no form for."""
+"""A corrected model as it is saved: an MJCF, and a JSON of the effects that MJCF cannot express."""
 
 import hashlib
 import json
@@ -28,14 +28,15 @@ class Correction:
     path: Path
     """Path of the MJCF."""
     effects: Effects
-    """What MuJoCo has no form for; empty where the MJCF says all."""
+    """Effects that MJCF cannot express; empty where the MJCF holds all corrections."""
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the content of both files, independent of where they lie.
+        """SHA-256 of the content of both files, wherever the folder is.
 
-        Runs save it, so that one which is resumed with another model is refused.
+        A run saves it, and refuses to be resumed with another model.
         """
+        # Sorted, so that the order of keys in the JSON does not matter.
         content = self.path.read_bytes() + json.dumps(self.effects, sort_keys=True).encode()
         return hashlib.sha256(content).hexdigest()
 
@@ -47,7 +48,7 @@ class Correction:
     def values(self, places: Mapping[str, Sequence[str]]) -> dict[str, dict[str, np.ndarray]]:
         """Translates the physical values into the arrays that the effects' functions read.
 
-        A place that has no value for an effect gets what leaves the robot as it is there.
+        A place without a value for an effect gets the value with which the effect does nothing there.
 
         Args:
           places: names of the robot's places by what an effect may be on: `joint`, `body`, `foot` and `robot`.
@@ -77,7 +78,8 @@ class Correction:
 
 
 def _inner(parameter: Parameter, value: float | None) -> float:
-    """What the physics reads of a value; where there is none, what leaves the robot as it is."""
+    """Converts a physical value into the number that the physics reads; None into the one that has no influence."""
+    # Values in files are in the parameter's own unit, so the scale is one.
     return float(parameter.inner(0.0 if value is None else parameter.coordinate(value, 1.0), 1.0))
 
 
@@ -97,7 +99,7 @@ def read(folder: Path) -> Correction:
         if not (folder / name).exists():
             raise ValueError(f"model: {folder / name} is missing")
     effects = json.loads((folder / EFFECTS).read_text())["effects"]
-    # Here and not when it is simulated, so that a run is refused before anything is computed.
+    # Checked here, not when it is simulated, so that a run is refused before anything is computed.
     for name in effects:
         if name not in EVERY:
             raise ValueError(f"{folder / EFFECTS}: got effect '{name}', expected one of {', '.join(EVERY)}")

@@ -1,4 +1,7 @@
-"""A corrected model on the test rig: saved as discovery leaves it, and loaded again with all its coordinates."""
+"""Saves and loads a corrected model as a robot on the test rig.
+
+Discovery saves a rig and the coordinates that it found. Loaded again, the rig moves as the one that was saved.
+"""
 
 import json
 from pathlib import Path
@@ -16,8 +19,8 @@ from envs.rig import Rig
 def save(folder: Path, spec: mujoco.MjSpec, rig: Rig, vector: np.ndarray) -> None:
     """Writes a corrected model to a folder.
 
-    What MuJoCo has a form for goes into `model.xml`; every other effect that the vector gives a value to goes into
-    `effects.json`, in physical units.
+    Corrections that MJCF can express go into `model.xml`. Every other effect with a coordinate that is not zero goes
+    into `effects.json`, in physical units.
 
     Args:
       folder: to write to; it is created where it does not exist.
@@ -32,13 +35,13 @@ def save(folder: Path, spec: mujoco.MjSpec, rig: Rig, vector: np.ndarray) -> Non
 
 
 def _corrected_spec(spec: mujoco.MjSpec, rig: Rig, vector: np.ndarray) -> mujoco.MjSpec:
-    """The nominal MJCF with the corrected inertias, armatures, dampings and friction losses, compiled."""
+    """Makes the nominal MJCF with the corrected inertias, armatures, dampings and friction losses, compiled."""
     values = rig.values(rig.tree(jnp.asarray(vector, jnp.float32)))
     model, device = rig.mj_model, jax.jit(rig.model)(values)
     spec = spec.copy()
     for name in rig.bodies:
         body, number = spec.body(name), model.body(name).id
-        # Else the compiler would take mass and inertia from the geometries again.
+        # Without this the compiler would compute mass and inertia from the geometries again.
         body.explicitinertial = True
         body.mass = float(device.body_mass[number])
         for field in ("ipos", "iquat", "inertia"):
@@ -49,7 +52,7 @@ def _corrected_spec(spec: mujoco.MjSpec, rig: Rig, vector: np.ndarray) -> mujoco
         dof, joint = rig.dof[number], spec.joint(name)
         joint.armature = float(device.dof_armature[dof])
         joint.damping = [float(device.dof_damping[dof]), *np.ravel(joint.damping)[1:]]
-        # Of the nominal model: the one on the device has a trace of friction, for MJX's sake.
+        # From the nominal model: on the device every joint has a trace of friction, which MJX needs.
         joint.frictionloss = max(float(model.dof_frictionloss[dof] + values["coulomb"]["torque_nm"][number]), 0.0)
     # A spec is written as XML only after it compiled.
     spec.compile()
@@ -57,9 +60,10 @@ def _corrected_spec(spec: mujoco.MjSpec, rig: Rig, vector: np.ndarray) -> mujoco
 
 
 def _physical(rig: Rig, vector: np.ndarray) -> dict[str, dict[str, dict[str, float]]]:
-    """Physical values of the effects that MuJoCo has no form for."""
+    """Computes physical values, by effect, place and parameter, of the effects that MJCF cannot express."""
+    # Coulomb friction is a signal on the rig, but a field (`frictionloss`) in MJCF.
     in_model = {name for name, row in rig.effects.items() if row.enters == "model"} | {"coulomb"}
-    # A parameter that is a shape has a meaning at coordinate zero, where its effect is there.
+    # A coordinate of zero means no effect, except for a shape: there zero is a value of its own where the effect acts.
     there = {(axis.effect, axis.place) for axis, coordinate in zip(rig.axes, vector, strict=True) if coordinate}
     effects = {}
     for axis, coordinate in zip(rig.axes, vector, strict=True):

@@ -1,12 +1,12 @@
-"""The log doctor: finds what is wrong with a log itself, before anything is learnt from it.
+"""The log doctor: finds errors of a log itself, before discovery or the tuner learn from it.
 
 `structure` looks at time stamps and rows. `physics` tries repairs: two joints swapped back, a sign flipped, degrees
-converted to radians, an offset or a delay removed. A repair is believed where the log agrees much better with itself
-and with the model after it. Disagreement is the sum over joints of up to five parts, in units of the signals'
-own size. Each goes from 0 (agreement) to 2, that of the targets to 1:
+converted to radians, an offset or a delay removed. A repair is believed if the log then agrees much better with itself
+and with the model. Disagreement is the sum over joints of up to five parts, in units of the signals' own size. Each
+goes from 0 (agreement) to 2, that of the targets to 1:
 
 - measured velocities against the slopes of measured positions;
-- the controller's torque against what the model needs for the measured motion (fixed base alone);
+- the controller's torque against the model's inverse dynamics of the measured motion (on a fixed base only);
 - the measured torque against the controller's;
 - positions against their targets;
 - positions against the joints' ranges.
@@ -28,11 +28,11 @@ from envs.models import suspended
 
 __all__ = ["Finding", "diagnose", "diagnose_log", "shared_findings"]
 
-_LEAST_ROWS = 100  # consecutive ones, without which nothing but structure can be judged
+_LEAST_ROWS = 100  # consecutive rows, below which only the structure is checked
 
 
 def diagnose_log(log: Log) -> dict[str, list[Finding]]:
-    """Diagnoses every run of a log, each separately; what `python -m experiments.doctor` reports.
+    """Diagnoses every run of a log separately; `python -m experiments.doctor` reports the result.
 
     Args:
       log: as it was read; its robot's model is loaded by name or path.
@@ -41,6 +41,7 @@ def diagnose_log(log: Log) -> dict[str, list[Finding]]:
       What is suspected, by the name of the run, in the log's order; an empty list where nothing is.
     """
     spec = models.spec(log.robot)
+    # On a free base the model's dynamics are not compared, so the base may stay.
     model = suspended(spec) if log.base == "fixed" else spec.compile()
     return {run.name: diagnose(run, log.joints, model, log.base) for run in log.runs}
 

@@ -1,4 +1,7 @@
-"""Measures how much a run disagrees with itself and with the model of its robot."""
+"""Measures how much a run disagrees with itself and with the model of its robot.
+
+The log doctor tries a repair by comparing this number before and after it (`envs.diagnosis.physics`).
+"""
 
 from dataclasses import replace
 
@@ -13,7 +16,7 @@ _ROWS = 250  # at which inverse dynamics are evaluated, at most
 
 
 class Disagreement:
-    """A measure of how much a run disagrees with itself and with the model; repairs are judged by how much it falls.
+    """Measures how much a run disagrees with itself and with the model; a repair is good if it lowers the number.
 
     It is the sum over joints of these parts, each from 0 to 2 (`target` to 1):
 
@@ -47,7 +50,11 @@ class Disagreement:
         return float(sum(part.sum() for part in self.parts(run).values()))
 
     def parts(self, run: Run) -> dict[str, np.ndarray]:
-        """Computes the parts by name, [joints] each, those of them whose signals the run has."""
+        """Computes the parts by name, [joints] each. Parts whose signals the run lacks are left out.
+
+        Use it to see which of the comparisons is responsible for a disagreement.
+        """
+        # From positions alone, or the slope would follow the velocities that it is compared with.
         position, slope = np.moveaxis(smoothed(replace(run, signals={"q": run.signals["q"]})), 1, 0)
         found = {}
         if "dq" in run.signals:
@@ -62,6 +69,7 @@ class Disagreement:
         given = commanded if commanded is not None else run.signals.get("tau")
         if self.dynamics and given is not None:
             needed, rows = self.needed(run, position, slope)
+            # Averaged like the accelerations behind `needed`, so that both are equally smooth.
             found["dynamics"] = relative_difference(_together(given)[rows], needed)
         return found
 
@@ -100,13 +108,15 @@ class Disagreement:
 
 
 def _together(values: np.ndarray) -> np.ndarray:
-    """Moving mean over seven rows, [rows, joints]."""
+    """Averages over seven neighbouring rows (a moving mean), [rows, joints]."""
     kernel = np.ones(7) / 7.0
     return np.stack([np.convolve(column, kernel, "same") for column in values.T], axis=1)
 
 
 def relative_difference(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Rms difference of two signals, over the mean of their own rms, at most 2: the form of every part.
+    """Computes the rms difference of two signals, divided by the mean of their own rms, at most 2.
+
+    All parts of a disagreement but `range` have this form.
 
     Args:
       one: [rows, joints].

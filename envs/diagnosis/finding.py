@@ -1,4 +1,4 @@
-"""What a diagnosis consists of: findings."""
+"""The record of one thing that the log doctor suspects of a run."""
 
 from dataclasses import dataclass
 
@@ -10,7 +10,7 @@ _WRONG = ("swapped joints", "flipped sign", "degrees", "radians twice", "milline
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that is suspected of a run, for a report and for code that decides whether to go on.
+    """One thing that is suspected of a run, for reports and for programs that refuse a damaged log.
 
     Two findings with the same kind, signal and joints say the same of two runs (`envs.diagnosis.shared_findings`).
     """
@@ -20,9 +20,10 @@ class Finding:
     signal: str
     """Where it is wrong: a signal, `measured` for all signals of sensors, `all` for these and the targets, or `t`."""
     joints: tuple[str, ...]
-    """Of the model, whose signals are wrong; empty where all are or where it is not about joints."""
+    """Joints of the model whose signals are wrong; empty where all joints are, or where the finding is not about
+    joints."""
     size: float
-    """How much, in the unit of the sentence."""
+    """Size of the error, in the unit that the sentence has (ms of a delay, rad of an offset, a factor)."""
     sentence: str
     """The finding for a person, with the remedy where there is one."""
 

@@ -1,6 +1,6 @@
 """Finds swapped joints, flipped signs, wrong units, offsets and delays by trying repairs; then drift and quantisation.
 
-Drift, quantisation and clipping are looked for in the repaired run, or degrees would look coarse.
+Drift, quantisation and clipping are looked for in the repaired run, because an encoder would look coarse in degrees.
 """
 
 from collections.abc import Callable, Mapping
@@ -16,7 +16,7 @@ from envs.diagnosis.finding import MEASURED, Finding
 from envs.logs import Run
 from envs.segments import quantum_of, smoothed
 
-# A repair is believed where the disagreement falls by more than both.
+# A repair is believed if the disagreement falls by more than both of these.
 _BETTER = 0.25  # in units of one joint's whole signal
 _SHARE = 0.1  # of the disagreement before
 _MOST_REPAIRS = 3
@@ -43,7 +43,7 @@ class _Repair:
 
 
 def physics(run: Run, joints: tuple[str, ...], model: mujoco.MjModel, held: bool) -> list[Finding]:
-    """Finds the repairs after which a run agrees best with itself and with the model, and what else is wrong then.
+    """Finds the repairs after which a run agrees best with itself and the model, and the defects of the repaired run.
 
     Args:
       run: a piece without structural defects (`structure`).
@@ -55,7 +55,7 @@ def physics(run: Run, joints: tuple[str, ...], model: mujoco.MjModel, held: bool
       Findings: repairs in the order in which they were made, then drift of the clock, quantisation and clipping.
     """
     run, found = _thinned(run), []
-    # Coarse encoders make accelerations useless, and with them the comparison with the model.
+    # With coarse encoders accelerations are mostly rounding errors, so the inverse dynamics are not compared.
     disagreement = Disagreement(run, joints, model, held and not _is_coarse(run))
     now = disagreement(run)
     for _ in range(_MOST_REPAIRS):
@@ -86,7 +86,7 @@ def _believed(now: float, then: float) -> bool:
 
 
 def _thinned(run: Run) -> Run:
-    """Keeps no more rows than are needed: the piece in which the joints move most."""
+    """Cuts a long run down to the piece in which the joints move most."""
     count = _KEPT_ROWS
     if len(run.time) <= count:
         return run
@@ -99,7 +99,7 @@ def _thinned(run: Run) -> Run:
 def _repairs(run: Run, disagreement: Disagreement) -> list[_Repair]:
     """Lists every repair to be tried."""
     count = run.signals["q"].shape[1]
-    # An error may be in one signal, in all that sensors give (a driver's mistake), or in targets as well.
+    # An error may be in one signal, in all signals of sensors (a mistake in the driver), or in targets as well.
     measured = tuple(name for name in MEASURED if name in run.signals)
     groups = {"measured": measured} | {name: (name,) for name in (*MEASURED, "target") if name in run.signals}
     groups["all"] = tuple(dict.fromkeys([*measured, *(["target"] if "target" in run.signals else [])]))
@@ -112,7 +112,7 @@ def _repairs(run: Run, disagreement: Disagreement) -> list[_Repair]:
         for joint in range(count):
             sign = np.where(np.arange(count) == joint, -1.0, 1.0)
             found.append(_Repair("flipped sign", label, (joint,), -1.0, _on(names, lambda v, sign=sign: v * sign)))
-        # Torques have no angles in them, whatever group they are in.
+        # Torques are not angles, so a group is converted without them.
         angles = tuple(name for name in names if name != "tau")
         for kind, factor in (("degrees", np.pi / 180.0), ("radians twice", 180.0 / np.pi)) if angles else ():
             found.append(_Repair(kind, label, (), factor, _on(angles, lambda v, factor=factor: v * factor)))
@@ -174,6 +174,7 @@ def _drift(run: Run) -> list[Finding]:
     if "dq" not in run.signals:
         return []
     slope = smoothed(replace(run, signals={"q": run.signals["q"]}))[:, 1]
+    # With a fast clock time stamps are too far apart, and slopes of positions too small.
     ratio = (run.signals["dq"] * slope).sum(axis=0) / np.maximum((slope**2).sum(axis=0), 1e-12)
     drift = float(np.median(ratio) - 1.0)
     apart = [relative_difference(run.signals["dq"], slope * factor).mean() for factor in (1.0, np.median(ratio))]
@@ -198,7 +199,7 @@ def _is_coarse(run: Run) -> bool:
 
 
 def _clipped(run: Run, joints: tuple[str, ...]) -> list[Finding]:
-    """Finds signals that return to their own largest or smallest value too often, short of the controller's limit."""
+    """Finds signals that stay at their own largest or smallest value too often, without being at the torque limit."""
     found = []
     for name in ("q", "dq", "tau"):
         if name not in run.signals:

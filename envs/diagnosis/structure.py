@@ -1,4 +1,4 @@
-"""Finds what is wrong with time stamps and rows; neither model nor joints matter here."""
+"""Finds defects of time stamps and rows, which can be seen without the robot's model."""
 
 from dataclasses import replace
 
@@ -12,7 +12,7 @@ _LEAST_RATE_HZ = 100.0
 
 
 def structure(run: Run) -> tuple[list[Finding], Run]:
-    """Looks for a rate that is too low, duplicated or missing rows and a clock that jumps.
+    """Finds a rate that is too low, duplicated rows, missing rows and a clock that jumps.
 
     Args:
       run: as it was read; its time stamps increase.
@@ -31,6 +31,7 @@ def structure(run: Run) -> tuple[list[Finding], Run]:
     if twice.any():
         text = f"duplicated rows: {twice.sum()}, the first is row {np.argmax(twice) + 2}; remove them"
         found.append(Finding("duplicated rows", "t", (), float(twice.sum()), text))
+    # Longer than usual by itself, and by more than the usual jitter of the clock.
     holes = np.flatnonzero((steps > 1.6 * period) & (steps > period + 4.0 * _spread(steps)))
     for row in holes:
         moved = _moves_on(run, row)
@@ -41,7 +42,7 @@ def structure(run: Run) -> tuple[list[Finding], Run]:
 
 
 def _spread(values: np.ndarray) -> float:
-    """Standard deviation by the median absolute deviation, which holes do not raise."""
+    """Estimates the standard deviation from the median absolute deviation, which a few holes do not raise."""
     return float(1.4826 * np.median(np.abs(values - np.median(values)))) + 1e-9
 
 

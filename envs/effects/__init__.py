@@ -1,20 +1,22 @@
 """The library of effects that a model may lack, one file per family.
 
-An effect is a row (`jaxtune.types.Effect`) of a family's `ROWS`; a row added there is found by everything that works
-with the library. An effect that enters the model names the model's fields. Every other effect is a function
+An effect is a row (`jaxtune.types.Effect`) of a family's `ROWS`. To add one, add a row; whatever works with the library
+finds it there. An effect that enters the model names the model's fields. Every other effect is a function
 `act(values, signal, now, memory) -> (signal, memory)` of the signal at one stage between the target and the reading of
-a joint; `now` is `envs.chain.Now`. The stages, and within each stage the rows, act in this order:
+a joint; `now` is `envs.chain.Now`. The stages act in the order of this drawing, the effects of one stage in the order
+of their rows:
 
     target -command-> -error-> controller -torque-> motor -transmission-> joint -sensor-> readings
                                                    friction, wrench --^
 
-A value that enters `act` is zero where the effect is not there, and then the signal passes unchanged.
+Values of zero leave the signal unchanged, so an effect is absent where its values are zero. That is why limits and
+stiffnesses enter `act` as reciprocals, and ratios as logarithms.
 """
 
 from envs.effects import actuator, contact, external, inertia, joint_friction, sensing, transmission
 
 RESIDUAL = external.RESIDUAL
-"""The torque that stands for whatever the library has no name for; not a hypothesis (`envs.effects.external`)."""
+"""The torque that discovery fits to what no effect explains; it is not a hypothesis (`envs.effects.external`)."""
 
 LIBRARY = {
     row.name: row

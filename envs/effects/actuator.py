@@ -1,6 +1,8 @@
 """Effects between the target and the motor's torque.
 
 Signals are [joints]: targets in rad (`command`), target less position in rad (`error`), motor torques in Nm (`torque`).
+Several of them look alike in a log (delay and lag; mass, friction and torque scale), so each row says which experiment
+separates it from the others.
 """
 
 import jax.numpy as jnp
@@ -20,6 +22,7 @@ def _torque_scale(values, torque, now, memory):
 def _torque_limit(values, torque, now, memory):
     """torque' = clip(torque, -limit, limit); `values` hold 1 / limit, which is zero where there is none."""
     del now
+    # A reciprocal of zero becomes a limit that no motor reaches, without a division by zero.
     limit = 1.0 / jnp.maximum(values["torque_nm"], 1e-9)
     return jnp.clip(torque, -limit, limit), memory
 
@@ -31,7 +34,7 @@ def _torque_speed(values, torque, now, memory):
     """
     drop = values["nm_s_per_rad"] * now.speed
     low, high = -now.limit - drop, now.limit - drop
-    # Else the line would have a motor that is off brake or drive the joint.
+    # A motor that is off has a limit of zero. The line alone would then brake or drive the joint.
     there = (values["nm_s_per_rad"] > 0) & (now.limit > 0)
     return jnp.where(there, jnp.clip(torque, low, high), torque), memory
 
@@ -44,6 +47,7 @@ def _command_delay(values, target, now, memory):
 def _target_slew(values, target, now, memory):
     """d target' / dt = clip((target - target') / dt, -rate, rate); `values` hold 1 / rate."""
     step = now.dt / jnp.maximum(values["rad_per_s"], 1e-9)
+    # The memory is the limited target itself.
     memory = memory + jnp.clip(target - memory, -step, step)
     return memory, memory
 

@@ -1,4 +1,7 @@
-"""Effects between the feet and the ground. They show on a free base alone, not on the test rig."""
+"""Effects between the feet and the ground, which change fields of the model.
+
+They show only on a free base. A robot on the test rig does not have them, and discovery lists them as not testable.
+"""
 
 from jaxtune.types import Effect, Parameter
 

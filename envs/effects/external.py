@@ -1,6 +1,6 @@
 """Effects from outside the robot: forces on its links and torques on its joints.
 
-The signal is a `envs.chain.Wrench`; effects add to it.
+The signal is an `envs.chain.Wrench`, which starts at zero; every effect adds its force or torque.
 """
 
 import jax.numpy as jnp
@@ -52,7 +52,8 @@ RESIDUAL = Effect(
 )
 """A torque on every joint for what no effect of the library explains.
 
-It is no hypothesis and names no cause: discovery fits it last, within bounds, where a misfit is left."""
+It is no hypothesis and names no cause. Discovery fits it last, within bounds, where a misfit is left, so that the user
+gets a better simulator even without a name."""
 
 ROWS = (
     Effect(

@@ -1,4 +1,8 @@
-"""Effects of masses and of where they are; they change the model's own fields."""
+"""Effects of the links' masses and centres of mass, which change fields of the model.
+
+`jaxtune.mjx.apply` recomputes the fields that depend on them. Mass is easily
+confused with torque scale and friction; what separates them is a swing with the motors off.
+"""
 
 from jaxtune.types import Effect, Parameter
 

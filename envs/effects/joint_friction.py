@@ -1,7 +1,8 @@
 """Effects of friction in the joints.
 
-Dry friction is a bound on a torque. The signal is this bound, [joints] Nm; effects add to it, and the engine solves for
-the torque within the bound that brings the joint to rest.
+Dry friction is a bound on a torque (MuJoCo's `dof_frictionloss`). The signal is this bound, [joints] Nm; effects add
+to it. The engine solves for the torque, within the bound, that brings the joint to rest or slows it most. So a joint
+can stick, which a torque computed from its speed could not make it do.
 """
 
 import jax.numpy as jnp

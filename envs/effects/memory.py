@@ -1,20 +1,29 @@
-"""Memories that effects share: delay lines and first-order lags."""
+"""Memories that effects share: delay lines and first-order lags.
+
+Each has a function that starts it in steady state and one that advances it by a step of the simulation.
+"""
 
 import jax
 import jax.numpy as jnp
 
 LONGEST_S = 0.04
-"""Longest delay that a line can hold, in s; simulations start with as much history."""
+"""Longest delay that a line can hold, in s. Simulations start with at least as much history (`envs.segments`)."""
 
 
 def as_it_is(values, signal: jax.Array, dt: float) -> jax.Array:
-    """Starts the memory of a lag or a slew limit whose input has always been this signal."""
+    """Starts the memory of a lag or a slew limit whose input has always been this signal: the signal itself.
+
+    `values` and `dt` are not used; every effect's `start` takes them.
+    """
     del values, dt
     return signal
 
 
 def delay_line(values, signal: jax.Array, dt: float) -> jax.Array:
-    """Starts a delay line [steps, ...], newest first, whose input has always been this signal."""
+    """Starts a delay line [steps, ...], newest first, whose input has always been this signal.
+
+    It holds `LONGEST_S` whatever the delay is, so that its shape does not depend on a value that is searched.
+    """
     del values
     return jnp.broadcast_to(signal, (round(LONGEST_S / dt) + 1, *signal.shape))
 
@@ -54,6 +63,7 @@ def lagged(memory: jax.Array, signal: jax.Array, seconds: jax.Array, dt: float) 
     Returns:
       y after this step, twice: as the signal and as the memory.
     """
+    # Exactly zero without a lag; the inner maximum keeps the derivative finite in the branch that is not taken.
     stays = jnp.where(seconds > 0, jnp.exp(-dt / jnp.maximum(seconds, 1e-9)), 0.0)
     memory = signal + stays * (memory - signal)
     return memory, memory

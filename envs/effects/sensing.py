@@ -1,7 +1,8 @@
-"""Effects between the joint and its reading, by which the controller and the log are misled alike.
+"""Effects between the joint and its reading: errors that both the controller and the log see.
 
-The signal is [2, joints], positions in rad and velocities in rad/s. `undo` recovers the true motion from readings, so
-that a simulation can start where the robot was.
+The signal is [2, joints], positions in rad and velocities in rad/s; for `imu_tilt` it is the gravity vector [3] in the
+body frame. `undo` recovers the true motion from recorded readings [time, 2, joints], so that a simulation can start
+where the robot really was.
 """
 
 import jax
@@ -31,8 +32,9 @@ def _sensor_delay(values, readings, now, memory):
 
 
 def _undo_delay(values, readings, dt):
-    """Takes the reading of one delay later; past the end, the last one."""
+    """truth(t) = readings(t + seconds), interpolated; past the end, the last reading."""
     count = len(readings)
+    # Every joint has a delay of its own, hence an interpolation of its own.
     at = jnp.clip(jnp.arange(count)[:, None] + values["seconds"] / dt, 0, count - 1)
     interpolate = jax.vmap(jnp.interp, in_axes=(1, None, 1), out_axes=1)
     steps = jnp.arange(count, dtype=readings.dtype)

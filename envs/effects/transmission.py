@@ -1,13 +1,19 @@
 """Effects between the motor and the joint: backlash, compliance, and the rotor's inertia.
 
-Encoders sit on the motor. Backlash and compliance let the motor run ahead of its joint by an offset o. The rotor is
-part of the joint's armature, so o follows from the balance of torques on the rotor over one step, in which the
-controller reacts to o with its stiffness kp and damping kd. With J the rotor's inertia and dt the step, every rad of
-offset costs
+Encoders sit on the motor. Backlash and compliance let the motor run ahead of its joint by an offset o. Only the
+joint is a body of the model; the rotor's inertia J is part of its armature. The offset follows from the balance of
+torques on the rotor over one step of length dt. If o changes by d within the step, then
 
-    R = kp + (kd + J / dt) / dt
+- the controller, which reads the motor, gives kp d + kd d / dt less torque (stiffness kp, damping kd);
+- the rotor takes J (d / dt - rate) / dt to change the rate of its offset.
 
-of torque (`_resistance`). The memory is the offset in rad and its rate in rad/s, [2, joints].
+Together the joint receives
+
+    torque + J rate / dt - R d    with    R = kp + (kd + J / dt) / dt
+
+(`_passed`, `_resistance`). The torque that accelerates the rotor along with the joint does not press on the gears
+(`Now.carried`), so it is subtracted where the pressing torque decides how far o moves (`_pressing`). The memory is the
+offset in rad and its rate in rad/s, [2, joints].
 """
 
 import jax.numpy as jnp
@@ -20,6 +26,7 @@ _TRANSMISSION = {"family": "transmission", "on": "joint"}
 
 def _resistance(now):
     """R: torque that a motor loses for every rad that it runs ahead within a step, [joints] Nm/rad."""
+    # All terms are zero for a measured motor. Its offset then follows the pressing torque at once.
     return jnp.maximum(now.stiffness + (now.damping + now.rotor / now.dt) / now.dt, 1e-9)
 
 
@@ -39,7 +46,7 @@ def _backlash(values, torque, now, memory):
     offset, rate = memory
     half = 0.5 * values["rad"]
     following = jnp.clip(offset + _pressing(torque, now, rate) / _resistance(now), -half, half)
-    # When a measured motor left its side of the play is unknown, so its rate starts at zero.
+    # The moment within a step at which a measured motor crossed the play is unknown, so its rate counts as zero.
     rate = jnp.where(now.measured, 0.0, (following - offset) / now.dt)
     return _passed(torque, now, memory, following), jnp.stack([following, rate])
 
