@@ -10,7 +10,6 @@ of the effects read (`Rig.values`). *Physical values*, in units, stand in report
 
 import copy
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +18,7 @@ import numpy as np
 from mujoco import mjx
 
 from envs import sensing
+from envs.axes import Axis, describe_axis
 from envs.chain import MIN_FRICTION_NM, Chain
 from envs.effects import EVERY
 from envs.effects.memory import LONGEST_S
@@ -34,40 +34,6 @@ ByEffect = Mapping[str, Mapping[str, jax.Array]]
 # units (rms over the rms of the noise floor). With four line searches it would be 0.2.
 _ITERATIONS, _LINE_SEARCHES = 4, 6
 _LONGEST_STEP_S = 0.001
-
-# Parameters that every model has, by the effect that changes them: link masses, the proportional gain, armature,
-# damping and dry friction. Each may be wrong by a tenth of its nominal value (one prior standard deviation). Discovery
-# fits them under all hypotheses, the null included, so that an inaccurate number is not taken for a missing effect.
-_PRIOR_SHARE = 0.1
-_NOMINAL_RATIOS = ("link_mass", "gain_error")
-_NOMINAL_FIELDS = {"armature": "dof_armature", "viscous": "dof_damping", "coulomb": "dof_frictionloss"}
-
-
-@dataclass(frozen=True)
-class Axis:
-    """One coordinate of a rig: one parameter of one effect at one place.
-
-    A coordinate of zero leaves the robot as it is. `Rig.scaled` changes the unit of a coordinate, and with it `scale`,
-    `least` and `prior_sd`.
-    """
-
-    effect: str
-    parameter: str
-    place: str
-    """A joint, a body, or `robot`."""
-    index: int
-    """Number of the place among all places where the effect may sit."""
-    scale: float
-    """What one unit of the coordinate stands for, in the unit of the parameter."""
-    least: float
-    """Smallest coordinate. An effect that subtracts from a field of the model (armature, damping) may take nine tenths
-    of it at most, so that the field stays positive."""
-    prior_sd: float
-    """Prior standard deviation, in coordinates, of a parameter that every model has (a nuisance that every hypothesis
-    fits); zero for an effect that models lack."""
-    joints: tuple[int, ...]
-    """Indices of the joints in which an effect at this place shows directly: the joint itself, or for a link all joints
-    that carry it."""
 
 
 class Rig:
@@ -165,31 +131,12 @@ class Rig:
 
     def _describe_axes(self) -> tuple[Axis, ...]:
         return tuple(
-            self._describe(row, parameter, place, index, float(scale))
+            describe_axis(
+                self.mj_model, self.dof, row, parameter, place, index, float(scale), self.moves(row.on, place)
+            )
             for row in self.effects.values()
             for parameter in row.parameters
             for index, (place, scale) in enumerate(zip(self.places[row.on], self.scale(row, parameter), strict=True))
-        )
-
-    def _describe(self, row: Effect, parameter: Parameter, place: str, index: int, scale: float) -> Axis:
-        least, prior_sd, fields = parameter.bounds[0], 0.0, parameter.fields
-        # Armature and damping must stay positive.
-        if parameter.form == "added" and row.on == "joint" and fields:
-            least = max(least, -0.9 * getattr(self.mj_model, fields[0])[self.dof[index]] / scale)
-        if row.name in _NOMINAL_RATIOS:
-            prior_sd = _PRIOR_SHARE
-        elif row.name in _NOMINAL_FIELDS:
-            value = getattr(self.mj_model, _NOMINAL_FIELDS[row.name])[self.dof[index]]
-            prior_sd = _PRIOR_SHARE * float(value / scale)
-        return Axis(
-            effect=row.name,
-            parameter=parameter.name,
-            place=place,
-            index=index,
-            scale=scale,
-            least=float(least),
-            prior_sd=prior_sd,
-            joints=tuple(sorted(self.moves(row.on, place))),
         )
 
     def tree(self, vector: jax.Array) -> dict[str, dict[str, jax.Array]]:

@@ -102,16 +102,7 @@ def main(args: Args) -> None:
     for name, target in targets.items():
         rows[name] = quality(*record_walks(target, jax.random.fold_in(key, len(rows)), act, args.episodes, long))
 
-    table = Table(title=f"{args.policy} in {args.target} {' '.join(args.set)}")
-    table.add_column("")
-    headings = {"grid": "command grid", "none": "no pushes", "pushes": "pushes"}
-    for name in rows:
-        table.add_column(headings[name], justify="right")
-    for name in rows["grid"]:
-        table.add_row(name, *(f"{row[name]:.3f}" for row in rows.values()))
-    table.add_section()
-    table.add_row("clock_hz", *[f"{constants.CLOCK_HZ:.3f}"] * len(rows))
-    console.print(table)
+    _print_table(args, rows)
     args.out.mkdir(parents=True, exist_ok=True)
     by_command = [
         {"command": one, **quality(*jax.tree.map(lambda leaf, row=row: leaf[row : row + 1], grid))}
@@ -130,6 +121,19 @@ def main(args: Args) -> None:
             film.gif(args.out / "walk.gif", learners["none"].robot.mj_model, recording.qpos)
     except film.NoPicture as error:
         console.print(f"no film: {error}", markup=False)
+
+
+def _print_table(args: Args, rows: dict[str, dict[str, float]]) -> None:
+    table = Table(title=f"{args.policy} in {args.target} {' '.join(args.set)}")
+    table.add_column("")
+    headings = {"grid": "command grid", "none": "no pushes", "pushes": "pushes"}
+    for name in rows:
+        table.add_column(headings[name], justify="right")
+    for name in rows["grid"]:
+        table.add_row(name, *(f"{row[name]:.3f}" for row in rows.values()))
+    table.add_section()
+    table.add_row("clock_hz", *[f"{constants.CLOCK_HZ:.3f}"] * len(rows))
+    console.print(table)
 
 
 if __name__ == "__main__":

@@ -121,7 +121,7 @@ class _Robot:
         model.dof_damping[self.dof] *= [off() for _ in joints]
         self._friction = model.dof_frictionloss[self.dof] * np.array([off() for _ in joints])
         model.dof_frictionloss[:] = 0.0  # `_rub` has it, as a bristle model
-        # Gains are set in a controller and not measured, so they are wrong by less.
+        # Gains are set and not measured: they are taken to be wrong by a third as much.
         self._gain = np.array([off() for _ in joints]) ** 0.3
         self._at = np.array([name in truth.places for name in joints], float)
         if truth.effect in ("armature", "viscous"):

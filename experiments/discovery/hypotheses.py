@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from envs.rig import Axis
+from envs.axes import Axis
 from jaxtune.discovery.problem import Hypothesis
 from jaxtune.types import Effect
 

@@ -116,7 +116,7 @@ def test_a_velocity_that_lags_is_left_out_and_said_so(plain):
         late = np.stack([np.interp(run.time - 0.02, run.time, column) for column in run.signals["dq"].T], axis=1)
         runs.append(type(run)(**{**run.__dict__, "signals": {**run.signals, "dq": late}}))
     kept, notes = drop_filtered(type(plain)(**{**plain.__dict__, "runs": tuple(runs)}))
-    assert notes == ("dq lags q by 20 ms: it is filtered, and not used",)
+    assert notes == ("dq lags q by 20 ms, so it was filtered and is not used",)
     assert all("dq" not in run.signals for run in kept.runs)
 
 

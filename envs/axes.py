@@ -1,0 +1,84 @@
+"""The coordinates of a rig: what a unit of each stands for, how far it may go, and what is believed of it before."""
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+
+import mujoco
+
+from jaxtune.types import Effect, Parameter
+
+# Parameters that every model has, by the effect that changes them: link masses, the proportional gain, armature,
+# damping and dry friction. Each may be wrong by a tenth of its nominal value (one prior standard deviation). Discovery
+# fits them under all hypotheses, the null included, so that an inaccurate number is not taken for a missing effect.
+_PRIOR_SHARE = 0.1
+_NOMINAL_RATIOS = ("link_mass", "gain_error")
+_NOMINAL_FIELDS = {"armature": "dof_armature", "viscous": "dof_damping", "coulomb": "dof_frictionloss"}
+_MOST_TAKEN = 0.9  # of a field of the model: armature and damping must stay positive
+
+
+@dataclass(frozen=True)
+class Axis:
+    """One coordinate of a rig: one parameter of one effect at one place.
+
+    A coordinate of zero leaves the robot as it is. `Rig.scaled` changes the unit of a coordinate, and with it `scale`,
+    `least` and `prior_sd`.
+    """
+
+    effect: str
+    parameter: str
+    place: str
+    """A joint, a body, or `robot`."""
+    index: int
+    """Number of the place among all places where the effect may sit."""
+    scale: float
+    """What one unit of the coordinate stands for, in the unit of the parameter."""
+    least: float
+    """Smallest coordinate. An effect that subtracts from a field of the model (armature, damping) may take nine tenths
+    of it at most, so that the field stays positive."""
+    prior_sd: float
+    """Prior standard deviation, in coordinates, of a parameter that every model has (a nuisance that every hypothesis
+    fits); zero for an effect that models lack."""
+    joints: tuple[int, ...]
+    """Indices of the joints in which an effect at this place shows directly: the joint itself, or for a link all joints
+    that carry it."""
+
+
+def describe_axis(
+    model: mujoco.MjModel,
+    dof: Sequence[int],
+    row: Effect,
+    parameter: Parameter,
+    place: str,
+    index: int,
+    scale: float,
+    joints: Collection[int],
+) -> Axis:
+    """Describes the coordinate of one parameter of one effect at one place.
+
+    Args:
+      model: the nominal model, suspended.
+      dof: address of every controlled joint's degree of freedom.
+      row: the effect.
+      parameter: one of its parameters.
+      place: where the effect sits.
+      index: number of the place.
+      scale: what one unit of the coordinate stands for.
+      joints: indices of the joints in which the effect shows directly.
+    """
+    least, prior_sd, fields = parameter.bounds[0], 0.0, parameter.fields
+    if parameter.form == "added" and row.on == "joint" and fields:
+        least = max(least, -_MOST_TAKEN * getattr(model, fields[0])[dof[index]] / scale)
+    if row.name in _NOMINAL_RATIOS:
+        prior_sd = _PRIOR_SHARE
+    elif row.name in _NOMINAL_FIELDS:
+        prior_sd = _PRIOR_SHARE * float(getattr(model, _NOMINAL_FIELDS[row.name])[dof[index]] / scale)
+    return Axis(
+        effect=row.name,
+        parameter=parameter.name,
+        place=place,
+        index=index,
+        scale=scale,
+        least=float(least),
+        prior_sd=prior_sd,
+        joints=tuple(sorted(joints)),
+    )
