@@ -1,4 +1,7 @@
-"""Episodes of BITeno in MJX: those that the tuner simulates, and those of a target in the same engine."""
+"""Episodes of BITeno in MJX: those that the tuner simulates, and those of a target in the same engine.
+
+Both are `rollout`, so a target in MJX differs from the tuner's simulator in its parameters alone.
+"""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -40,7 +43,8 @@ def rollout(
     Returns:
       The episodes, and what was recorded of them, [episodes, time, ...].
     """
-    # From constant parameters the compiler would compute the derived fields of every model itself, for minutes.
+    # Without the barrier the compiler would fold constant parameters into every derived field of every model, and take
+    # minutes.
     params = jax.lax.optimization_barrier(dict(params))
     count = next(iter(params.values())).shape[0]
     episode = jax.vmap(lambda *drawn: _episode(robot, act, steps, watch, *drawn))
