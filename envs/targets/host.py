@@ -67,13 +67,19 @@ class HostTarget:
         self._settle = jax.jit(jax.vmap(robot.settle))
 
     def episodes(self, key: jax.Array, act: Act, count: int, steps: int) -> Trajectory:
-        """Measures episodes under a policy; see `envs.targets.protocol.Target`."""
+        """Measures episodes under a policy, on the host; `envs.targets.protocol.Target` describes arguments and result.
+
+        It cannot be jitted, so the tuner is given its episodes through `Tuner.tune`.
+        """
         return self.record(key, act, count, steps)[0]
 
     def record(
         self, key: jax.Array, act: Act, count: int, steps: int, commands: Commands | None = None
     ) -> tuple[Trajectory, Recording]:
-        """Measures episodes and records the motion behind them; see `envs.targets.protocol.Target`."""
+        """Measures episodes and their motion; `envs.targets.protocol.Target` describes arguments and result.
+
+        Robots that fell or broke are simulated on to the last step, masked.
+        """
         # As a pytree a policy is an argument of one compiled program, not a constant of a new one.
         act = act if isinstance(act, jax.tree_util.Partial) else jax.tree_util.Partial(act)
         # The same keys as in `envs.targets.mjx.rollout`, so that episodes in all engines start alike.

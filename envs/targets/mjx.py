@@ -92,13 +92,19 @@ class MjxTarget:
     """True physical values by name; only tests and reports may read them."""
 
     def episodes(self, key: jax.Array, act: Act, count: int, steps: int) -> Trajectory:
-        """Measures episodes under a policy; see `envs.targets.protocol.Target`."""
+        """Measures episodes under a policy; `envs.targets.protocol.Target` describes arguments and result.
+
+        It can be traced, so it may serve as the `measure` of a tuner.
+        """
         return rollout(self.robot, key, act, self._params(count), steps)[0]
 
     def record(
         self, key: jax.Array, act: Act, count: int, steps: int, commands: Commands | None = None
     ) -> tuple[Trajectory, Recording]:
-        """Measures episodes and records the motion behind them; see `envs.targets.protocol.Target`."""
+        """Measures episodes and their motion; `envs.targets.protocol.Target` describes arguments and result.
+
+        Use it to judge a gait (`envs.biteno.gait.quality`).
+        """
         return rollout(self.robot, key, act, self._params(count), steps, commands, watch)
 
     def _params(self, count: int) -> dict:
