@@ -98,7 +98,7 @@ class Meta:
         }
         # One column of a file cannot be two signals.
         if len(set(self.columns.values())) < len(self.columns):
-            self._refuse("columns", self.columns, "theirs that differ")
+            self._refuse("columns", self.columns, "another column of the file for each name")
         policy = {"rate_hz": False, "action_scale": False, "base": False}
         self.policy = None
         if meta.get("policy") is not None:

@@ -50,7 +50,7 @@ class MujocoC:
         ratio = robot.mj_model.opt.timestep / model.opt.timestep
         self._repeats = round(ratio)
         if self._repeats < 1 or abs(ratio - self._repeats) > 1e-6:
-            raise ValueError(f"timestep: got {model.opt.timestep}, which does not divide {robot.mj_model.opt.timestep}")
+            raise ValueError(f"timestep: got {model.opt.timestep}, expected a divisor of {robot.mj_model.opt.timestep}")
         self._model = parameters.apply_mujoco(model, params, robot.entries)
         # One workspace for each thread; robots are distributed over them.
         threads = os.cpu_count() if threads is None else threads
