@@ -112,7 +112,7 @@ class Rig:
                 f"rig: got {self.joints} at {self.control_hz:g} Hz, expected {tuple(joints)} at {control_hz:g} Hz"
             )
         if self.others:
-            raise ValueError(f"joints: {', '.join(self.others)} may move too, and the log does not have them")
+            raise ValueError(f"joints: got a log without {', '.join(self.others)}, expected all joints that may move")
 
     def scaled(self, scales: Mapping[str, np.ndarray]) -> "Rig":
         """Returns the same robot with other units of its coordinates.
@@ -142,7 +142,7 @@ class Rig:
     def tree(self, vector: jax.Array) -> dict[str, dict[str, jax.Array]]:
         """Splits a vector of coordinates [axes] into arrays [places] by effect and parameter.
 
-        The vector is in the order of `axes`. Use it where a search, which knows vectors alone, meets the effects.
+        The vector is in the order of `axes`. Searches work on vectors; the effects read such a tree.
         """
         tree, start = {}, 0
         for name, row in self.effects.items():

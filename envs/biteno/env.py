@@ -146,7 +146,10 @@ class Biteno:
         return self.move(params, state, action)[0]
 
     def move(self, params: parameters.Params, state: State, action: jax.Array) -> tuple[State, Motion]:
-        """Moves the robot by one policy step, as `step` does, and returns the engine's motion as well."""
+        """Moves the robot by one policy step, as `step` does, and returns the engine's motion as well.
+
+        Use it to record what the state does not keep: torques and the forces on the feet.
+        """
         drive = self.drive(params, state, action)
         motion = self.simulate(params, state, drive)
         return self.settle(state, drive, motion), motion

@@ -113,7 +113,7 @@ def coordinates(rig: Rig, effects: Effects) -> np.ndarray:
         for place, parameters in places.items():
             for name, value in parameters.items():
                 if (effect, place, name) not in index:
-                    raise ValueError(f"effects: there is no '{name}' of '{effect}' at '{place}'")
+                    raise ValueError(f"effects: got '{name}' of '{effect}' at '{place}', expected one that the rig has")
                 row = EVERY[effect]
                 parameter = next(p for p in row.parameters if p.name == name)
                 number = index[effect, place, name]

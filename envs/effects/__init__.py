@@ -11,6 +11,9 @@ of their rows:
 
 Values of zero leave the signal unchanged, so an effect is absent where its values are zero. That is why limits and
 stiffnesses enter `act` as reciprocals, and ratios as logarithms.
+
+Bounds, priors and sizes in the rows are coordinates (`jaxtune.types.Parameter`): in the unit that ends the parameter's
+name, or in units of its `scale` where it has one; logarithms for ratios, reciprocals for limits and stiffnesses.
 """
 
 from envs.effects import actuator, contact, external, inertia, joint_friction, sensing, transmission

@@ -69,8 +69,9 @@ def _torque_lag(values, torque, now, memory):
     return lagged(memory, torque, values["seconds"], now.dt)
 
 
-_SECONDS = Parameter(name="seconds", bounds=(0.0, 0.04), prior=0.01)
+_SECONDS = Parameter(name="seconds", bounds=(0.0, 0.04), prior=0.01)  # `memory.LONGEST_S` at most
 
+# The order counts within a stage: targets are delayed before they are slewed, torques limited before they lag.
 ROWS = (
     Effect(
         name="command_delay",

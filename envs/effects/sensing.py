@@ -59,7 +59,7 @@ def _imu_tilt(values, gravity, now, memory):
     return gravity + turn @ gravity, memory
 
 
-_SECONDS = Parameter(name="seconds", bounds=(0.0, 0.04), prior=0.01)
+_SECONDS = Parameter(name="seconds", bounds=(0.0, 0.04), prior=0.01)  # `memory.LONGEST_S` at most
 
 ROWS = (
     Effect(

@@ -2,8 +2,8 @@
 
 A log records how a robot was held, how its joints were controlled and what was measured. A run is one continuous
 recording: `run_000.csv`, `.npz`, `.parquet`, or a ROS bag. Whatever names, units and signs a log has, `read` returns
-the model's: joint positions, velocities and targets in rad, torques in Nm, all about the model's axes. `units` and
-`sign` of `meta.yaml` concern these four signals alone. Nothing is dropped, reordered or filled.
+those of the model: joint positions and targets in rad, velocities in rad/s, torques in Nm, all about the model's axes.
+`units` and `sign` of `meta.yaml` concern these four signals alone. Nothing is dropped, reordered or filled.
 """
 
 from envs.logs.controller import Controller, Impedance

@@ -5,12 +5,15 @@
       gyro.x: /imu.angular_velocity.x
       action.left_knee: /policy.data[2]
 
-The rows are the messages of one topic: that of the actions where there is one, else that of the positions. Other topics
-are sampled at these times; other messages of a policy belong to the tick whose action is nearest. Time is the stamp in
-the headers where all messages have one, else the recorder's; it starts at zero. A run begins where the last of its
-topics begins and ends where the first measured one ends. Rows continue for a while after the last action, because a
-policy may stop before its robot falls. Rows in a hole of a measured topic are left out, which leaves a hole in the time
-stamps.
+A bag has a clock per topic, a run has one for all signals. These rules make one of them:
+
+- The rows are the messages of one topic: that of the actions if there is one, else that of the positions.
+- Other topics are sampled at these times. What a policy sends on other topics belongs to the tick whose action is
+  nearest. (A tick is one step of the policy.)
+- Time is the stamp in the headers if all messages have one, else the recorder's; it starts at zero.
+- A run begins where the last of its topics begins, and ends where the first measured one ends.
+- Rows continue for a while after the last action, because a policy may stop before its robot falls.
+- Rows in a hole of a measured topic are left out, which leaves a hole in the time stamps.
 """
 
 import re
@@ -65,7 +68,7 @@ class _Topic:
 
     @property
     def signals(self) -> set[str]:
-        """Names of the signals that have columns on it."""
+        """Names of the signals that have columns on this topic (`q`, `gyro`, ...)."""
         return {_signal(ours) for ours in self.values}
 
 
@@ -95,6 +98,7 @@ def read_bag(path: Path, columns: Mapping[str, str]) -> dict[str, np.ndarray]:
                 "of something other than the time, which comes with the messages"
             )
         places[ours] = _Place(match["topic"], tuple(match["field"].split(".")), match["index"])
+    # Actions first, so that rows are the policy's own steps.
     of_rows = [ours for first in ("action.", "q.") for ours in places if ours.startswith(first)]
     if not of_rows:
         raise ValueError(f"{path}: columns: got none of 'q.*', expected where in the bag the positions are")
@@ -116,6 +120,7 @@ def read_bag(path: Path, columns: Mapping[str, str]) -> dict[str, np.ndarray]:
 
 def _rows(path: Path, topics: Mapping[str, _Topic], of_rows: str) -> tuple[float, int, np.ndarray]:
     """Returns the period of the rows in s, the first stamp in ns, and the times [rows] in s from there."""
+    # A command holds until the next one, so its topic may end early or have holes; a measurement may not.
     measured = {name: topic for name, topic in topics.items() if topic.signals - {*COMMANDED}}
     for name in dict.fromkeys([of_rows, *measured]):
         if len(topics[name].time) < 2:
@@ -162,6 +167,7 @@ def _read_topics(path: Path, places: Mapping[str, _Place]) -> dict[str, _Topic]:
                 messages.append(_read(message, recorded, connection.topic, len(messages) + 1, places))
     except Exception as error:  # a damaged bag fails in many ways
         raise ValueError(f"{path}: {type(error).__name__}: {error}") from error
+    # One clock for all topics: stamps of some would be compared with the recorder's times of others.
     stamped = all(stamp for messages in found.values() for stamp, _, _ in messages)
     return {topic: _topic(path, topic, messages, 0 if stamped else 1, places) for topic, messages in found.items()}
 

@@ -1,4 +1,7 @@
-"""The joint controllers that a log may come from, and the one place where their law stands."""
+"""The joint controllers that a log may come from, and their law.
+
+Whatever simulates, checks or imitates a controller calls `Impedance.torque`, or refers to it where it must be JAX.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

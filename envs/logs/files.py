@@ -1,4 +1,7 @@
-"""Reads and writes logs: a folder of `meta.yaml` and runs."""
+"""Reads and writes logs, folders of `meta.yaml` and runs, and checks them.
+
+A damaged log is refused with the file, the row and the column; it is never repaired in silence.
+"""
 
 from pathlib import Path
 
@@ -20,7 +23,7 @@ from envs.logs.tables import READERS, WRITERS, check_time, check_values, refuse_
 from envs.models import BUILT_IN
 
 _UNIT_NORM = 0.05  # tolerance of the length of unit vectors
-_RATE_RATIO = 2.0  # between nominal and recorded rate, at most
+_RATE_RATIO = 2.0  # largest ratio of nominal to recorded rate, or the reverse
 
 
 def read(folder: Path, measured: bool = True) -> Log:
@@ -66,7 +69,7 @@ def read(folder: Path, measured: bool = True) -> Log:
 def write(log: Log, folder: Path, suffix: str = ".csv") -> None:
     """Writes a log in the model's names, units and signs, from which `read` returns the same log.
 
-    `meta.yaml` is written last and appears at once, so that another program which waits for it finds all runs complete.
+    `meta.yaml` is written last, and in one step, so that another program which waits for it finds all runs complete.
 
     Args:
       log: to write.
@@ -110,13 +113,14 @@ def write(log: Log, folder: Path, suffix: str = ".csv") -> None:
 
 
 def _as_meta(controller: Controller) -> dict:
+    # No limit is an infinite one, which `meta.yaml` expresses by leaving it out.
     gains = {name: values.tolist() for name, values in controller.gains.items() if np.isfinite(values).all()}
     return {"type": controller.kind, "rate_hz": controller.rate_hz, **gains}
 
 
 def _run(path: Path, meta: Meta, needed: str) -> Run:
     columns = read_bag(path, meta.columns) if is_bag(path) else READERS[path.suffix](path)
-    # All columns, also those that the format does not know: a NaN in one of them is a damaged file.
+    # All columns are checked, also those that the format does not know: a NaN in any of them means a damaged file.
     for name, values in columns.items():
         refuse_first(path, name, values, ~np.isfinite(values), "a finite number")
     columns = _rename(path, columns, meta)
@@ -163,6 +167,7 @@ def _signals(path: Path, columns: dict[str, np.ndarray], meta: Meta, needed: str
         if signal in signals:
             norm = np.linalg.norm(signals[signal], axis=1)
             refuse_first(path, f"{signal}.*", norm, abs(norm - 1) > _UNIT_NORM, "a vector of length one")
+    # Actions keep their unit and sign: they are the policy's, not the model's.
     sign = np.array([meta.signs[joint] for joint in meta.joints])
     for signal, factor in {"q": meta.angle, "dq": meta.angle, "target": meta.angle, "tau": meta.torque}.items():
         if signal in signals:
@@ -181,6 +186,7 @@ def _rename(path: Path, columns: dict[str, np.ndarray], meta: Meta) -> dict[str,
     columns = {foreign.get(name, name): values for name, values in columns.items()}
     if "t" not in columns:
         raise ValueError(f"{path}, column 't': is missing")
+    # A misspelt joint is an error, not a column that the format does not know.
     for name in columns:
         prefix = name.partition(".")[0]
         ours = prefix in (*JOINT_SIGNALS, *VECTOR_SIGNALS) and "." in name

@@ -1,4 +1,7 @@
-"""The format of a log: names of its signals, runs, conditions and splits."""
+"""The format of a log in memory: names of its signals, runs, conditions and splits.
+
+`envs/logs/README.md` has the table of columns with their units.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -28,14 +31,18 @@ SCALAR_SIGNALS = ("enabled", "volts")
 """Signals with one column."""
 
 SPLITS = ("train", "select", "sealed")
-"""Parts of a log: what is fitted, the validation set (select), and the held-out test that is read once (sealed)."""
+"""Parts of a log: the runs that are fitted (train), the validation set (select), and the held-out test, which is read
+once (sealed)."""
 
 _SHARES = dict(zip(SPLITS, (2, 1, 1), strict=True))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Run:
-    """One continuous recording: its controller, time stamps and signals, in the model's names, units and signs."""
+    """One continuous recording: its controller, time stamps and signals, in the model's names, units and signs.
+
+    A run is never changed; to repair or cut one, make another with `dataclasses.replace`.
+    """
 
     name: str
     condition: str
@@ -67,7 +74,10 @@ class Run:
 
 @dataclass(frozen=True, kw_only=True)
 class Log:
-    """Runs of one robot, as `envs.logs.read` returns them."""
+    """Runs of one robot, as `envs.logs.read` returns them and `envs.logs.write` takes them.
+
+    Discovery, the log doctor and `envs.targets.recorded` all start from one.
+    """
 
     robot: str
     """Name of a built-in model, or the path of an MJCF file (`envs.models.spec`)."""

@@ -1,4 +1,7 @@
-"""Reads `meta.yaml` and checks it key by key."""
+"""Reads `meta.yaml` and checks it key by key, before a run is read.
+
+`envs/logs/README.md` describes the keys.
+"""
 
 import difflib
 import reprlib
@@ -19,9 +22,9 @@ from envs.logs.format import (
     column_names,
 )
 
-_ANGLE = {"rad": 1.0, "deg": np.pi / 180.0}
+_ANGLE = {"rad": 1.0, "deg": np.pi / 180.0}  # factors to rad
 _LARGEST = 1e300  # YAML's integers may be too large for a float
-_TORQUE = {"Nm": 1.0, "mNm": 1e-3}
+_TORQUE = {"Nm": 1.0, "mNm": 1e-3}  # factors to Nm
 _META = {
     "robot": True,
     "base": True,
@@ -93,8 +96,9 @@ class Meta:
             ours: self._text(f"columns.{ours}", theirs)
             for ours, theirs in self._mapping("columns", meta.get("columns"), self.known).items()
         }
+        # One column of a file cannot be two signals.
         if len(set(self.columns.values())) < len(self.columns):
-            self._refuse("columns", self.columns, "theirs that differ")
+            self._refuse("columns", self.columns, "another column of the file for each name")
         policy = {"rate_hz": False, "action_scale": False, "base": False}
         self.policy = None
         if meta.get("policy") is not None:
@@ -104,6 +108,7 @@ class Meta:
                     self._text("policy.base", value)
                 else:
                     self._number(f"policy.{name}", value)
+        # Kept as written, because a run may override single numbers of it.
         self._controller = meta["controller"]
         self.controller = self._read_controller("controller", self._controller)
         runs = meta.get("runs")
@@ -156,6 +161,7 @@ class Meta:
             model = mujoco.MjModel.from_xml_path(str(path))
         except ValueError as error:
             raise ValueError(f"{self.path}: robot: {path}: {error}") from error
+        # A column holds one number per joint, which free and ball joints have not.
         kinds = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
         return str(path.resolve()), [model.joint(i).name for i in range(model.njnt) if model.jnt_type[i] in kinds]
 
@@ -190,6 +196,7 @@ class Meta:
 
     def _number(self, where: str, value: Any, *, zero: bool = False) -> float:
         """Checks for a finite number that is positive or, with `zero`, not negative."""
+        # In Python, booleans are integers.
         if (
             isinstance(value, bool)
             or not isinstance(value, int | float)

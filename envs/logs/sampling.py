@@ -1,15 +1,18 @@
-"""Resamples recorded signals at other times."""
+"""Resamples recorded signals at other times: commands are held, measurements are interpolated or averaged.
+
+Bags need it to bring all topics to one clock, and recorded walks to find what a policy observed at its own rate.
+"""
 
 import numpy as np
 
 SENT = ("action", "target", "phase")
-"""Signals that a policy sends in a tick."""
+"""Signals that a policy sends in one of its steps (a tick)."""
 COMMANDED = (*SENT, "enabled", "cmd")
-"""Signals of a command, which hold until the next one is sent."""
+"""Signals of commands, which hold until the next one is sent."""
 HELD = (*COMMANDED, "contact", "quat")
-"""These, and signals that cannot be interpolated; the last value counts, they are never filtered or averaged."""
+"""Signals of which the last value counts, because they hold or cannot be interpolated. They are never averaged."""
 
-_FASTER = 1.25  # ratio of recorded to wanted rate, from which on a signal is averaged
+_FASTER = 1.25  # a signal is averaged if it was recorded at this many times the wanted rate, or faster
 
 
 def held(time: np.ndarray, values: np.ndarray, at: np.ndarray) -> np.ndarray:
@@ -41,6 +44,7 @@ def sampled(time: np.ndarray, values: np.ndarray, at: np.ndarray, period_s: floa
     Returns:
       Values at these times, [times, ...].
     """
+    # The row at or before each time, but never the last: a line needs a row to its right.
     left = np.clip(np.searchsorted(time, at, side="right") - 1, 0, len(time) - 2)
     if np.median(np.diff(time)) * _FASTER >= period_s:
         share = (at - time[left]) / (time[left + 1] - time[left])

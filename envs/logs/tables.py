@@ -1,4 +1,7 @@
-"""Reads and writes tables of numbers; a bad cell is refused with its file, row and column."""
+"""Reads and writes tables of numbers (CSV, NPZ, Parquet); refuses a bad cell with its file, row and column.
+
+Rows are counted from 1, without the header.
+"""
 
 import csv
 from collections.abc import Mapping
@@ -75,15 +78,16 @@ def _read_csv(path: Path) -> dict[str, np.ndarray]:
             raise ValueError(f"{path}, column '{name}': expected a name that is there once")
     if not names:
         raise ValueError(f"{path}: is empty")
-    # Nothing counts as a missing value, so that an empty cell is refused.
+    # No text counts as a missing value, so that an empty cell or "NA" is refused instead of becoming a NaN.
     options = pyarrow.csv.ConvertOptions(
         column_types=dict.fromkeys(names, pyarrow.float64()), null_values=[], strings_can_be_null=False
     )
     try:
-        # An empty line is a row without cells.
+        # An empty line is a row without cells, which is refused too.
         parse = pyarrow.csv.ParseOptions(ignore_empty_lines=False)
         table = pyarrow.csv.read_csv(path, convert_options=options, parse_options=parse)
     except pyarrow.ArrowInvalid as error:
+        # Arrow's message does not name row and column.
         return _read_csv_by_row(path, names, error)
     return {name: table[name].to_numpy() for name in names}
 
@@ -123,7 +127,7 @@ def _read_npz(path: Path) -> dict[str, np.ndarray]:
     except Exception as error:  # a damaged archive fails in many ways
         raise ValueError(f"{path}: {type(error).__name__}: {error}") from error
     for name, values in columns.items():
-        # What is in an archive and is no array comes as bytes.
+        # NumPy returns members of an archive that are not arrays as bytes.
         if not isinstance(values, np.ndarray):
             raise ValueError(f"{path}, column '{name}': got {type(values).__name__}, expected an array")
         if values.ndim != 1 or values.dtype.kind not in "fiub":

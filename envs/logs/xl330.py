@@ -1,6 +1,7 @@
 """Reads recordings of a Dynamixel XL330 that turns a pendulum, in the JSON files of github.com/Rhoban/bam.
 
-They are public measurements of one real motor, at several firmware gains.
+They are public measurements of one real motor, at several firmware gains. It is the only real machine in
+the project's results.
 """
 
 import json
@@ -14,7 +15,8 @@ from envs.logs.tables import check_time, check_values
 
 KT, RESISTANCE_OHM = 0.38, 3.6  # Nm/A and Ohm, of the published Coulomb-viscous fit
 SPLIT_OF_GAIN = {100: "train", 800: "train", 200: "select", 400: "sealed"}
-"""Split by the firmware's gain; the sealed gain lies between gains that are trained on."""
+"""Split by the firmware's gain. The gains of validation (select) and of the held-out test (sealed) lie between those
+that are fitted."""
 
 _MASS_KG, _LENGTH_M = 0.49, 0.1
 _COUNTS_PER_RAD = 4096 / (2 * np.pi)
@@ -32,7 +34,7 @@ _OTHER = ("load", "temp")
 
 
 def read_xl330(folder: Path) -> Log:
-    """Reads a folder of such JSON files as a log of the robot `pendulum`.
+    """Reads a folder of Rhoban's JSON files as a log of the robot `pendulum`.
 
     A file is a run, a firmware gain is a condition, and gains decide the split (`SPLIT_OF_GAIN`). The controller is a
     servo whose gain follows from the firmware's.

@@ -1,4 +1,7 @@
-"""A servo that turns a pendulum: the model of the bench on which single motors are measured (`envs.logs.xl330`)."""
+"""A servo that turns a pendulum: the model of a bench on which single motors are measured.
+
+`envs.logs.read_xl330` reads public recordings of such a bench.
+"""
 
 from pathlib import Path
 

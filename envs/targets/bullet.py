@@ -24,7 +24,7 @@ except ImportError as error:
     raise ValueError("target: 'bullet' needs PyBullet: pip install 'jaxtune[bullet]'") from error
 
 _MISSING = ("joint_armature", "contact_time_constant")
-_ITERATIONS = 100
+_ITERATIONS = 100  # of PyBullet's contact solver
 
 
 def urdf(model: mujoco.MjModel) -> str:
@@ -68,7 +68,7 @@ def urdf(model: mujoco.MjModel) -> str:
 
 
 def _inertia(model: mujoco.MjModel, body: int) -> np.ndarray:
-    """Inertia matrix [3, 3] of a body in its own frame."""
+    """Computes the inertia matrix [3, 3] kg m^2 of a body about its centre of mass, in the body's own axes."""
     turn = np.zeros(9)
     mujoco.mju_quat2Mat(turn, model.body_iquat[body])
     turn = turn.reshape(3, 3)
@@ -106,20 +106,22 @@ class Bullet:
         self._worlds = []
 
     def start(self, state: State) -> None:
-        """Puts every robot into its own world, at its first state."""
+        """Puts every robot into its own world, at its first state; see `envs.targets.host.Engine`."""
+        # Worlds of an earlier set of episodes are used again.
         while len(self._worlds) < len(state.qpos):
             self._worlds.append(self._world())
         self._last_qvel = np.asarray(state.qvel)
         for world, qpos, qvel in zip(self._worlds, np.asarray(state.qpos, float), self._last_qvel, strict=False):
             client, body, joints, _ = world
             turn = _rotation(qpos[3:7])
+            # PyBullet's base is the centre of mass, and its quaternions end with w; MuJoCo's base is the body's origin.
             client.resetBasePositionAndOrientation(body, qpos[:3] + turn @ self._com, np.roll(qpos[3:7], -1))
             for joint, angle, speed in zip(joints, qpos[7:], qvel[6:], strict=True):
                 client.resetJointState(body, joint, angle, float(speed))
             self._set_base_velocity(world, turn, qvel)
 
     def move(self, state: State, drive: Drive) -> Motion:
-        """Moves every robot by one policy step; see `envs.targets.host.Engine`."""
+        """Moves every robot by one policy step, one after the other; see `envs.targets.host.Engine`."""
         pushed = np.asarray(state.qvel)
         targets = np.asarray(drive.targets, float)
         rows = []
@@ -146,13 +148,15 @@ class Bullet:
         index = {client.getJointInfo(body, joint)[1].decode(): joint for joint in range(client.getNumJoints(body))}
         joints = [index[name] for name in constants.JOINTS]
         feet = [index[f"{side}_knee"] for side in constants.SIDES]
+        # PyBullet damps every link by default, as if in air; MuJoCo does not.
         client.changeDynamics(body, -1, linearDamping=0.0, angularDamping=0.0)
         for name, joint in zip(constants.JOINTS, joints, strict=True):
             dof = self._model.joint(name).dofadr[0]
             client.changeDynamics(
                 body, joint, linearDamping=0.0, angularDamping=0.0, jointDamping=self._model.dof_damping[dof]
             )
-            # PyBullet brakes every joint by default; the force that is left to the brake is dry friction.
+            # PyBullet brakes every joint by default. With the friction loss as its largest force, the brake is the
+            # joint's dry friction.
             client.setJointMotorControl2(
                 body, joint, pybullet.VELOCITY_CONTROL, force=float(self._model.dof_frictionloss[dof])
             )
@@ -171,6 +175,7 @@ class Bullet:
         for target in targets:
             states = client.getJointStates(body, joints)
             angle, speed = np.array([state[:2] for state in states]).T
+            # The PD law of MuJoCo's actuators, computed here so that both engines have the same controller.
             torque = self._gain * target + self._bias[:, 0] * angle + self._bias[:, 1] * speed
             torque = np.clip(torque, self._limit[:, 0], self._limit[:, 1])
             client.setJointMotorControlArray(body, joints, pybullet.TORQUE_CONTROL, forces=torque)
@@ -185,6 +190,7 @@ class Bullet:
         quat = np.roll(turned, 1)
         turn = _rotation(quat)
         velocity, spin = (np.array(value) for value in client.getBaseVelocity(body))
+        # Both are in the world's frame; MuJoCo has the angular velocity in the body's.
         states = client.getJointStates(body, joints)
         angle, speed = np.array([state[:2] for state in states]).T
         origin = np.array(position) - turn @ self._com

@@ -1,4 +1,7 @@
-"""Episodes in engines outside JAX: they simulate the physics, everything else is the same code as in MJX."""
+"""Episodes in engines outside JAX. The engine simulates the physics; everything else is the same code as in MJX.
+
+To add an engine, write an `Engine` and wrap it in a `HostTarget`.
+"""
 
 from collections.abc import Mapping
 from typing import Protocol
@@ -14,10 +17,16 @@ from jaxtune.types import Trajectory
 
 
 class Engine(Protocol):
-    """A physics engine that simulates many robots of one model, one policy step at a time."""
+    """A physics engine that simulates many robots of one model, one policy step at a time.
+
+    It knows nothing of observation, reward or policy, which `HostTarget` adds.
+    """
 
     def start(self, state: State) -> None:
-        """Puts robots [episodes] into their first states, before the first call of `move`."""
+        """Puts robots [episodes] into their first states, before the first call of `move`.
+
+        An engine without a state of its own may ignore it, because `move` is given the state as well.
+        """
 
     def move(self, state: State, drive: Drive) -> Motion:
         """Moves every robot [episodes] by one policy step.
@@ -25,6 +34,9 @@ class Engine(Protocol):
         Args:
           state: before the step. Its velocity may differ from where the last motion ended, because robots are pushed.
           drive: joint targets of every sub-step.
+
+        Returns:
+          Where the robots are after the step, in MuJoCo's conventions (`Motion`), [episodes, ...].
         """
 
 
@@ -55,15 +67,22 @@ class HostTarget:
         self._settle = jax.jit(jax.vmap(robot.settle))
 
     def episodes(self, key: jax.Array, act: Act, count: int, steps: int) -> Trajectory:
-        """Measures episodes under a policy; see `envs.targets.protocol.Target`."""
+        """Measures episodes under a policy, on the host; `envs.targets.protocol.Target` describes arguments and result.
+
+        It cannot be jitted, so the tuner is given its episodes through `Tuner.tune`.
+        """
         return self.record(key, act, count, steps)[0]
 
     def record(
         self, key: jax.Array, act: Act, count: int, steps: int, commands: Commands | None = None
     ) -> tuple[Trajectory, Recording]:
-        """Measures episodes and records the motion behind them; see `envs.targets.protocol.Target`."""
+        """Measures episodes and their motion; `envs.targets.protocol.Target` describes arguments and result.
+
+        Robots that fell or broke are simulated on to the last step, masked.
+        """
         # As a pytree a policy is an argument of one compiled program, not a constant of a new one.
         act = act if isinstance(act, jax.tree_util.Partial) else jax.tree_util.Partial(act)
+        # The same keys as in `envs.targets.mjx.rollout`, so that episodes in all engines start alike.
         keys = jax.vmap(jax.random.split)(jax.random.split(key, count))
         step_keys = np.asarray(jax.vmap(lambda key: jax.random.split(key, steps))(keys[:, 1]))
         state = self._reset(keys[:, 0])
@@ -79,6 +98,7 @@ class HostTarget:
             drive = self._drive(state, action)
             motion = self._engine.move(state, drive)
             following = self._settle(state, drive, motion)
+            # The step in which a simulation broke has no valid score, so it is masked as well.
             broke = alive & (np.asarray(following.not_finite) > 0)
             valid = alive & ~broke
             score = np.where(valid, following.score, 0.0)

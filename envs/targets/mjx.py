@@ -1,4 +1,7 @@
-"""Episodes of BITeno in MJX: those that the tuner simulates, and those of a target in the same engine."""
+"""Episodes of BITeno in MJX: those that the tuner simulates, and those of a target in the same engine.
+
+Both are `rollout`, so a target in MJX differs from the tuner's simulator in its parameters alone.
+"""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -40,7 +43,8 @@ def rollout(
     Returns:
       The episodes, and what was recorded of them, [episodes, time, ...].
     """
-    # From constant parameters the compiler would compute the derived fields of every model itself, for minutes.
+    # Without the barrier the compiler would fold constant parameters into every derived field of every model, and take
+    # minutes.
     params = jax.lax.optimization_barrier(dict(params))
     count = next(iter(params.values())).shape[0]
     episode = jax.vmap(lambda *drawn: _episode(robot, act, steps, watch, *drawn))
@@ -88,13 +92,19 @@ class MjxTarget:
     """True physical values by name; only tests and reports may read them."""
 
     def episodes(self, key: jax.Array, act: Act, count: int, steps: int) -> Trajectory:
-        """Measures episodes under a policy; see `envs.targets.protocol.Target`."""
+        """Measures episodes under a policy; `envs.targets.protocol.Target` describes arguments and result.
+
+        It can be traced, so it may serve as the `measure` of a tuner.
+        """
         return rollout(self.robot, key, act, self._params(count), steps)[0]
 
     def record(
         self, key: jax.Array, act: Act, count: int, steps: int, commands: Commands | None = None
     ) -> tuple[Trajectory, Recording]:
-        """Measures episodes and records the motion behind them; see `envs.targets.protocol.Target`."""
+        """Measures episodes and their motion; `envs.targets.protocol.Target` describes arguments and result.
+
+        Use it to judge a gait (`envs.biteno.gait.quality`).
+        """
         return rollout(self.robot, key, act, self._params(count), steps, commands, watch)
 
     def _params(self, count: int) -> dict:

@@ -50,7 +50,7 @@ class MujocoC:
         ratio = robot.mj_model.opt.timestep / model.opt.timestep
         self._repeats = round(ratio)
         if self._repeats < 1 or abs(ratio - self._repeats) > 1e-6:
-            raise ValueError(f"timestep: got {model.opt.timestep}, which does not divide {robot.mj_model.opt.timestep}")
+            raise ValueError(f"timestep: got {model.opt.timestep}, expected a divisor of {robot.mj_model.opt.timestep}")
         self._model = parameters.apply_mujoco(model, params, robot.entries)
         # One workspace for each thread; robots are distributed over them.
         threads = os.cpu_count() if threads is None else threads
@@ -58,11 +58,12 @@ class MujocoC:
         self._pool = rollout.Rollout(nthread=threads)
 
     def start(self, state: State) -> None:
-        """Does nothing: every step starts from the given state."""
+        """Does nothing, because every call of `move` starts from the state that it is given."""
 
     def move(self, state: State, drive: Drive) -> Motion:
-        """Moves every robot by one policy step; see `envs.targets.host.Engine`."""
+        """Moves every robot by one policy step, distributed over threads; see `envs.targets.host.Engine`."""
         count = len(state.qpos)
+        # MuJoCo's full physics state is time, positions and velocities.
         start = np.concatenate([np.zeros((count, 1)), state.qpos, state.qvel], axis=1)
         control = np.repeat(np.asarray(drive.targets, float), self._repeats, axis=1)
         states, sensors = self._pool.rollout(

@@ -41,7 +41,10 @@ class Recording:
 
 
 def watch(before: State, after: State, motion: Motion) -> Recording:
-    """Makes the `Recording` of one step from the states before and after it and the engine's motion."""
+    """Makes the `Recording` of one step, from the states before and after it and the engine's motion.
+
+    Hand it to `envs.targets.mjx.rollout` to record episodes.
+    """
     return Recording(
         qpos=after.qpos,
         qvel=after.qvel,

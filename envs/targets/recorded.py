@@ -1,9 +1,10 @@
-"""Makes episodes from measured logs: what a policy observed and did at its own ticks, in the simulator's form.
+"""Makes episodes from measured logs: what a policy observed and did in each of its steps, in the simulator's form.
 
-A run is cut where the robot falls and where its rows have a hole. Motors that are switched off under a walking policy
-count as a fall, because most robots are switched off when they fall. So does a trunk that sinks; where its height was
-not measured, it is estimated from the legs. The first tick of every piece is left out, because the action before it is
-unknown. So is the last tick of a piece that does not end in a fall, because its outcome is unknown.
+A *tick* is a step of the policy as it shows in a log; a *piece* is a part of a run without falls and holes. A run is
+cut where the robot falls and where its rows have a hole. Motors that are switched off under a walking policy count as a
+fall, because most robots are switched off when they fall. So does a trunk that sinks; if its height was not measured,
+it is estimated from the legs. The first tick of every piece is left out, because the action before it is unknown. So is
+the last tick of a piece that does not end in a fall, because its outcome is unknown.
 """
 
 from functools import partial
@@ -33,24 +34,24 @@ _STEADY = 0.95  # share of ticks that are equally many rows apart where rows and
 
 @chex.dataclass(frozen=True)
 class Recorded:
-    """Measured episodes, and what a simulation needs to repeat them.
+    """Measured episodes, and the commands with which a simulation can repeat them.
 
-    Commands begin `lead` steps before the trajectory: one or two ticks of the run that are no steps of the trajectory,
-    but that a simulation walks through.
+    Commands begin one or two steps before the trajectory. These ticks are not part of the trajectory (see the module's
+    docstring), but a simulation must walk through them to be where the robot was.
     """
 
     trajectory: Trajectory
     commands: Commands  # from the run's first tick on, one or two steps before the trajectory
     power: jax.Array  # [episodes, time] W, mechanical; braking is not regained
-    run: jax.Array  # [episodes] index of the run, in order; every run has one episode or more
-    begin: jax.Array  # [episodes] policy steps from the run's first step to the episode's
+    run: jax.Array  # [episodes] index of the run, increasing; every run has at least one episode
+    begin: jax.Array  # [episodes] policy steps from the run's first step to the episode's first
 
 
 def episodes(log: Log, steps: int) -> Recorded:
     """Turns a log of a walking BITeno into episodes of `steps` policy steps.
 
-    A longer piece of a run becomes several episodes; a shorter one is filled up with steps that are not alive. Without
-    measured torques the controller's commanded ones are used.
+    A longer piece of a run becomes several episodes; a shorter one is filled up with steps that are not alive. If the
+    log has no measured torques, the torques that the controller commanded take their place.
 
     Args:
       log: of one or more runs.
@@ -75,6 +76,7 @@ def episodes(log: Log, steps: int) -> Recorded:
     for index, run in enumerate(log.runs):
         ticks = _at_ticks(run, order)
         pieces = _pieces(ticks)
+        # A run without a walk is refused, because every run of the result must have an episode.
         if not pieces:
             raise ValueError(f"{run.name}: got no two consecutive ticks with the robot on its feet, expected a walk")
         begins = np.round((ticks["time"] - ticks["time"][pieces[0][0][0]]) / constants.POLICY_DT_S).astype(int)
@@ -87,7 +89,13 @@ def episodes(log: Log, steps: int) -> Recorded:
 
 
 def beginning(recorded: Recorded, steps: int) -> Recorded:
-    """Cuts to the first `steps` of every run's first episode, which simulations repeat from the start of the walk."""
+    """Cuts to the first `steps` of every run's first episode.
+
+    Use it to compare a simulation with a log from the start of the walk; later on the two are in different states.
+
+    Returns:
+      One episode for every run, [runs, steps, ...], with its commands.
+    """
     first = np.unique(np.asarray(recorded.run), return_index=True)[1]
     one = jax.tree.map(lambda leaf: leaf[first], recorded)
     trajectory, commands = one.trajectory, one.commands
@@ -105,8 +113,8 @@ def beginning(recorded: Recorded, steps: int) -> Recorded:
 def whole(recorded: Recorded, steps: int) -> tuple[Trajectory, np.ndarray]:
     """Joins the episodes of every run into one, to summarise a walk: its falls, score and power.
 
-    A step is not alive where nothing was recorded, also in the middle of a run, and from the first fall on. Windows for
-    the tuner must not be cut from such episodes, because steps may be missing between two that are alive.
+    A step is alive if it was recorded and comes before the run's first fall. Steps may be missing between two that are
+    alive, so windows for the tuner must not be cut from such episodes.
 
     Args:
       recorded: as `episodes` makes it.
@@ -117,6 +125,7 @@ def whole(recorded: Recorded, steps: int) -> tuple[Trajectory, np.ndarray]:
     """
     run, begin, trajectory = np.asarray(recorded.run), np.asarray(recorded.begin), recorded.trajectory
     alive = np.asarray(trajectory.alive)
+    # The step of the first fall of every run; runs without one get a step that no walk reaches.
     falls = np.full(run[-1] + 1, np.iinfo(np.int32).max)
     np.minimum.at(falls, run, np.where(trajectory.fell, begin + alive.sum(axis=1), falls[run]))
     place = begin[:, None] + np.arange(alive.shape[1])
@@ -134,7 +143,11 @@ def whole(recorded: Recorded, steps: int) -> tuple[Trajectory, np.ndarray]:
 
 
 def _at_ticks(run: Run, order: list[int]) -> dict[str, np.ndarray]:
-    """Signals [ticks, ...] by name when the policy observed, joints in the model's order, with `time` and `up`."""
+    """Samples the signals at the moments at which the policy observed the robot, joints in the model's order.
+
+    Returns:
+      Signals [ticks, ...] by name, with `time` in s and `up`, which is True where the robot is on its feet.
+    """
     signals = dict(run.signals)
     if "quat" in signals and "gravity" not in signals:
         signals["gravity"] = np.asarray(jax.vmap(sensing.projected_gravity)(signals["quat"]))
@@ -153,7 +166,8 @@ def _at_ticks(run: Run, order: list[int]) -> dict[str, np.ndarray]:
     if aligned:
         seen = {name: values[rows] for name, values in signals.items()} | {"time": run.time[rows]}
     else:
-        # The policy observed some time between the row before and this one.
+        # The action appears in this row for the first time, so the policy observed the robot between the row before and
+        # this one.
         at = 0.5 * (run.time[rows] + run.time[np.maximum(rows - 1, 0)])
         seen = {name: values[rows] for name, values in signals.items() if name in HELD} | {"time": at}
         for name in signals.keys() - set(HELD):
@@ -164,10 +178,14 @@ def _at_ticks(run: Run, order: list[int]) -> dict[str, np.ndarray]:
 
 
 def _ticks(name: str, time: np.ndarray, action: np.ndarray) -> tuple[np.ndarray, bool]:
-    """Rows in which the policy sent an action, and whether it observed the robot in these very rows."""
+    """Finds the rows in which the policy sent an action, and whether it observed the robot in these very rows.
+
+    If rows come at the policy's rate, every row is a tick. Among faster rows a tick is where the action changes.
+    """
     period, width = constants.POLICY_DT_S, float(np.median(np.diff(time)))
     changes = 1 + np.flatnonzero((np.diff(action, axis=0) != 0).any(axis=1))
     if abs(width / period - 1.0) < _SAME_RATE:
+        # Every row is a tick, unless the action has stayed the same for so long that the policy must have stopped.
         starts = np.append(0, changes)
         long = np.diff(np.append(starts, len(time)))
         return np.union1d(starts, np.flatnonzero(np.repeat(long < _SILENCE, long))), True
@@ -180,23 +198,24 @@ def _ticks(name: str, time: np.ndarray, action: np.ndarray) -> tuple[np.ndarray,
     if len(rows) < 2 or abs(np.median(apart) / period - 1.0) > 0.25:
         every = f"every {np.median(apart):.3g} s" if len(rows) > 1 else f"{len(rows)} time(s)"
         raise ValueError(f"{name}: 'action' changes {every}, expected every {period:g} s")
-    # Where two actions are equal, the second is no change: its tick is filled in. After a long silence the policy has
-    # stopped.
+    # Two equal actions in a row show no change, so the tick of the second one is filled in. After a long silence
+    # nothing is filled in, because the policy has stopped.
     unchanged = [
         np.searchsorted(time, time[row] + np.arange(1, round(gap / period)) * period - 0.5 * width)
         for row, gap in zip(rows, apart, strict=False)
         if gap < _SILENCE * period
     ]
     rows = np.unique(np.concatenate([rows, *unchanged]))
+    # Where ticks are always the same number of rows apart, rows and policy share a clock.
     steady = np.diff(rows) == round(period / width)
     return rows, bool(steady.mean() >= _STEADY)
 
 
 def _wanted_torque(run: Run, seen: dict[str, np.ndarray], order: list[int]) -> np.ndarray:
-    """Torque that the joints' controller commanded, [ticks, joints] Nm, for logs without measured torques."""
+    """Computes the torque that the joints' controller commanded, [ticks, joints] Nm, for logs without measured ones."""
     if run.controller.kind != "pd":
         raise ValueError(f"{run.name}: there is no 'tau', which a controller of type servo needs")
-    # Up to a tick the target of the tick before has acted.
+    # At the moment of a tick the target of the tick before is still acting.
     target = np.concatenate([seen["target"][:1], seen["target"][:-1]])
     return run.controller.impedance()[order].torque(target, seen["q"], seen["dq"])
 
@@ -206,18 +225,24 @@ def _pieces(ticks: dict[str, np.ndarray]) -> list[tuple[np.ndarray, bool]]:
     up = ticks["up"]
     hole = np.append(False, np.diff(ticks["time"]) > _HOLE * constants.POLICY_DT_S)
     found, down = [], False
+    # Split at holes, and wherever the robot falls or stands up.
     for rows in np.split(np.arange(len(up)), np.flatnonzero(hole | np.append(False, up[1:] != up[:-1]))):
+        # A step needs the ticks before and after it, hence three; after a fall the robot must stay up for a while.
         stands = up[rows[0]] and len(rows) >= (round(_UP_S / constants.POLICY_DT_S) if down else 3)
         if stands:
             after = rows[-1] + 1
-            # The robot may have fallen in a hole of the rows: then it lies in the next one.
+            # If the robot fell in a hole of the rows, it lies on the ground in the next row.
             found.append((rows, bool(after < len(up) and not up[after])))
         down = not up[rows[0]] or (down and not stands)
     return found
 
 
 def _steps(ticks: dict[str, np.ndarray], rows: np.ndarray, fell: bool) -> dict:
-    """Takes the signals before, at and after every step [steps] of a piece, by name."""
+    """Takes the signals before, at and after every step [steps] of a piece, by name.
+
+    The observation needs the action before a step, the reward the state after it.
+    """
+    # A fall is itself a tick, so the last step before it has an outcome; other pieces lose their last tick.
     last = None if fell else -1
     places = {"before": rows[:-1][:last], "now": rows[1:][:last], "after": rows[1:][:last] + 1}
     moments = {
@@ -263,7 +288,7 @@ def _as_simulated(steps: dict, lead: int) -> Recorded:
         joint_reference=each(gait.joint_reference)(now["phase"], now["cmd"]),
     )
     alive, fell = steps["alive"], steps["fell"].any(axis=1)
-    # A simulation that repeats an episode may stay up for longer than the robot did.
+    # A simulation that repeats an episode may stay up for longer than the robot did. It then keeps the last command.
     held = jnp.clip(jnp.arange(-lead, alive.shape[1]), 0, alive.sum(axis=1, keepdims=True) - 1)
     return Recorded(
         trajectory=Trajectory(

@@ -132,7 +132,7 @@ def names(rig):
 def test_what_the_rig_does_not_have_is_named(arm, effects):
     ((effect, places),) = effects.items()
     ((place, values),) = places.items()
-    with pytest.raises(ValueError, match=f"there is no '{next(iter(values))}' of '{effect}' at '{place}'"):
+    with pytest.raises(ValueError, match=f"got '{next(iter(values))}' of '{effect}' at '{place}'"):
         corrected.coordinates(arm.rig, effects)
 
 

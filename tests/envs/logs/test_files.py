@@ -180,7 +180,7 @@ def test_a_folder_in_use_is_not_written_to(tmp_path):
         ({"columns": {"q.left_elbow": "theta"}}, r"columns.q.left_elbow: there is no such key"),
         (
             {"columns": {"q.left_hip": "q.left_knee", "q.left_knee": "q.left_knee"}},
-            "columns: got .*expected theirs that differ",
+            "columns: got .*expected another column of the file for each name",
         ),
         ({"rate": 5}, "rate: there is no such key; did you mean 'rate_hz'"),
         ({"runs": {"run_007": {}}}, "runs.run_007: there is no such run; found run_000"),

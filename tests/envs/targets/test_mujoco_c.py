@@ -103,7 +103,7 @@ def test_options_make_it_another_engine(robot):
 
 
 def test_a_time_step_that_does_not_fit_is_named(robot):
-    with pytest.raises(ValueError, match=r"timestep: got 0.0007, which does not divide 0.001"):
+    with pytest.raises(ValueError, match=r"timestep: got 0.0007, expected a divisor of 0.001"):
         mujoco_c.target(robot, VALUES, timestep=0.0007)
 
 
