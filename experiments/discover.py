@@ -5,19 +5,14 @@ on held-out runs how much smaller the error has become. It may also answer that 
 missing that it cannot name.
 """
 
-import json
-import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from envs import corrected
 from experiments.common import checkpoint
-from experiments.common.checkpoint import write_json
 from experiments.common.cli import bars, console, run
 from experiments.discovery import report
-from experiments.discovery.setup import HORIZONS_S, build_question, read_logs
-from experiments.discovery.summary import details, free_runs, summarise
-from jaxtune.discovery import workflow
+from experiments.discovery.investigate import investigate
+from experiments.discovery.setup import HORIZONS_S, read_logs
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,29 +41,22 @@ def main(args: Args) -> None:
       ValueError: an option is wrong, a log cannot be used, or the folder holds another run.
     """
     checkpoint.set_up_compiler(checkpoint.a_device_a_core())
-    began = time.monotonic()
     _check(args)
-    log, spec = read_logs(args.logs)
+    read_logs(args.logs)  # says what is wrong with them before the folder is made
     identity = {"logs": [str(path) for path in args.logs], "horizons": args.horizons, "healthy": args.healthy}
     checkpoint.open_run(args.out, identity | {"seed": args.seed})
-    saved = args.out / "state.json"
     with bars() as progress:
         task = progress.add_task("simulating null logs", total=None)
-        question = build_question(log, spec, args.horizons, args.healthy, args.seed)
-        result = workflow.discover(
-            question.problem,
-            saved=json.loads(saved.read_text()) if saved.exists() else None,
-            save=lambda state: write_json(saved, state),
+        answer = investigate(
+            args.logs,
+            args.out,
+            horizons=args.horizons,
+            null_logs=args.healthy,
+            seed=args.seed,
             say=lambda text: progress.update(task, description=text[:100]),
         )
-    summary, free = summarise(question, result), free_runs(log, question, result)
-    evidence = details(question, result, free)
-    seconds = {"seconds": time.monotonic() - began, "versions": checkpoint.versions()}
-    write_json(args.out / "summary.json", summary | seconds)
-    write_json(args.out / "details.json", evidence)
-    corrected.save(args.out / "model", spec, question.rig, (result.residual or result.fit).vector)
-    report.show(console, question, summary, free)
-    report.write(args.out / "report.html", log, question, result, summary, free)
+    report.show(console, answer.question, answer.summary, answer.free)
+    report.write(args.out / "report.html", answer.log, answer.question, answer.result, answer.summary, answer.free)
 
 
 def _check(args: Args) -> None:

@@ -1,0 +1,76 @@
+"""One discovery from a folder of logs to its files: the same for a user's log and for the cases of a benchmark."""
+
+import json
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from envs import corrected
+from envs.logs import Log
+from experiments.common import checkpoint
+from experiments.common.checkpoint import write_json
+from experiments.discovery.setup import HORIZONS_S, Question, build_question, read_logs
+from experiments.discovery.summary import details, free_runs, summarise
+from jaxtune.discovery import workflow
+from jaxtune.discovery.noise_floor import Say
+from jaxtune.discovery.result import Result
+
+
+@dataclass(frozen=True, kw_only=True)
+class Answer:
+    """What a discovery said of a log, with what a report needs beside it."""
+
+    log: Log
+    question: Question
+    result: Result
+    summary: dict
+    """Content of `summary.json`."""
+    free: dict
+    """Whole simulated runs, of `summary.free_runs`."""
+
+
+def investigate(
+    logs: Sequence[Path],
+    out: Path,
+    *,
+    horizons: Sequence[float] = HORIZONS_S,
+    null_logs: int = 20,
+    seed: int = 0,
+    say: Say = lambda text: None,
+) -> Answer:
+    """Reads logs, discovers what their model lacks, and writes summary, details and the corrected model.
+
+    Interrupted, the same call goes on after the last accepted effect.
+
+    Args:
+      logs: folders of logs of one robot.
+      out: folder of `summary.json`, `details.json`, `state.json` and `model/`.
+      horizons: three increasing lengths of segments in s.
+      null_logs: number of simulated null logs.
+      seed: of the null logs.
+      say: receives a line of text about progress.
+
+    Returns:
+      The answer, for a report.
+
+    Raises:
+      ValueError: a log cannot be used.
+    """
+    began, saved = time.monotonic(), out / "state.json"
+    log, spec = read_logs(logs)
+    question = build_question(log, spec, horizons, null_logs, seed)
+    out.mkdir(parents=True, exist_ok=True)
+    result = workflow.discover(
+        question.problem,
+        saved=json.loads(saved.read_text()) if saved.exists() else None,
+        save=lambda state: write_json(saved, state),
+        say=say,
+    )
+    free = free_runs(log, question, result)
+    stamp = {"seconds": time.monotonic() - began, "versions": checkpoint.versions()}
+    summary = summarise(question, result) | stamp
+    write_json(out / "summary.json", summary)
+    write_json(out / "details.json", details(question, result, free))
+    corrected.save(out / "model", spec, question.rig, (result.residual or result.fit).vector)
+    return Answer(log=log, question=question, result=result, summary=summary, free=free)
