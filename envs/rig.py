@@ -30,6 +30,9 @@ from jaxtune.types import Effect, Parameter
 ByEffect = Mapping[str, Mapping[str, jax.Array]]
 """Coordinates or values by effect and parameter, [places] each."""
 
+System = tuple[mjx.Model, mjx.Data, jax.Array]
+"""A robot's model and first state in MJX, and the direction of gravity in its IMU's frame, [3]."""
+
 # Of MJX's solver. With friction in every joint, readings differ from those with twice as many iterations by 0.003 floor
 # units (rms over the rms of the noise floor). With four line searches it would be 0.2.
 _ITERATIONS, _LINE_SEARCHES = 4, 6
@@ -96,6 +99,24 @@ class Rig:
         self.axes = self._describe_axes()
         # The IMU is taken to sit on the first body, which carries the others.
         self._gravity = sensing.projected_gravity(jnp.asarray(model.body_quat[1], jnp.float32))
+
+    @property
+    def system(self) -> System:
+        """The numbers of this robot, which programs take as an argument; see `on`."""
+        # Not on a device yet: a program may run on several.
+        return jax.tree.map(np.asarray, (self._model, self._data, self._gravity))
+
+    @property
+    def layout(self) -> tuple:
+        """All that compiled programs depend on beside `system`: robots of equal layout can share them."""
+        addresses = (self.qpos.tobytes(), self.dof.tobytes(), self._bodies.tobytes())
+        return self.joints, self.bodies, self.dt, addresses, jax.tree.structure(self.system)
+
+    def on(self, system: System) -> "Rig":
+        """Returns the rig with another robot of the same layout on it, also inside a compiled program."""
+        other = copy.copy(self)
+        other._model, other._data, other._gravity = system
+        return other
 
     def check_matches(self, joints: Sequence[str], control_hz: float) -> None:
         """Checks that the rig can be compared with a log: its joints and rate, and no other joint that may move.

@@ -1,7 +1,7 @@
 """Turns measured logs and a nominal model into the problem that discovery works on."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import mujoco
@@ -41,13 +41,14 @@ class Question:
 
 @dataclass(frozen=True)
 class _Simulator:
-    """Simulates some signals of a rig. Two with the same rig and signals are equal, so they share compiled programs."""
+    """Simulates some signals of a rig. Two of equal layout and signals are equal, so they share compiled programs."""
 
-    rig: Rig
+    rig: Rig = field(compare=False)
+    layout: Hashable
     signals: tuple[str, ...]
 
-    def __call__(self, values, inputs):
-        read = self.rig.simulate(self.rig.tree(values), inputs)
+    def __call__(self, system, values, inputs):
+        read = self.rig.on(system).simulate(self.rig.tree(values), inputs)
         return {name: read[name] for name in self.signals}
 
 
@@ -128,7 +129,8 @@ def build_question(
     simulated = [simulate_null_log(log, spec, seed + number) for number in range(null_logs)]
     measured, *nulls = (cut_log(one, rig.dt, signals, horizons) for one in (log, *simulated))
     problem = Problem(
-        simulate=_Simulator(plain, signals),
+        simulate=_Simulator(plain, plain.layout, signals),
+        system=plain.system,
         values=rig.inner,
         axes=len(rig.axes),
         hypotheses=every,

@@ -11,10 +11,11 @@ from typing import Any
 import jax
 import numpy as np
 
-Simulate = Callable[[jax.Array, Any], Mapping[str, jax.Array]]
-"""`simulate(values [axes], inputs) -> {signal: [rows, components]}`, for one segment.
+Simulate = Callable[[Any, jax.Array, Any], Mapping[str, jax.Array]]
+"""`simulate(system, values [axes], inputs) -> {signal: [rows, components]}`, for one segment.
 
-It must be hashable: programs are compiled once per length of segments, and simulators that are equal share them.
+It must be hashable: programs are compiled once per length of segments, and simulators that are equal share them. The
+`system` is an argument, so robots that differ in numbers alone, such as masses, share programs as well.
 """
 
 
@@ -108,6 +109,8 @@ class Problem:
     """
 
     simulate: Simulate
+    system: Any
+    """Numbers of the nominal robot, the first argument of `simulate`."""
     axes: int
     """Length of the vector of coordinates."""
     hypotheses: Sequence[Hypothesis]
