@@ -77,6 +77,7 @@ class Rig:
             if model.body_weldid[i] > 0 and model.body_mass[i] > 0 and model.body(i).name
         ]
         self._bodies = np.array(moving)
+        self.trees = model.dof_treeid[self.dof].copy()
         self.bodies = tuple(model.body(i).name for i in moving)
         self.mj_model = model
         # Joints that move but are neither controlled nor read; `check_matches` refuses a model that has some.
@@ -281,7 +282,7 @@ class Rig:
         before = len(segment.measured) - 1 - round(LONGEST_S / self.dt)
         drive = {
             name: getattr(segment, name)
-            for name in ("target", "feed", "stiffness", "damping", "limit", "emf", "sample")
+            for name in ("target", "between", "feed", "stiffness", "damping", "limit", "emf", "sample")
         }
         past = jax.tree.map(lambda x: x[:before], drive)
         future = jax.tree.map(lambda x: x[before:], drive)

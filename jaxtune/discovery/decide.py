@@ -179,7 +179,12 @@ def believed(candidates: Sequence[Candidate], probabilities: np.ndarray) -> list
 
 
 def rivals(
-    at: Floor, candidates: Sequence[Candidate], probabilities: np.ndarray, best: Candidate, hypothesis: Hypothesis, settings: Settings
+    at: Floor,
+    candidates: Sequence[Candidate],
+    probabilities: np.ndarray,
+    best: Candidate,
+    hypothesis: Hypothesis,
+    settings: Settings,
 ) -> tuple[str, ...]:
     """Names the effects that may as well be there in the place of one of the best candidate's.
 

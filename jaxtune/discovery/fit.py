@@ -93,7 +93,9 @@ class Fit:
     def along(self, hypothesis: Hypothesis) -> np.ndarray:
         """Finds a hypothesis that is part of the model by its directions; a mask [coordinates]."""
         rows = self.free.directions
-        return np.array([any((row == mine).all() for mine in hypothesis.directions) for row in rows]) & ~self.free.nominal
+        return (
+            np.array([any((row == mine).all() for mine in hypothesis.directions) for row in rows]) & ~self.free.nominal
+        )
 
     @property
     def linear(self) -> Linear:
@@ -163,7 +165,9 @@ def fit_at(free: Free, coordinates: np.ndarray, counts: Counts, evaluate: Evalua
       evaluate: residuals of vectors.
     """
     residual = evaluate((coordinates @ free.directions)[None])[0]
-    return polish([Fit(free, coordinates, residual, np.zeros((len(residual), len(coordinates))), counts)], evaluate, 0)[0]
+    return polish([Fit(free, coordinates, residual, np.zeros((len(residual), len(coordinates))), counts)], evaluate, 0)[
+        0
+    ]
 
 
 def begin(
@@ -201,7 +205,9 @@ def begin(
         replace(fit, residual=residual, finite=bool(np.isfinite(residual).all()))
         for fit, residual in zip(fits, found, strict=True)
     ]
-    own = [np.arange(len(fit.coordinates)) >= len(fit.coordinates) - len(p) for fit, p in zip(fits, points, strict=True)]
+    own = [
+        np.arange(len(fit.coordinates)) >= len(fit.coordinates) - len(p) for fit, p in zip(fits, points, strict=True)
+    ]
     return with_slopes(fits, own, evaluate)
 
 

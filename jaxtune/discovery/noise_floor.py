@@ -77,7 +77,9 @@ def prior_directions(problem: Problem) -> Free:
     """
     # Entries of the prior that are zero are axes of effects, which the nominal model has not.
     directions = np.concatenate([np.diag(problem.prior)[problem.prior > 0], problem.timing])
-    bounds = np.concatenate([np.tile([-FURTHEST, FURTHEST], (np.count_nonzero(problem.prior), 1)), problem.timing_bounds])
+    bounds = np.concatenate(
+        [np.tile([-FURTHEST, FURTHEST], (np.count_nonzero(problem.prior), 1)), problem.timing_bounds]
+    )
     count = len(directions)
     return Free(directions, np.ones(count), bounds, np.ones(count, bool))
 
@@ -143,9 +145,7 @@ def with_systematic_share(floor: NoiseFloor, at: Floor, residual: np.ndarray) ->
     return {
         horizon: replace(
             one,
-            counts=replace(
-                one.counts, systematic=min(share * bins / len(one.scale["train"]), one.counts.independent)
-            ),
+            counts=replace(one.counts, systematic=min(share * bins / len(one.scale["train"]), one.counts.independent)),
         )
         for horizon, one in floor.items()
     }
@@ -169,7 +169,10 @@ def _fit_null_logs(problem: Problem, prior: Free, train: Segments) -> tuple[np.n
         unit = np.sqrt((raw**2).mean(axis=(0, 1)))
         # The first unit holds what the nominal parameters are off, which the second no longer does.
         for _ in range(2 if number == 0 else 1):
-            steps = [_step(prior, point, log / unit, slopes / unit[..., None], share) for point, log in zip(coordinates, raw, strict=True)]
+            steps = [
+                _step(prior, point, log / unit, slopes / unit[..., None], share)
+                for point, log in zip(coordinates, raw, strict=True)
+            ]
             left = np.stack([log + slopes @ step for log, step in zip(raw, steps, strict=True)])
             unit = np.maximum(np.sqrt((left**2).mean(axis=(0, 1))), 1e-9)
             share = independent_share((left / unit).reshape(-1, *unit.shape))

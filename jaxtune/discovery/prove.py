@@ -8,7 +8,6 @@ import numpy as np
 
 from jaxtune.discovery.decide import (
     Candidate,
-    Evidence,
     Thresholds,
     believed,
     passes,
@@ -66,7 +65,9 @@ def conclude(settings: Settings, problem: Problem, floor: NoiseFloor, state: Sta
     at = floor[problem.main_horizon]
     say("evidence")
     best, terms, ablated, failed = _proved(settings, problem, floor, state)
-    candidates = sorted({one.key: one for one in (best, *state.candidates)}.values(), key=lambda one: total_cost(at, one, state.price))
+    candidates = sorted(
+        {one.key: one for one in (best, *state.candidates)}.values(), key=lambda one: total_cost(at, one, state.price)
+    )
     probabilities = posterior(problem, at, candidates, state.price)
     terms = tuple(
         replace(term, confusable_with=rivals(at, candidates, probabilities, best, term.hypothesis, settings))
@@ -283,12 +284,14 @@ def _placebos(state: State, conclusion: Conclusion) -> dict[str, np.ndarray]:
     singles = sorted((one for one in state.candidates if len(one.hypotheses) == 1), key=lambda one: one.fit.cost)
     kinds: dict[str, Sequence[Candidate]] = {
         "wrong place": [
-            one for one in singles if one.hypotheses[0].name == truth.name
-            and not set(one.hypotheses[0].places) & set(truth.places)
+            one
+            for one in singles
+            if one.hypotheses[0].name == truth.name and not set(one.hypotheses[0].places) & set(truth.places)
         ],
         "wrong effect": [
-            one for one in singles if one.hypotheses[0].places == truth.places
-            and one.hypotheses[0].family != truth.family
+            one
+            for one in singles
+            if one.hypotheses[0].places == truth.places and one.hypotheses[0].family != truth.family
         ],
     }
     return {f"{label}: {found[0].key}": found[0].fit.vector for label, found in kinds.items() if found}

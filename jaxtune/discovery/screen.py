@@ -10,6 +10,7 @@ in the end, and a pair costs no more simulations than its parts.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -58,9 +59,7 @@ class Screen:
     """[logs]: fall of the cost that the best hypothesis reaches on each null log."""
 
 
-def screen(
-    problem: Problem, at: Floor, base: Fit, hypotheses: Sequence[Hypothesis], *, pairs: int, say: Say
-) -> Screen:
+def screen(problem: Problem, at: Floor, base: Fit, hypotheses: Sequence[Hypothesis], *, pairs: int, say: Say) -> Screen:
     """Screens hypotheses beside a model.
 
     Args:
@@ -155,8 +154,9 @@ def change_of(hypothesis: Hypothesis, points: np.ndarray, curves: Curves) -> np.
     """Interpolates how a hypothesis changes the residuals at points [n, parameters]; returns [n, features]."""
     found = 0.0
     coordinates = points @ hypothesis.directions
-    for axis in np.flatnonzero((hypothesis.directions != 0).any(axis=0)):
-        sizes, values = curves[int(axis)]
+    # Shape parameters have no curve: they mean nothing without a size.
+    for axis in (int(one) for one in np.flatnonzero((hypothesis.directions != 0).any(axis=0)) if int(one) in curves):
+        sizes, values = curves[axis]
         at = np.clip(coordinates[:, axis], sizes[0], sizes[-1])
         left = np.clip(np.searchsorted(sizes, at, side="right") - 1, 0, len(sizes) - 2)
         share = ((at - sizes[left]) / (sizes[left + 1] - sizes[left])).astype(np.float32)[:, None]
@@ -185,7 +185,7 @@ def _points(some: Fit, hypothesis: Hypothesis, curves: Curves) -> np.ndarray:
         wanted[:, : points.shape[1]] = points
         return np.clip(wanted, *hypothesis.bounds.T)
     sizes = np.array(sorted([0.0, *probes[:, 0]]))
-    between = [a + share * (b - a) for a, b in zip(sizes, sizes[1:], strict=False) for share in _BETWEEN]
+    between = [a + share * (b - a) for a, b in pairwise(sizes) for share in _BETWEEN]
     points = np.zeros((len(between), probes.shape[1]))
     points[:, 0] = between
     return points[points[:, 0] != 0]

@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxtune.discovery.decide import Candidate, total_cost
 from jaxtune.discovery.evaluate import worst
-from jaxtune.discovery.fit import Fit, begin, polish, refine, without
+from jaxtune.discovery.fit import Fit, begin, polish, refine
 from jaxtune.discovery.localise import localise
 from jaxtune.discovery.noise_floor import Floor, NoiseFloor, Say
 from jaxtune.discovery.problem import Problem, are_distinct
@@ -63,7 +63,11 @@ def step(
     state = state.replaced(best, replace(best, fit=fit))
     base = fit if state.screened else state.nominal
     state = localise(problem, at, state, fit)
-    free = [h for h in problem.hypotheses if all(h.key != other.key and are_distinct(h, other) for other in state.best.hypotheses)]
+    free = [
+        h
+        for h in problem.hypotheses
+        if all(h.key != other.key and are_distinct(h, other) for other in state.best.hypotheses)
+    ]
     found = screen(problem, at, base, free, pairs=0 if state.screened else settings.firsts, say=say)
     state = state.with_screen(settings, problem, found)
     leads = shortlist(settings, found, state.price)
@@ -95,9 +99,7 @@ def shortlist(settings: Settings, found: Screen, price: float) -> list[Lead]:
     return chosen + pairs[: settings.pairs]
 
 
-def fit_leads(
-    settings: Settings, at: Floor, base: Fit, present: Sequence, leads: Sequence[Lead]
-) -> list[Candidate]:
+def fit_leads(settings: Settings, at: Floor, base: Fit, present: Sequence, leads: Sequence[Lead]) -> list[Candidate]:
     """Fits leads beside a model on `train`, the best of them with fresh slopes, and simulates them on `select`.
 
     Args:
@@ -110,7 +112,7 @@ def fit_leads(
     if not leads:
         return []
     evaluate = at.residuals["train"]
-    begun = begin(base, [l.hypotheses for l in leads], [l.point for l in leads], [l.start for l in leads], evaluate)
+    begun = begin(base, *zip(*((lead.hypotheses, lead.point, lead.start) for lead in leads), strict=True), evaluate)
     fits = refine(begun, evaluate, settings.rounds)
     order = [index for index in np.argsort([fit.cost for fit in fits]) if np.isfinite(fits[index].cost)]
     finalists = order[: settings.finalists]
