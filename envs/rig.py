@@ -264,7 +264,7 @@ class Rig:
             for name, row in self.effects.items()
         }
 
-    def simulate(self, values: ByEffect, segment: Segment) -> dict[str, jax.Array]:
+    def simulate(self, values: ByEffect, segment: Segment, steps: jax.Array | None = None) -> dict[str, jax.Array]:
         """Simulates a segment of a log under one hypothesis.
 
         First the measured history before the segment fills the memories of the effects. Then the robot starts from its
@@ -273,6 +273,8 @@ class Rig:
         Args:
           values: of all effects, as `values` returns them.
           segment: the controller's inputs, and the motion measured before the segment.
+          steps: how many steps are simulated, all where None; later rows repeat zeros. As it may be traced, segments of
+            all lengths can share one program.
 
         Returns:
           Readings at the segment's rows by signal: `q`, `dq` and `tau` [rows, joints], `gravity` [rows, 3].
@@ -310,12 +312,16 @@ class Rig:
             qacc=self._data.qacc.at[self.dof].set(acceleration[before]),
         )
 
-        def move(carry, x):
-            data, memory = carry
-            data, memory, read = chain.step(model, data, memory, values, x)
-            return (data, memory), read
+        def move(index, carry):
+            data, memory, reads = carry
+            data, memory, read = chain.step(model, data, memory, values, take(index))
+            return data, memory, jax.tree.map(lambda all, now: all.at[index].set(now), reads, read)
 
-        _, read = jax.lax.scan(move, (data, memory), future)
+        take = lambda index: jax.tree.map(lambda x: x[index], future)  # noqa: E731
+        count = len(future["sample"])
+        one = jax.eval_shape(lambda: chain.step(model, data, memory, values, take(0))[2])
+        reads = jax.tree.map(lambda x: jnp.zeros((count, *x.shape), x.dtype), one)
+        _, _, read = jax.lax.fori_loop(0, count if steps is None else steps, move, (data, memory, reads))
         # The rows of a log lie between steps of the simulation, so readings are interpolated.
         step, share = segment.row_step, segment.row_share[:, None]
         following = jnp.minimum(step + 1, len(future["sample"]) - 1)

@@ -47,8 +47,8 @@ class _Simulator:
     layout: Hashable
     signals: tuple[str, ...]
 
-    def __call__(self, system, values, inputs):
-        read = self.rig.on(system).simulate(self.rig.tree(values), inputs)
+    def __call__(self, system, values, inputs, steps):
+        read = self.rig.on(system).simulate(self.rig.tree(values), inputs, steps)
         return {name: read[name] for name in self.signals}
 
 

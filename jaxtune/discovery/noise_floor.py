@@ -108,7 +108,9 @@ def measure(problem: Problem, say: Say) -> NoiseFloor:
         found[horizon] = Floor(
             horizon=horizon,
             scale=scale,
-            counts=Counts(components=unit.shape[-1], independent=independent_share(in_units.reshape(-1, *unit.shape))),
+            counts=Counts(
+                components=unit.shape[-1], independent=independent_share(in_units.reshape(-1, *in_units.shape[2:]))
+            ),
             residuals={
                 split: partial(flat_residuals, problem, segments[split], scale[split]) for split in problem.data
             },

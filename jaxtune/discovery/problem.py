@@ -11,11 +11,12 @@ from typing import Any
 import jax
 import numpy as np
 
-Simulate = Callable[[Any, jax.Array, Any], Mapping[str, jax.Array]]
-"""`simulate(system, values [axes], inputs) -> {signal: [rows, components]}`, for one segment.
+Simulate = Callable[[Any, jax.Array, Any, jax.Array], Mapping[str, jax.Array]]
+"""`simulate(system, values [axes], inputs, steps) -> {signal: [rows, components]}`, for one segment.
 
-It must be hashable: programs are compiled once per length of segments, and simulators that are equal share them. The
-`system` is an argument, so robots that differ in numbers alone, such as masses, share programs as well.
+It must be hashable: programs are compiled once, and simulators that are equal share them. The `system` is an argument,
+so robots that differ in numbers alone, such as masses, share programs as well. The number of `steps` is one too, and
+inputs are padded to the longest segment; rows after the last step may hold anything.
 """
 
 
@@ -95,6 +96,8 @@ class Segments:
     """[segments, ...] on every leaf: what the simulator is given (first state, targets, ...)."""
     signals: Mapping[str, np.ndarray]
     """[segments, rows, components] by name: what was measured."""
+    steps: int
+    """Steps of the simulation to the last row."""
     run: np.ndarray
     """[segments]: index of the run that the segment was cut from."""
     regimes: np.ndarray

@@ -47,8 +47,8 @@ def paired_residuals(
     """Simulates chosen pairs of a vector and a segment; `residuals` takes all pairs.
 
     Every pair is a simulation of its own. They run side by side, `width` at a time on every device, in a loop whose
-    length is an argument of the compiled program. So there is one compilation for every length of segments, whatever
-    their number, that of the vectors, and the numbers of the robot.
+    length is an argument of the compiled program. So there is one compilation for all segments, whatever their length
+    and number, the number of the vectors, and the numbers of the robot.
 
     Args:
       problem: the simulator and how its signals are binned.
@@ -64,18 +64,18 @@ def paired_residuals(
     width *= len(jax.devices())
     values = np.asarray(problem.values(vectors), np.float32)
     measured = binned(segments.signals, problem.bin_rows)
+    longest = problem.data["train"][problem.horizons[-1]].inputs
     once, found = _CHUNKS * width, []
     for start in range(0, len(which), once):
         count = min(once, len(which) - start)
         # A last call is filled up with pairs that are not simulated: another shape would be another compilation.
         mine = start + np.arange(once) % count
-        grid = lambda leaf: np.asarray(leaf).reshape(_CHUNKS, width, *leaf.shape[1:])  # noqa: E731
-        inputs = jax.tree.map(lambda leaf, mine=mine: grid(leaf[piece[mine]]), segments.inputs)
         chunks = -(-count // width)
-        predicted = _simulate_chunks(
-            problem.simulate, problem.bin_rows, problem.system, chunks, grid(values[which[mine]]), inputs
-        )
-        found.append(np.asarray(predicted).reshape(once, *measured.shape[1:])[:count])
+        some = jax.tree.map(lambda leaf, like, mine=mine: _padded(leaf[piece[mine]], like), segments.inputs, longest)
+        work = jax.tree.map(lambda leaf: leaf.reshape(_CHUNKS, width, *leaf.shape[1:]), (values[which[mine]], some))
+        predicted = _simulate_chunks(problem.simulate, problem.bin_rows, problem.system, chunks, segments.steps, *work)
+        flat = np.asarray(predicted).reshape(once, *predicted.shape[2:])
+        found.append(flat[:count, : measured.shape[1]])
     return measured[piece] - np.concatenate(found)
 
 
@@ -107,25 +107,32 @@ def binned(signals: Mapping[str, Any], rows: int):
 
 
 @partial(jax.jit, static_argnums=(0, 1))
-def _simulate_chunks(simulate: Simulate, bin_rows: int, system, count, values, inputs):
+def _simulate_chunks(simulate: Simulate, bin_rows: int, system, count, steps, values, inputs):
     """Runs the first `count` chunks of values [chunks, width, axes] and inputs [chunks, width, ...]."""
 
-    def one(system, mine, segment):
-        return binned(simulate(system, mine, segment), bin_rows)
+    def one(system, mine, segment, steps):
+        return binned(simulate(system, mine, segment, steps), bin_rows)
 
-    def all_of(system, count, values, inputs):
+    def all_of(system, count, steps, values, inputs):
         take = lambda index: jax.tree.map(lambda leaf: leaf[index], (values, inputs))  # noqa: E731
-        many = jax.vmap(one, in_axes=(None, 0, 0))
-        shape = jax.eval_shape(many, system, *take(0))
+        many = jax.vmap(one, in_axes=(None, 0, 0, None))
+        shape = jax.eval_shape(many, system, *take(0), steps)
 
         def work(index, found):
-            return found.at[index].set(many(system, *take(index)))
+            return found.at[index].set(many(system, *take(index), steps))
 
         return jax.lax.fori_loop(0, count, work, jnp.zeros((len(values), *shape.shape), shape.dtype))
 
     # Nothing is exchanged: devices share the width, and each loops by itself.
     mesh, across = Mesh(np.array(jax.devices()), ("width",)), PartitionSpec(None, "width")
-    specs = (PartitionSpec(), PartitionSpec(), across, across)
+    specs = (PartitionSpec(), PartitionSpec(), PartitionSpec(), across, across)
     return jax.shard_map(all_of, mesh=mesh, in_specs=specs, out_specs=across, check_vma=False)(
-        system, count, values, inputs
+        system, count, steps, values, inputs
     )
+
+
+def _padded(leaf: np.ndarray, like: np.ndarray) -> np.ndarray:
+    """Repeats the last entry of a leaf [n, ...] along its second dimension until it is as long as that of `like`."""
+    if leaf.ndim < 2 or leaf.shape[1] == like.shape[1]:
+        return leaf
+    return np.pad(leaf, [(0, 0), (0, like.shape[1] - leaf.shape[1]), *[(0, 0)] * (leaf.ndim - 2)], mode="edge")
