@@ -169,7 +169,7 @@ def stale(run: Run, signal: str) -> np.ndarray:
         speed = motion / np.diff(run.time[new])
         on = np.minimum(speed[1:] / speed[:-1], speed[:-1] / speed[1:]) > _STEADY
         on = np.append(False, on) | np.append(on, False)
-        far = np.abs(motion) * (rows - 1) / rows > _STALE * max(quantum, np.abs(motion).min())
+        far = np.abs(motion) * (rows - 1) / rows > _STALE * quantum
         for first, count in zip(new[:-1][on & far], rows[on & far], strict=True):
             found[first + 1 : first + count, column] = True
     return found
