@@ -105,13 +105,16 @@ def replay(run: Run, model: mujoco.MjModel, joints: Sequence[str], linear: bool,
     states, torques = np.empty((len(looks), 2, len(joints))), np.empty((len(looks), len(joints)))
     if looks[0]:
         mujoco.mj_step(model, data, int(looks[0]))
+    law, row_of_law = controller[last[0]], last[0]
     for look, row in enumerate(last):
+        if row != row_of_law:
+            law, row_of_law = controller[row], row
         q, dq = data.qpos[qpos], data.qvel[dof]
-        torque = controller[row].torque(targets[look], q, dq) if driven else run.signals["tau"][row]
+        torque = law.torque(targets[look], q, dq) if driven else run.signals["tau"][row]
         # As damping, back electromotive force acts continuously between two ticks.
-        model.dof_damping[dof] = damping + controller.back_emf[row]
+        model.dof_damping[dof] = damping + law.back_emf
         # A sensor of torque or current sees what the back electromotive force leaves.
-        states[look, 0], states[look, 1], torques[look] = q, dq, torque - controller.back_emf[row] * dq
+        states[look, 0], states[look, 1], torques[look] = q, dq, torque - law.back_emf * dq
         data.qfrc_applied[dof] = torque
         if look + 1 < len(looks):
             mujoco.mj_step(model, data, int(looks[look + 1] - looks[look]))

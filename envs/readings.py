@@ -216,14 +216,14 @@ def hermite(time: np.ndarray, values: np.ndarray, slopes: np.ndarray, at: np.nda
       time: [n] s, increasing, two or more.
       values: [n, ...].
       slopes: [n, ...], of the values per s.
-      at: [times] s.
+      at: s, of any shape.
 
     Returns:
-      Values and slopes, [times, ...] each.
+      Values and slopes, [*at.shape, ...] each.
     """
     at = np.clip(at, time[0], time[-1])
     left = np.clip(np.searchsorted(time, at, side="right") - 1, 0, len(time) - 2)
-    along = (-1, *(1,) * (values.ndim - 1))
+    along = (*at.shape, *(1,) * (values.ndim - 1))
     width = (time[left + 1] - time[left]).reshape(along)
     s = (at - time[left]).reshape(along) / width
     (p0, v0), (p1, v1) = ((values[left + i], slopes[left + i]) for i in (0, 1))

@@ -97,32 +97,27 @@ def cut(runs: Sequence[Run], horizon_s: float, dt: float, bin_s: float = 0.01) -
     period = float(np.median([np.median(np.diff(run.time)) for run in runs]))
     together = rows_together(period, bin_s)
     rows = max(1, round(horizon_s / period / together)) * together
-    pieces = []
-    for number, run in enumerate(runs):
-        # Every segment needs a history, the first one too.
-        first = int(np.searchsorted(run.time, run.time[0] + HISTORY_S))
-        pieces += [(number, start) for start in range(first, len(run.time) - rows, rows)]
-    if not pieces:
+    # Every segment needs a history, the first one too.
+    first = [int(np.searchsorted(run.time, run.time[0] + HISTORY_S)) for run in runs]
+    starts = [np.arange(begin, len(run.time) - rows, rows) for run, begin in zip(runs, first, strict=True)]
+    if not any(map(len, starts)):
         longest = max(run.time[-1] - run.time[0] for run in runs)
         raise ValueError(f"runs: the longest has {longest:.3g} s, expected more than {horizon_s + HISTORY_S:.3g} s")
-    # As many steps as the longest segment needs, because rows are not exactly periodic.
-    after = 1 + max(int(np.ceil((runs[n].time[i + rows] - runs[n].time[i]) / dt - 1e-6)) for n, i in pieces)
-    # Smoothing is done once for a run, not once for a segment.
-    prepared = [_Prepared(run, dt) for run in runs]
-    segments = [prepared[number].segment(start, start + 1 + np.arange(rows), after) for number, start in pieces]
+    lengths = np.concatenate([run.time[i + rows] - run.time[i] for run, i in zip(runs, starts, strict=True)])
+    row = [own[:, None] + 1 + np.arange(rows) for own in starts]
     names = [name for name in COMPARED if all(name in run.signals for run in runs)]
     if not all("target" in run.signals for run in runs):
         names = [name for name in names if name != "tau"]
-    row = np.array([np.arange(start + 1, start + 1 + rows) for _, start in pieces])
-    signals = {name: [aligned(run, name) for run in runs] for name in names}
     return Cut(
-        segments=jax.tree.map(lambda *leaves: np.stack(leaves), *segments),
+        segments=_segments(runs, starts, row, lengths.max(), dt),
         signals={
-            name: np.stack([values[n][i] for (n, _), i in zip(pieces, row, strict=True)]).astype(np.float32)
-            for name, values in signals.items()
+            name: np.concatenate([aligned(run, name)[own] for run, own in zip(runs, row, strict=True)]).astype(
+                np.float32
+            )
+            for name in names
         },
-        run=np.array([number for number, _ in pieces]),
-        row=row,
+        run=np.repeat(np.arange(len(runs)), [len(own) for own in starts]),
+        row=np.concatenate(row),
     )
 
 
@@ -135,24 +130,36 @@ def whole(runs: Sequence[Run], dt: float) -> Cut:
       runs: of one robot.
       dt: step of the simulation in s.
     """
-    prepared = [_Prepared(run, dt) for run in runs]
     first = [int(np.searchsorted(run.time, run.time[0] + HISTORY_S)) for run in runs]
-    counts = [len(run.time) - 1 - start for run, start in zip(runs, first, strict=True)]
-    rows = np.array(
-        [
-            np.minimum(start + 1 + np.arange(max(counts)), len(run.time) - 1)
-            for run, start in zip(runs, first, strict=True)
-        ]
-    )
-    lengths = [run.time[-1] - run.time[start] for run, start in zip(runs, first, strict=True)]
-    after = 1 + int(np.ceil(max(lengths) / dt - 1e-6))
-    segments = [one.segment(start, row, after) for one, start, row in zip(prepared, first, rows, strict=True)]
+    most = max(len(run.time) - 1 - start for run, start in zip(runs, first, strict=True))
+    row = [
+        np.minimum(start + 1 + np.arange(most), len(run.time) - 1)[None] for run, start in zip(runs, first, strict=True)
+    ]
+    longest = max(run.time[-1] - run.time[start] for run, start in zip(runs, first, strict=True))
     return Cut(
-        segments=jax.tree.map(lambda *leaves: np.stack(leaves), *segments),
-        signals={"q": np.stack([aligned(run, "q")[row] for run, row in zip(runs, rows, strict=True)])},
+        segments=_segments(runs, [np.array([start]) for start in first], row, longest, dt),
+        signals={"q": np.concatenate([aligned(run, "q")[own] for run, own in zip(runs, row, strict=True)])},
         run=np.arange(len(runs)),
-        row=rows,
+        row=np.concatenate(row),
     )
+
+
+def _segments(
+    runs: Sequence[Run], starts: Sequence[np.ndarray], rows: Sequence[np.ndarray], longest_s: float, dt: float
+) -> Segment:
+    """Makes the segments of all runs, as one with [segments, ...] on every field.
+
+    Args:
+      runs: of one robot.
+      starts: [segments] of every run: the row at which each begins.
+      rows: [segments, rows] of every run: the rows at which each is read, later than its start.
+      longest_s: the time from a start to the last row read, of the longest segment. Rows are not exactly periodic, and
+        all segments get as many steps as the longest.
+      dt: step of the simulation in s.
+    """
+    after = 1 + int(np.ceil(longest_s / dt - 1e-6))
+    parts = [_of_run(run, start, row, after, dt) for run, start, row in zip(runs, starts, rows, strict=True)]
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
 
 
 def rows_together(period_s: float, bin_s: float) -> int:
@@ -165,59 +172,54 @@ def rows_together(period_s: float, bin_s: float) -> int:
     return max(1, round(bin_s / period_s))
 
 
-class _Prepared:
-    """A run with smoothed states and its controller's numbers at every row, ready to be cut."""
+def _of_run(run: Run, start: np.ndarray, rows: np.ndarray, after: int, dt: float) -> Segment:
+    """Makes the segments of one run, of `after` steps each (`_segments`)."""
+    before, ahead = round(HISTORY_S / dt), round(LONGEST_S / dt)
+    begin = run.time[start][:, None]
+    grid = begin + dt * np.arange(-before, after)
+    # A row's values act from its time stamp until the next.
+    last = np.clip(np.searchsorted(run.time, grid + 1e-9, side="right") - 1, 0, len(run.time) - 1)
+    target, between = _targets(run, grid, last)
+    controller, none = run.impedance(), np.zeros(run.signals["q"].shape)
+    held = {
+        "feed": none if "target" in run.signals else run.signals["tau"],
+        "stiffness": controller.stiffness,
+        "damping": controller.damping,
+        "limit": controller.limit,
+        "emf": controller.back_emf,
+    }
+    # Where the controller's ticks lie between rows is unknown; they are counted from the run's first row.
+    ticks = np.floor((grid - run.time[0]) * run.controller.rate_hz + 1e-6)
+    at = (run.time[rows] - begin) / dt
+    step = np.minimum(np.floor(at + 1e-6).astype(np.int32), after - 1)
+    position, velocity = np.moveaxis(smoothed(run), 1, 0)
+    states = hermite(run.time, position, velocity, begin + dt * np.arange(-before, ahead + 1))
+    return Segment(
+        target=target,
+        between=between,
+        **{name: values.astype(np.float32)[last] for name, values in held.items()},
+        sample=np.diff(ticks, axis=1, prepend=-np.inf) > 0,
+        measured=np.stack(states, axis=2).astype(np.float32),
+        row_step=step,
+        row_share=np.clip(at - step, 0.0, 1.0).astype(np.float32),
+    )
 
-    def __init__(self, run: Run, dt: float):
-        self._run, self._dt = run, dt
-        self._states = smoothed(run)
-        joints = run.signals["q"].shape[1]
-        controller = run.impedance()
-        none = np.zeros((len(run.time), joints))
-        self._held = {
-            "target": run.signals.get("target", none),
-            "feed": none if "target" in run.signals else run.signals["tau"],
-            "stiffness": controller.stiffness,
-            "damping": controller.damping,
-            "limit": controller.limit,
-            "emf": controller.back_emf,
-        }
 
-    def segment(self, start: int, rows: np.ndarray, after: int) -> Segment:
-        """Makes the segment that starts at row `start`, has `after` steps and is read at `rows`, all later."""
-        run, dt = self._run, self._dt
-        before, ahead = round(HISTORY_S / dt), round(LONGEST_S / dt)
-        begin = run.time[start]
-        grid = begin + dt * np.arange(-before, after)
-        # A row's values act from its time stamp until the next.
-        last = np.clip(np.searchsorted(run.time, grid + 1e-9, side="right") - 1, 0, len(run.time) - 1)
-        held = {name: values[last].astype(np.float32) for name, values in self._held.items()}
-        further = self._further(grid, last)
-        if run.controller.between_rows == "linear":
-            held["target"] = held["target"] + further
-        unknown = run.controller.between_rows == "unknown"
-        # Where the controller's ticks lie between rows is unknown; they are counted from the run's first row.
-        period = 1.0 / run.controller.rate_hz
-        ticks = np.floor((grid - run.time[0]) / period + 1e-6)
-        at = (run.time[rows] - begin) / dt
-        step = np.minimum(np.floor(at + 1e-6).astype(np.int32), after - 1)
-        return Segment(
-            **held,
-            between=further if unknown else np.zeros_like(further),
-            sample=np.append(True, np.diff(ticks) > 0),
-            measured=self._at(begin + dt * np.arange(-before, ahead + 1)),
-            row_step=step,
-            row_share=np.clip(at - step, 0.0, 1.0).astype(np.float32),
-        )
+def _targets(run: Run, grid: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns targets, and how far linear ones are from them where it is unknown which the robot had.
 
-    def _further(self, grid: np.ndarray, last: np.ndarray) -> np.ndarray:
-        """Returns how far a target that leads to the next row linearly is from the last row's, [times, joints] rad."""
-        time, target = self._run.time, self._held["target"]
-        following = np.minimum(last + 1, len(time) - 1)
-        share = (grid - time[last]) / np.maximum(time[following] - time[last], 1e-9)
-        return (np.clip(share, 0.0, 1.0)[:, None] * (target[following] - target[last])).astype(np.float32)
+    Args:
+      run: the run; without targets both are zero.
+      grid: [segments, steps] s.
+      last: [segments, steps] the row at or before each time.
 
-    def _at(self, times: np.ndarray) -> np.ndarray:
-        """Interpolates smoothed states at other times."""
-        position, velocity = np.moveaxis(self._states, 1, 0)
-        return np.stack(hermite(self._run.time, position, velocity, times), axis=1).astype(np.float32)
+    Returns:
+      [segments, steps, joints] rad each.
+    """
+    target = run.signals.get("target", np.zeros(run.signals["q"].shape))
+    following = np.minimum(last + 1, len(run.time) - 1)
+    share = (grid - run.time[last]) / np.maximum(run.time[following] - run.time[last], 1e-9)
+    further = np.clip(share, 0.0, 1.0)[..., None] * (target[following] - target[last])
+    held, none = target[last], np.zeros_like(further)
+    by_rows = {"hold": (held, none), "linear": (held + further, none), "unknown": (held, further)}
+    return tuple(values.astype(np.float32) for values in by_rows[run.controller.between_rows])
