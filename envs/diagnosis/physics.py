@@ -187,7 +187,7 @@ def _drift(run: Run) -> list[Finding]:
 
 def _coarse(run: Run, joints: tuple[str, ...]) -> list[Finding]:
     """Finds positions that were rounded more coarsely than the motion allows."""
-    quantum = quantum_of(run.signals["q"])
+    quantum = quantum_of(run.signals["q"]).max()
     if not _is_coarse(run):
         return []
     text = f"quantisation: positions come in steps of {quantum:.3g} rad; smaller motion cannot be seen"
@@ -195,7 +195,7 @@ def _coarse(run: Run, joints: tuple[str, ...]) -> list[Finding]:
 
 
 def _is_coarse(run: Run) -> bool:
-    return quantum_of(run.signals["q"]) > _COARSE * float(np.median(np.ptp(run.signals["q"], axis=0)))
+    return quantum_of(run.signals["q"]).max() > _COARSE * float(np.median(np.ptp(run.signals["q"], axis=0)))
 
 
 def _clipped(run: Run, joints: tuple[str, ...]) -> list[Finding]:
@@ -208,7 +208,7 @@ def _clipped(run: Run, joints: tuple[str, ...]) -> list[Finding]:
         limit = (
             run.controller.gains.get("torque_limit_nm", np.full(values.shape[1], np.inf)) if name == "tau" else np.inf
         )
-        quantum = max(quantum_of(values), 1e-9)
+        quantum = np.maximum(quantum_of(values), 1e-9)
         for side, end in ((1.0, values.max(axis=0)), (-1.0, values.min(axis=0))):
             inward = side * (end - values)
             stays = (inward < 0.5 * quantum) & (np.abs(end) < 0.99 * limit)

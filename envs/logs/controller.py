@@ -49,7 +49,8 @@ class Impedance:
           [..., joints] Nm.
         """
         torque = self.stiffness * (target - position) - self.damping * velocity
-        return np.clip(torque, -self.limit, self.limit)
+        # As np.clip, which takes several times as long for a few joints.
+        return np.minimum(np.maximum(torque, -self.limit), self.limit)
 
     def __getitem__(self, index) -> "Impedance":
         """Takes some rows (or joints, of one without rows), as of an array."""

@@ -1,5 +1,6 @@
-"""Lists the hypotheses of discovery: every effect at every place alone, at left and right pairs, and at all places."""
+"""Lists the hypotheses of discovery: every effect at every place alone, and at sets of places that are alike."""
 
+import re
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -31,15 +32,42 @@ def hypotheses(
     )
 
 
-def place_sets(places: Sequence[str]) -> list[tuple[str, ...]]:
-    """Lists the sets of places at which an effect is tried: each place alone, left and right pairs, and all together.
+_RIGHT = {"left": "right", "l": "r", "fl": "fr", "rl": "rr", "hl": "hr", "bl": "br"}
+_RIGHT |= {"lf": "rf", "lr": "rr", "lh": "rh", "lb": "rb"}
+_SIDES = {*_RIGHT, *_RIGHT.values(), "front", "rear", "hind", "back"}
+_WORDS = re.compile(r"left|right|[a-z0-9]+?(?=left|right|[^a-z0-9]|$)", re.IGNORECASE)
 
-    Pairs and all places are common in robots (the same motor in both knees), and one size for all of them is easier to
-    confirm than a size for each.
+
+def place_sets(places: Sequence[str]) -> list[tuple[str, ...]]:
+    """Lists the sets of places at which an effect is tried.
+
+    They are each place alone, pairs of left and right, all of one kind on several legs (such as four calves), and all
+    places. Such sets are common in robots (the same motor in both knees), and one size for all of them is easier to
+    confirm than a size for each. Sides are words of a name: `left`, `L`, `FL` (front left), `LH` (left hind), `rear`.
     """
-    pairs = [(one, one.replace("left", "right")) for one in places if "left" in one]
-    sets = [(place,) for place in places] + [pair for pair in pairs if pair[1] in places]
-    return sets if len(places) < 2 or tuple(places) in sets else [*sets, tuple(places)]
+    pairs = [(one, _mirrored(one)) for one in places if _mirrored(one) in places]
+    kinds: dict[str, list[str]] = {}
+    for place in places:
+        kinds.setdefault(_kind(place), []).append(place)
+    several = [tuple(kind) for kind in kinds.values() if len(kind) > 1]
+    sets = [(place,) for place in places] + pairs + several + [tuple(places)]
+    # The first of several in another order.
+    return list({frozenset(one): one for one in reversed(sets)}.values())[::-1]
+
+
+def _mirrored(place: str) -> str | None:
+    """Returns the name of the same place on the right, or None for a place that is not on the left."""
+    for word in _WORDS.finditer(place):
+        right = _RIGHT.get(word[0].lower())
+        if right is not None:
+            right = right.upper() if word[0].isupper() else right.title() if word[0].istitle() else right
+            return place[: word.start()] + right + place[word.end() :]
+    return None
+
+
+def _kind(place: str) -> str:
+    """Returns a name without its side."""
+    return _WORDS.sub(lambda word: "" if word[0].lower() in _SIDES else word[0], place)
 
 
 def timing_directions(axes: Sequence[Axis], control_hz: float) -> tuple[np.ndarray, np.ndarray]:
