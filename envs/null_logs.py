@@ -12,14 +12,17 @@ its integrator, the moment at which a controller reads the joint. A null log the
   column.
 """
 
+import os
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
+from mujoco import rollout
 
 from envs import sensing
 from envs.logs import Log, Run
+from envs.logs.controller import Impedance
 from envs.models import suspended
 from envs.readings import noise_of, read_later, rounding_of, stale
 from envs.smoothing import smoothed
@@ -28,23 +31,54 @@ _STEP_S = 0.0005  # half the step of `Rig`
 _SPREAD = 0.1  # standard deviation of the logarithm of every drawn parameter, as in `Axis.prior_sd`
 
 
-def simulate_null_log(log: Log, spec: mujoco.MjSpec, seed: int) -> Log:
-    """Simulates a log in which no effect is missing, with the targets and conditions of a measured one.
+def simulate_null_logs(log: Log, spec: mujoco.MjSpec, count: int, seed: int) -> list[Log]:
+    """Simulates logs in which no effect is missing, with the targets and conditions of a measured one.
+
+    All runs of all logs are simulated side by side.
 
     Args:
       log: the measured log; its targets are played again and its noise is imitated.
       spec: MJCF of the nominal robot.
+      count: number of logs.
       seed: of the drawn parameters, the controller's jitter and the noise. Other seeds give other null logs.
 
     Returns:
-      A log of the same runs, joints and signals. Signals of the controller (targets, supply, enabling) are copied,
+      Logs of the same runs, joints and signals. Signals of the controller (targets, supply, enabling) are copied,
       signals of sensors are simulated.
     """
-    rng = np.random.default_rng(seed)
-    model = _drawn(spec, rng)
-    linear = {"hold": False, "linear": True, "unknown": bool(rng.integers(0, 2))}
-    runs = tuple(replay(run, model, log.joints, linear[run.controller.between_rows], rng) for run in log.runs)
-    return replace(log, runs=runs)
+    robots = [_Robot.drawn(spec, np.random.default_rng(seed + number)) for number in range(count)]
+    pairs = [(robot, run) for robot in robots for run in log.runs]
+    played = play(pairs, log.joints)
+    runs = [_as_run(robot, run, motion) for (robot, run), motion in zip(pairs, played, strict=True)]
+    each = len(log.runs)
+    return [replace(log, runs=tuple(runs[start : start + each])) for start in range(0, len(runs), each)]
+
+
+@dataclass(frozen=True)
+class _Robot:
+    """One robot that lacks nothing: its model, how its targets go on between rows, and its random numbers."""
+
+    model: mujoco.MjModel
+    linear: bool
+    rng: np.random.Generator
+
+    @staticmethod
+    def drawn(spec: mujoco.MjSpec, rng: np.random.Generator) -> "_Robot":
+        """Draws a robot from the prior. Where a log does not say how targets go on, half of all robots go straight."""
+        return _Robot(_drawn(spec, rng), bool(rng.integers(0, 2)), rng)
+
+    def goes_straight(self, run: Run) -> bool:
+        """Whether targets move to the next row in a straight line; else they are held."""
+        return {"hold": False, "linear": True, "unknown": self.linear}[run.controller.between_rows]
+
+
+@dataclass(frozen=True)
+class _Motion:
+    """A simulated run where its controller looked: times [n], states [n, 2, joints], torques [n, joints]."""
+
+    times: np.ndarray
+    states: np.ndarray
+    torques: np.ndarray
 
 
 def _drawn(spec: mujoco.MjSpec, rng: np.random.Generator) -> mujoco.MjModel:
@@ -70,62 +104,128 @@ def _factors(rng: np.random.Generator, count: int) -> np.ndarray:
     return np.exp(_SPREAD * rng.standard_normal(count).clip(-2.0, 2.0))
 
 
-def replay(run: Run, model: mujoco.MjModel, joints: Sequence[str], linear: bool, rng: np.random.Generator) -> Run:
-    """Plays a run's targets (or its torques, where it has no targets) on a model in MuJoCo C.
+def play(pairs: Sequence[tuple[_Robot, Run]], joints: Sequence[str]) -> list[_Motion]:
+    """Plays runs' targets (or their torques, where they have no targets) on models in MuJoCo C, all side by side.
 
     The controller's law is `envs.logs.Controller`'s. It reads the joint at its own rate, each time up to one step of
     the physics early or late, because a robot's ticks and a simulation's steps never coincide.
 
     Args:
-      run: the measured run; it gives targets, controller, time stamps and the first state.
-      model: what is moved, without actuators.
+      pairs: what is moved, and the measured run that gives targets, controller, time stamps and the first state. All
+        runs have one controller rate.
       joints: names of the joints, in the log's order.
-      linear: whether targets move to the next row in a straight line; else they are held.
-      rng: of jitter and noise.
 
     Returns:
-      The same run with `q`, `dq`, `tau`, `abs_tau` and `gravity` simulated, those of them that it has.
+      The motion of every pair.
     """
-    data = mujoco.MjData(model)
-    qpos = np.array([model.joint(name).qposadr[0] for name in joints])
-    dof = np.array([model.joint(name).dofadr[0] for name in joints])
-    damping = model.dof_damping[dof].copy()
-    # Smoothed, so that noise in the first row does not become an error of the start.
-    data.qpos[qpos], data.qvel[dof] = smoothed(run)[0]
-    controller, driven = run.impedance(), "target" in run.signals
-    steps = int(np.ceil(1.0 / run.controller.rate_hz / _STEP_S - 1e-9))
-    model.opt.timestep = 1.0 / run.controller.rate_hz / steps
-    count = int(np.ceil((run.time[-1] - run.time[0]) * run.controller.rate_hz)) + 2
+    models, first = [robot.model for robot, _ in pairs], pairs[0][0].model
+    qpos = np.array([first.joint(name).qposadr[0] for name in joints])
+    dof = np.array([first.joint(name).dofadr[0] for name in joints])
+    rate = pairs[0][1].controller.rate_hz
+    steps = int(np.ceil(1.0 / rate / _STEP_S - 1e-9))
+    for model in models:
+        model.opt.timestep = 1.0 / rate / steps
+    longest = max(run.time[-1] - run.time[0] for _, run in pairs)
+    rng = pairs[0][0].rng
     # Jitter does not add up: a tick that comes early is followed by a longer interval.
-    looks = np.cumsum(np.append(rng.integers(0, steps), steps + np.diff(rng.integers(0, 2, count))))
-    times = run.time[0] + model.opt.timestep * looks
-    last = np.clip(np.searchsorted(run.time, times + 1e-9, side="right") - 1, 0, len(run.time) - 1)
-    targets = _targets(run, times, last, linear) if driven else None
-    # States are recorded where the controller reads them and interpolated at the rows' times below.
-    states, torques = np.empty((len(looks), 2, len(joints))), np.empty((len(looks), len(joints)))
-    if looks[0]:
-        mujoco.mj_step(model, data, int(looks[0]))
-    law, row_of_law = controller[last[0]], last[0]
-    for look, row in enumerate(last):
-        if row != row_of_law:
-            law, row_of_law = controller[row], row
-        q, dq = data.qpos[qpos], data.qvel[dof]
-        torque = law.torque(targets[look], q, dq) if driven else run.signals["tau"][row]
-        # As damping, back electromotive force acts continuously between two ticks.
-        model.dof_damping[dof] = damping + law.back_emf
-        # A sensor of torque or current sees what the back electromotive force leaves.
-        states[look, 0], states[look, 1], torques[look] = q, dq, torque - law.back_emf * dq
-        data.qfrc_applied[dof] = torque
-        if look + 1 < len(looks):
-            mujoco.mj_step(model, data, int(looks[look + 1] - looks[look]))
-    model.dof_damping[dof] = damping
-    level = np.asarray(sensing.projected_gravity(model.body_quat[1]))
-    exact = {"q": states[:, 0], "dq": states[:, 1], "tau": torques, "abs_tau": torques}
-    exact["gravity"] = np.tile(level, (len(times), 1))
+    gaps = steps + np.diff(rng.integers(0, min(steps, 2), int(np.ceil(longest * rate)) + 3))
+    looks = first.opt.timestep * np.concatenate([[0], np.cumsum(gaps)])
+    # Where a controller's first tick lies is its own matter.
+    times = np.array([run.time[0] + robot.rng.uniform(0.0, 1.0 / rate) + looks for robot, run in pairs])
+    drive = _Drive([run for _, run in pairs], times, [robot.goes_straight(run) for robot, run in pairs])
+    size = mujoco.mj_stateSize(first, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+    state = np.stack([_first_state(robot.model, run, qpos, dof) for robot, run in pairs])
+    found = np.empty((len(looks), len(pairs), 2, len(joints)))
+    torques = np.empty((len(looks), len(pairs), len(joints)))
+    held, control = np.zeros((len(pairs), len(joints))), np.zeros((len(pairs), steps + 1, first.nv))
+    data = [mujoco.MjData(first) for _ in range(os.cpu_count() or 1)]
+    # The state is time, positions, velocities.
+    at_q, at_v = 1 + qpos, 1 + first.nq + dof
+    with rollout.Rollout(nthread=len(data)) as pool:
+        for look in range(len(looks)):
+            q, dq = state[:, at_q], state[:, at_v]
+            held, brake = drive.torque(look, q, dq)
+            found[look, :, 0], found[look, :, 1], torques[look] = q, dq, held - brake
+            if look == len(gaps):
+                break
+            count = int(gaps[look])
+            control[..., dof] = (held - brake)[:, None]
+            after = np.empty((len(pairs), count, size))
+            pool.rollout(
+                models,
+                data,
+                state,
+                np.ascontiguousarray(control[:, :count]),
+                control_spec=mujoco.mjtState.mjSTATE_QFRC_APPLIED,
+                nstep=count,
+                state=after,
+                skip_checks=True,
+            )
+            state = np.ascontiguousarray(after[:, -1])
+    return [_Motion(times[index], found[:, index], torques[:, index]) for index in range(len(pairs))]
+
+
+def _first_state(model: mujoco.MjModel, run: Run, qpos: np.ndarray, dof: np.ndarray) -> np.ndarray:
+    """The state of a model at a run's first row; smoothed, so that noise there does not become an error of the start."""
+    data = mujoco.MjData(model)
+    data.qpos[qpos], data.qvel[dof] = smoothed(run)[0]
+    state = np.empty(mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS))
+    mujoco.mj_getState(model, data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+    return state
+
+
+class _Drive:
+    """What the controllers of many runs command at each of their ticks.
+
+    Args:
+      runs: one for every simulation.
+      times: [runs, ticks] s.
+      straight: whether each run's targets move on between rows.
+    """
+
+    def __init__(self, runs: Sequence[Run], times: np.ndarray, straight: Sequence[bool]):
+        rows = [_last_row(run, own) for run, own in zip(runs, times, strict=True)]
+        laws = [run.impedance()[row] for run, row in zip(runs, rows, strict=True)]
+        self._driven = "target" in runs[0].signals
+        by_tick = lambda values: np.stack(values, axis=1)  # noqa: E731
+        self._law = Impedance(
+            stiffness=by_tick([law.stiffness for law in laws]),
+            damping=by_tick([law.damping for law in laws]),
+            limit=by_tick([law.limit for law in laws]),
+            back_emf=by_tick([law.back_emf for law in laws]),
+        )
+        each = zip(runs, times, rows, straight, strict=True)
+        targets = [
+            _targets(run, own, row, linear) if self._driven else run.signals["tau"][row]
+            for run, own, row, linear in each
+        ]
+        self._wanted = by_tick(targets)
+
+    def torque(self, look: int, q: np.ndarray, dq: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Commanded torques [runs, joints] at a tick, and what the back electromotive force takes from them."""
+        law, wanted = self._law[look], self._wanted[look]
+        return (law.torque(wanted, q, dq) if self._driven else wanted), law.back_emf * dq
+
+
+def _as_run(robot: _Robot, run: Run, motion: _Motion) -> Run:
+    """Makes a run of a motion, with the signals that the measured one has, read by sensors like its own."""
+    level = np.asarray(sensing.projected_gravity(robot.model.body_quat[1]))
+    exact = {
+        "q": motion.states[:, 0],
+        "dq": motion.states[:, 1],
+        "tau": motion.torques,
+        "abs_tau": motion.torques,
+        "gravity": np.tile(level, (len(motion.times), 1)),
+    }
     # Without targets the torques are what was sent, not what was measured.
-    sensed = [name for name in exact if name in run.signals and (driven or name != "tau")]
-    read = {name: _as_read(run, name, times, exact[name], rng) for name in sensed}
+    sensed = [name for name in exact if name in run.signals and ("target" in run.signals or name != "tau")]
+    read = {name: _as_read(run, name, motion.times, exact[name], robot.rng) for name in sensed}
     return replace(run, signals={**run.signals, **read})
+
+
+def _last_row(run: Run, times: np.ndarray) -> np.ndarray:
+    """The last row at or before each time."""
+    return np.clip(np.searchsorted(run.time, times + 1e-9, side="right") - 1, 0, len(run.time) - 1)
 
 
 def _targets(run: Run, times: np.ndarray, last: np.ndarray, linear: bool) -> np.ndarray:

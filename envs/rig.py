@@ -162,7 +162,7 @@ class Rig:
         )
 
     def tree(self, vector: jax.Array) -> dict[str, dict[str, jax.Array]]:
-        """Splits a vector of coordinates [axes] into arrays [places] by effect and parameter.
+        """Splits vectors of coordinates [..., axes] into arrays [..., places] by effect and parameter.
 
         The vector is in the order of `axes`. Searches work on vectors; the effects read such a tree.
         """
@@ -171,7 +171,7 @@ class Rig:
             count = len(self.places[row.on])
             tree[name] = {}
             for parameter in row.parameters:
-                tree[name][parameter.name] = vector[start : start + count]
+                tree[name][parameter.name] = vector[..., start : start + count]
                 start += count
         return tree
 
@@ -248,8 +248,8 @@ class Rig:
 
         It is `values` for flat vectors, in the order of `axes`.
         """
-        trees = [self.values(self.tree(vector)) for vector in vectors]
-        return np.array([np.concatenate([leaf for row in tree.values() for leaf in row.values()]) for tree in trees])
+        tree = self.values(self.tree(np.asarray(vectors)))
+        return np.concatenate([np.asarray(leaf) for row in tree.values() for leaf in row.values()], axis=-1)
 
     def values(self, coords: ByEffect) -> ByEffect:
         """Translates coordinates into values, the form that effects read (`jaxtune.types.Parameter.inner`).

@@ -11,7 +11,7 @@ import numpy as np
 from envs import models, readings, segments
 from envs.effects import LEARNED, LIBRARY
 from envs.logs import Log, Run, read, read_xl330, splits
-from envs.null_logs import simulate_null_log
+from envs.null_logs import simulate_null_logs
 from envs.regimes import REGIMES
 from envs.rig import Rig
 from envs.scales import measure_scales
@@ -136,7 +136,7 @@ def build_question(
     library = {name: row for name, row in rig.effects.items() if name in LIBRARY}
     every = hypotheses(rig.axes, rig.places, library)
     timing, timing_bounds = timing_directions(rig.axes, rig.control_hz)
-    simulated = [simulate_null_log(log, spec, seed + number) for number in range(null_logs)]
+    simulated = simulate_null_logs(log, spec, null_logs, seed)
     measured, *nulls = (cut_log(one, rig.dt, signals, horizons) for one in (log, *simulated))
     problem = Problem(
         simulate=_Simulator(plain, plain.layout, signals),
