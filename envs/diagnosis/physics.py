@@ -14,7 +14,7 @@ import numpy as np
 from envs.diagnosis.disagreement import Disagreement, relative_difference
 from envs.diagnosis.finding import MEASURED, Finding
 from envs.logs import Run
-from envs.segments import quantum_of, smoothed
+from envs.segments import quantum_of
 
 # A repair is believed if the disagreement falls by more than both of these.
 _BETTER = 0.25  # in units of one joint's whole signal
@@ -22,6 +22,7 @@ _SHARE = 0.1  # of the disagreement before
 _MOST_REPAIRS = 3
 _KEPT_ROWS = 1500  # of a long run; more take time and change nothing
 _UNITS = ("degrees", "radians twice", "millinewtonmetres")
+_LEAST_UNITS = 1.0  # by which a change of units must lower `Disagreement.magnitudes` to be tried with another repair
 _DELAYS_S = (0.004, 0.008, 0.012, 0.016, 0.024, 0.032, 0.045)
 _LEAST_OFFSET_RAD = 0.025
 _LEAST_DRIFT = 0.015
@@ -63,16 +64,17 @@ def physics(run: Run, joints: tuple[str, ...], model: mujoco.MjModel, held: bool
         chain, repaired, then = _best([[repair] for repair in repairs], run, disagreement)
         if chain[0].kind in _UNITS or not _believed(now, then):
             # Nothing agrees in wrong units, so a second error shows only once the units are repaired: try both at once.
-            units = [repair for repair in repairs if repair.kind in _UNITS]
+            size = disagreement.magnitudes(run) - _LEAST_UNITS
+            units = [one for one in repairs if one.kind in _UNITS and disagreement.magnitudes(one.apply(run)) < size]
             others = [repair for repair in repairs if repair.kind in ("swapped joints", "flipped sign")]
-            both = _best([[unit, other] for unit in units for other in others], run, disagreement)
-            if _believed(min(now, then), both[2]):
-                chain, repaired, then = both
+            both = [[unit, other] for unit in units for other in others]
+            if both and _believed(min(now, then), (best := _best(both, run, disagreement))[2]):
+                chain, repaired, then = best
         if not _believed(now, then):
             break
         found += [_as_finding(repair, joints) for repair in chain]
         run, now = repaired, then
-    return [*found, *_drift(run), *_coarse(run, joints), *_clipped(run, joints)]
+    return [*found, *_drift(run, disagreement), *_coarse(run, joints), *_clipped(run, joints)]
 
 
 def _best(chains: list[list[_Repair]], run: Run, disagreement: Disagreement) -> tuple[list[_Repair], Run, float]:
@@ -104,7 +106,8 @@ def _repairs(run: Run, disagreement: Disagreement) -> list[_Repair]:
     groups = {"measured": measured} | {name: (name,) for name in (*MEASURED, "target") if name in run.signals}
     groups["all"] = tuple(dict.fromkeys([*measured, *(["target"] if "target" in run.signals else [])]))
     found = []
-    for label, names in groups.items():
+    # Groups may be of the same signals; the first name is kept.
+    for label, names in {names: (label, names) for label, names in reversed(groups.items())}.values():
         for pair in combinations(range(count), 2):
             order = np.arange(count)
             order[list(pair)] = pair[::-1]
@@ -151,8 +154,7 @@ def _offsets(run: Run, disagreement: Disagreement) -> list[_Repair]:
     commanded = disagreement.commanded(run)
     if commanded is None or not disagreement.dynamics:
         return []
-    position, slope = np.moveaxis(smoothed(replace(run, signals={"q": run.signals["q"]})), 1, 0)
-    needed, rows = disagreement.needed(run, position, slope)
+    needed, rows = disagreement.needed(run)
     # A torque at its limit, or of motors that are off, says nothing of the offset.
     free = np.abs(commanded[rows]) < 0.98 * run.controller.gains["torque_limit_nm"]
     on = run.signals.get("enabled", np.ones(len(run.time)))[rows, None] > 0
@@ -169,11 +171,11 @@ def _offsets(run: Run, disagreement: Disagreement) -> list[_Repair]:
     return found
 
 
-def _drift(run: Run) -> list[Finding]:
+def _drift(run: Run, disagreement: Disagreement) -> list[Finding]:
     """Finds a clock that runs fast or slow: velocities and slopes of positions differ by one factor at all joints."""
     if "dq" not in run.signals:
         return []
-    slope = smoothed(replace(run, signals={"q": run.signals["q"]}))[:, 1]
+    slope = disagreement.motion(run)[1]
     # With a fast clock time stamps are too far apart, and slopes of positions too small.
     ratio = (run.signals["dq"] * slope).sum(axis=0) / np.maximum((slope**2).sum(axis=0), 1e-12)
     drift = float(np.median(ratio) - 1.0)
