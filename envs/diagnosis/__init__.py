@@ -20,6 +20,7 @@ from collections.abc import Mapping, Sequence
 import mujoco
 
 from envs import models
+from envs.diagnosis.clipping import clipped_alike
 from envs.diagnosis.finding import Finding
 from envs.diagnosis.physics import physics
 from envs.diagnosis.structure import structure
@@ -43,7 +44,8 @@ def diagnose_log(log: Log) -> dict[str, list[Finding]]:
     spec = models.spec(log.robot)
     # On a free base the model's dynamics are not compared, so the base may stay.
     model = suspended(spec) if log.base == "fixed" else spec.compile()
-    return {run.name: diagnose(run, log.joints, model, log.base) for run in log.runs}
+    alike = clipped_alike(log.runs, log.joints)
+    return {run.name: diagnose(run, log.joints, model, log.base) + alike[run.name] for run in log.runs}
 
 
 def shared_findings(found: Mapping[str, Sequence[Finding]]) -> list[tuple[Finding, list[str]]]:

@@ -11,6 +11,7 @@ from itertools import combinations
 import mujoco
 import numpy as np
 
+from envs.diagnosis.clipping import clipped
 from envs.diagnosis.disagreement import Disagreement, relative_difference
 from envs.diagnosis.finding import MEASURED, Finding
 from envs.logs import Run
@@ -27,9 +28,6 @@ _DELAYS_S = (0.004, 0.008, 0.012, 0.016, 0.024, 0.032, 0.045)
 _LEAST_OFFSET_RAD = 0.025
 _LEAST_DRIFT = 0.015
 _COARSE = 0.004  # largest step of an encoder, as a share of the joint's range of motion
-# A signal is clipped where at least this share and this number of rows lie at its own largest or smallest value.
-_CLIPPED = 0.01
-_LEAST_CLIPPED = 8
 
 
 @dataclass(frozen=True)
@@ -74,7 +72,7 @@ def physics(run: Run, joints: tuple[str, ...], model: mujoco.MjModel, held: bool
             break
         found += [_as_finding(repair, joints) for repair in chain]
         run, now = repaired, then
-    return [*found, *_drift(run, disagreement), *_coarse(run, joints), *_clipped(run, joints)]
+    return [*found, *_drift(run, disagreement), *_coarse(run, joints), *clipped(run, joints)]
 
 
 def _best(chains: list[list[_Repair]], run: Run, disagreement: Disagreement) -> tuple[list[_Repair], Run, float]:
@@ -198,35 +196,6 @@ def _coarse(run: Run, joints: tuple[str, ...]) -> list[Finding]:
 
 def _is_coarse(run: Run) -> bool:
     return quantum_of(run.signals["q"]) > _COARSE * float(np.median(np.ptp(run.signals["q"], axis=0)))
-
-
-def _clipped(run: Run, joints: tuple[str, ...]) -> list[Finding]:
-    """Finds signals that stay at their own largest or smallest value too often, without being at the torque limit."""
-    found = []
-    for name in ("q", "dq", "tau"):
-        if name not in run.signals:
-            continue
-        values = run.signals[name]
-        limit = (
-            run.controller.gains.get("torque_limit_nm", np.full(values.shape[1], np.inf)) if name == "tau" else np.inf
-        )
-        quantum = max(quantum_of(values), 1e-9)
-        for side, end in ((1.0, values.max(axis=0)), (-1.0, values.min(axis=0))):
-            inward = side * (end - values)
-            stays = (inward < 0.5 * quantum) & (np.abs(end) < 0.99 * limit)
-            # A rounded signal returns to every one of its values; a clipped one returns to its end more often than to
-            # the values beside it.
-            beside = (inward < 3.5 * quantum).mean(axis=0) - stays.mean(axis=0)
-            moving = np.ptp(values, axis=0) > 20 * quantum
-            share = np.where(
-                moving & (stays.sum(axis=0) >= _LEAST_CLIPPED) & (stays.mean(axis=0) > 2.0 * beside),
-                stays.mean(axis=0),
-                0.0,
-            )
-            for joint in np.flatnonzero(share > _CLIPPED):
-                text = f"{name}: {joints[joint]} is clipped at {end[joint]:.4g}, in {share[joint]:.0%} of the rows"
-                found.append(Finding("clipped", name, (joints[joint],), float(end[joint]), text))
-    return found
 
 
 _SENTENCES: Mapping[str, str] = {
