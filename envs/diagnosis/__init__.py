@@ -20,7 +20,7 @@ from collections.abc import Mapping, Sequence
 import mujoco
 
 from envs import models
-from envs.diagnosis.clipping import clipped_alike
+from envs.diagnosis.clipping import clipped, clipped_alike
 from envs.diagnosis.columns import misspelt
 from envs.diagnosis.contacts import contacts
 from envs.diagnosis.finding import Finding
@@ -95,14 +95,15 @@ def diagnose(run: Run, joints: tuple[str, ...], model: mujoco.MjModel, base: str
         forces that were not measured.
 
     Returns:
-      Findings of names and structure first, then of physics; an empty list where nothing is suspected.
+      Findings of names and structure first, then of physics and of clipping; an empty list where nothing is suspected.
     """
     found, clean = structure(run)
     found = misspelt(run, joints) + found
+    cut_off = clipped(run, joints)
     if len(clean.time) < _LEAST_ROWS:
         text = (
             f"only {len(clean.time)} consecutive rows are in order, expected {_LEAST_ROWS} or more: "
             "joints, signs, units and delays were not checked"
         )
-        return [*found, Finding("in pieces", "t", (), float(len(clean.time)), text)]
-    return found + physics(clean, joints, model, base == "fixed")
+        return [*found, Finding("in pieces", "t", (), float(len(clean.time)), text), *cut_off]
+    return [*found, *physics(clean, joints, model, base == "fixed"), *cut_off]

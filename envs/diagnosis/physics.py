@@ -1,6 +1,6 @@
 """Finds swapped joints, flipped signs, wrong units, offsets and delays by trying repairs; then drift and quantisation.
 
-Drift, quantisation and clipping are looked for in the repaired run, because an encoder would look coarse in degrees.
+Drift and quantisation are looked for in the repaired run, because an encoder would look coarse in degrees.
 """
 
 from collections.abc import Callable, Mapping
@@ -11,7 +11,6 @@ from itertools import combinations
 import mujoco
 import numpy as np
 
-from envs.diagnosis.clipping import clipped
 from envs.diagnosis.disagreement import Disagreement, relative_difference
 from envs.diagnosis.finding import MEASURED, Finding
 from envs.logs import Run
@@ -51,7 +50,7 @@ def physics(run: Run, joints: tuple[str, ...], model: mujoco.MjModel, held: bool
       held: whether the base is fixed, so that the model's inverse dynamics hold.
 
     Returns:
-      Findings: repairs in the order in which they were made, then drift of the clock, quantisation and clipping.
+      Findings: repairs in the order in which they were made, then drift of the clock and quantisation.
     """
     run, found = _thinned(run), []
     # With coarse encoders accelerations are mostly rounding errors, so the inverse dynamics are not compared.
@@ -72,7 +71,7 @@ def physics(run: Run, joints: tuple[str, ...], model: mujoco.MjModel, held: bool
             break
         found += [_as_finding(repair, joints) for repair in chain]
         run, now = repaired, then
-    return [*found, *_drift(run, disagreement), *_coarse(run, joints), *clipped(run, joints)]
+    return [*found, *_drift(run, disagreement), *_coarse(run, joints)]
 
 
 def _best(chains: list[list[_Repair]], run: Run, disagreement: Disagreement) -> tuple[list[_Repair], Run, float]:

@@ -19,7 +19,6 @@ from envs.segments import quantum_of
 _SUDDEN_S = 0.008  # in which no robot stops, and starts again as fast
 _NEAR = 25  # rows before and after a stay, from which noise is estimated
 _LEAST_QUANTA = 3.0  # of motion that must have been seen
-_LEAST_VALUES = 6  # of a reading that is noise
 _CHANCE = 0.3  # stays that noise may bring about in a run, at most
 _FAR = 0.3  # of the joint's own range of motion
 
@@ -29,11 +28,16 @@ def repeated(run: Run) -> np.ndarray:
     measured = [run.signals[name] for name in (*MEASURED, "gyro", "acc", "vel") if name in run.signals]
     values = np.concatenate([one.reshape(len(run.time), -1) for one in measured], axis=1)
     same = (np.diff(values, axis=0) == 0).all(axis=1)
+    joints = run.signals["q"].shape[1]
     edges = np.flatnonzero(np.diff(same, prepend=False, append=False))
-    quanta = np.array([quantum_of(column[:, None]) for column in run.signals["q"].T])
+    quanta = np.array([quantum_of(column[:, None]) for column in values.T])
     for first, last in zip(edges[::2], edges[1::2], strict=True):
         # Rows from `first` to `last` are equal, both included.
-        if not (_passes(run, first, last, quanta) or _driven(run, first, last) or _noisy(values, first, last)):
+        if not (
+            _passes(run, first, last, quanta[:joints])
+            or _driven(run, first, last)
+            or _noisy(values, first, last, quanta)
+        ):
             same[first:last] = False
     return same
 
@@ -58,21 +62,22 @@ def _driven(run: Run, first: int, last: int) -> bool:
     return bool((speed * (run.time[last] - run.time[first]) > far).any())
 
 
-def _noisy(values: np.ndarray, first: int, last: int) -> bool:
+def _noisy(values: np.ndarray, first: int, last: int, quanta: np.ndarray) -> bool:
     """Whether two readings scatter in all rows around a stay, so that it is by no chance that all of them stay."""
-    around = values[max(0, first - _NEAR) : last + 1 + _NEAR]
-    steps = np.diff(around, axis=0)
-    steps = steps[(steps != 0).any(axis=1)]
-    if len(steps) < max(_NEAR // 2, 0.4 * (len(around) - (last - first))):
+    sides = [values[max(0, first - _NEAR) : first + 1], values[last : last + 1 + _NEAR]]
+    rows = [side[np.append(True, (np.diff(side, axis=0) != 0).any(axis=1))] for side in sides]
+    # Of neighbours that stand still as well, too few rows differ.
+    if any(len(side) < max(_NEAR // 2, 0.4 * count) for side, count in zip(rows, map(len, sides), strict=True)):
         return False
-    back = (np.sign(steps[1:]) * np.sign(steps[:-1]) < 0).mean(axis=0)
-    changes = (steps != 0).mean(axis=0)
-    # A reading at rest may change to and fro between two neighbouring values of its encoder; noise has more.
-    several = np.array([len(np.unique(column)) for column in around.T]) >= _LEAST_VALUES
-    noise = several & (changes + back > 1.25)
-    # Each reading repeats by chance as often as it does nearby; half a time where it never does.
-    chance = np.prod(np.maximum(1.0 - changes[noise], 0.5 / len(steps))) ** (last - first)
-    return bool(noise.sum() >= 2 and chance * len(values) < _CHANCE)
+    third = [np.diff(side, n=3, axis=0) for side in rows]
+    sd = np.min([1.4826 * np.median(np.abs(each), axis=0) / np.sqrt(20.0) for each in third], axis=0)
+    # Of white noise three in four third differences have the other sign than the one before; of motion hardly any.
+    turns = np.min([(np.sign(each[1:]) * np.sign(each[:-1]) < 0).mean(axis=0) for each in third], axis=0)
+    # Rounding and a change to and fro between neighbouring values have half a quantum.
+    noise = (turns > 0.5) & (sd > np.maximum(0.8 * quanta, 1e-9))
+    # Two readings of noise are equal with this probability.
+    same = np.maximum(quanta[noise] / (sd[noise] * np.sqrt(4 * np.pi)), 0.25 / _NEAR)
+    return bool(noise.sum() >= 2 and np.prod(same) ** (last - first) * len(values) < _CHANCE)
 
 
 def slope(time: np.ndarray, values: np.ndarray) -> np.ndarray:

@@ -66,7 +66,11 @@ def jumped(log):
 
 
 MISLED = {
-    "degrees": (lambda log: signals(log, q=np.degrees, dq=np.degrees), "degrees for radians"),
+    # Without a limit, as in degrees every motor would be at it.
+    "degrees": (
+        lambda log: gains(signals(log, q=np.degrees, dq=np.degrees), torque_limit_nm=np.full(2, np.inf)),
+        "degrees for radians",
+    ),
     "swapped joints": (lambda log: signals(log, q=lambda v: v[:, ::-1], dq=lambda v: v[:, ::-1]), "are swapped"),
     "flipped sign": (lambda log: signals(log, q=lambda v: v * [1, -1], dq=lambda v: v * [1, -1]), "a flipped sign"),
     "missing rows": (lambda log: at(log, *range(300, 340)), "rows are missing after row 300"),
