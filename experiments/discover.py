@@ -1,8 +1,8 @@
 """Names what a model lacks, from measured logs: `python -m experiments.discover --logs LOG [LOG ...] --out DIR`.
 
-It finds where simulation and measurement disagree, names the missing effect and adds it to the model. Then it measures
-on held-out runs how much smaller the error has become. It may also answer that nothing is missing, or that something is
-missing that it cannot name.
+The log doctor looks at the logs first. Discovery finds where simulation and measurement disagree, names the missing
+effect and adds it to the model. Then it measures on held-out runs how much smaller the error has become. It may also
+answer that nothing is missing, or that something is missing that it cannot name.
 """
 
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from pathlib import Path
 
 from experiments.common import checkpoint
 from experiments.common.cli import bars, console, run
-from experiments.discovery import report
+from experiments.discovery import gate, report
 from experiments.discovery.investigate import investigate
 from experiments.discovery.setup import HORIZONS_S, read_logs
 
@@ -32,6 +32,8 @@ class Args:
     thresholds."""
     seed: int = 0
     """Random seed of the null logs."""
+    trust_log: bool = False
+    """Go on although the log doctor suspects an error of the log that would make the answer wrong."""
 
 
 def main(args: Args) -> None:
@@ -42,7 +44,10 @@ def main(args: Args) -> None:
     """
     checkpoint.set_up_compiler(checkpoint.a_device_a_core())
     _check(args)
-    read_logs(args.logs)  # says what is wrong with them before the folder is made
+    # Says what is wrong with the logs before the folder is made and anything is compiled.
+    log, _ = read_logs(args.logs)
+    for note in gate.check(log, args.horizons, trust=args.trust_log):
+        console.print(f"note: {note}", highlight=False, markup=False, soft_wrap=True)
     identity = {"logs": [str(path) for path in args.logs], "horizons": args.horizons, "healthy": args.healthy}
     checkpoint.open_run(args.out, identity | {"seed": args.seed})
     with bars() as progress:

@@ -4,7 +4,6 @@ The result is a log without measurements. Play its targets on the robot, suspend
 columns; `experiments.discover` then reads the log. The motion is described in `experiments.discovery.excitation`.
 """
 
-import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,7 +13,8 @@ import numpy as np
 from envs import models
 from envs.logs import Controller, Log, Run, write
 from experiments.common.cli import console, run
-from experiments.discovery.excitation import excitation, scaled
+from experiments.discovery.excitation import MOTIONS, excitation, scaled
+from experiments.discovery.standalone import standalone
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,21 +42,27 @@ class Args:
     """Rate of the joint controllers in Hz."""
     seed: int = 0
     """Random seed of postures, paces and steps."""
+    motion: str = "medley"
+    """What the robot does: medley, or one that distinguishes certain effects best: slow_triangles, small_steps,
+    large_steps, chirp, soft_chirp, swing or holds."""
 
 
 def main(args: Args) -> None:
-    """Writes the targets, and a copy of the model if it is not a built-in one.
+    """Writes the targets, and the model as one file if it is not a built-in one.
 
     Raises:
       ValueError: an option is wrong, or the model cannot be read.
     """
-    for name in ("seconds", "rate_hz", "kp", "torque_limit_nm", "control_hz"):
-        if not 0 < getattr(args, name) < np.inf:
-            raise ValueError(f"{name}: got {getattr(args, name)}, expected a positive, finite number")
+    _check(args)
     spec = models.spec(args.robot)
     # A free joint is the base, which is held, and a ball joint has no scalar target.
     kinds = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
     joints = tuple(joint.name for joint in spec.joints if joint.type in kinds)
+    if not joints or not all(joints):
+        raise ValueError(f"robot: got '{args.robot}' with joints {joints}, expected hinges or slides that have names")
+    built_in = args.robot in models.BUILT_IN
+    # Before anything is written, because it may fail.
+    model = None if built_in else standalone(Path(args.robot))
     everywhere = np.ones(len(joints))
     gains = {"kp": args.kp, "kd": args.kd, "torque_limit_nm": args.torque_limit_nm}
     controller = Controller(
@@ -71,18 +77,34 @@ def main(args: Args) -> None:
             time=one.time,
             signals={"target": one.target, "enabled": one.enabled},
         )
-        for one in excitation(spec, joints, args.runs, args.seconds, args.rate_hz, args.seed)
+        for one in excitation(spec, joints, args.runs, args.seconds, args.rate_hz, args.seed, args.motion)
     )
-    built_in = args.robot in models.BUILT_IN
     name = args.robot if built_in else Path(args.robot).name
     write(Log(robot=name, base="fixed", rate_hz=args.rate_hz, joints=joints, policy=None, runs=runs), args.out)
     # The log names its model by a path relative to itself, so that the folder can be moved as a whole.
-    if not built_in:
-        shutil.copy(args.robot, args.out / name)
+    if model is not None:
+        (args.out / name).write_text(model, encoding="utf-8")
     console.print(
         f"wrote {len(runs)} runs of {args.seconds:g} s for {', '.join(joints)} to {args.out}. Play each run's targets "
         "on the robot, and add the measured columns to its file or a copy of it: q.*, and dq.* if there is a sensor."
     )
+
+
+def _check(args: Args) -> None:
+    """Checks every number, before the model is read."""
+    for name in ("seconds", "rate_hz", "kp", "torque_limit_nm", "control_hz"):
+        if not 0 < getattr(args, name) < np.inf:
+            raise ValueError(f"{name}: got {getattr(args, name)}, expected a positive, finite number")
+    if not 0 <= args.kd < np.inf:
+        raise ValueError(f"kd: got {args.kd}, expected a finite number that is not negative")
+    if args.seed < 0:
+        raise ValueError(f"seed: got {args.seed}, expected a number that is not negative")
+    if args.runs < 4:
+        raise ValueError(f"runs: got {args.runs}, expected 4 or more")
+    if args.motion not in MOTIONS:
+        raise ValueError(f"motion: got '{args.motion}', expected one of {', '.join(MOTIONS)}")
+    if args.out.exists() and any(args.out.iterdir()):
+        raise ValueError(f"out: got {args.out}, expected a new or empty folder")
 
 
 if __name__ == "__main__":

@@ -1,9 +1,9 @@
 """The log doctor: finds errors of a log itself, before discovery or the tuner learn from it.
 
-`structure` looks at time stamps and rows. `physics` tries repairs: two joints swapped back, a sign flipped, degrees
-converted to radians, an offset or a delay removed. A repair is believed if the log then agrees much better with itself
-and with the model. Disagreement is the sum over joints of up to five parts, in units of the signals' own size. Each
-goes from 0 (agreement) to 2, that of the targets to 1:
+`columns` looks at names, `structure` at time stamps and rows, `contacts` at the model's geometry. `physics` tries
+repairs: two joints swapped back, a sign flipped, degrees converted to radians, an offset or a delay removed. A repair
+is believed if the log then agrees much better with itself and with the model. Disagreement is the sum over joints of up
+to five parts, in units of the signals' own size. Each goes from 0 (agreement) to 2, that of the targets to 1:
 
 - measured velocities against the slopes of measured positions;
 - the controller's torque against the model's inverse dynamics of the measured motion (on a fixed base only);
@@ -20,6 +20,9 @@ from collections.abc import Mapping, Sequence
 import mujoco
 
 from envs import models
+from envs.diagnosis.clipping import clipped, clipped_alike
+from envs.diagnosis.columns import misspelt
+from envs.diagnosis.contacts import contacts
 from envs.diagnosis.finding import Finding
 from envs.diagnosis.physics import physics
 from envs.diagnosis.structure import structure
@@ -43,7 +46,17 @@ def diagnose_log(log: Log) -> dict[str, list[Finding]]:
     spec = models.spec(log.robot)
     # On a free base the model's dynamics are not compared, so the base may stay.
     model = suspended(spec) if log.base == "fixed" else spec.compile()
-    return {run.name: diagnose(run, log.joints, model, log.base) for run in log.runs}
+    found = {run.name: diagnose(run, log.joints, model, log.base) for run in log.runs}
+    for name, alike in clipped_alike(log.runs, log.joints).items():
+        found[name] += alike
+    # Where a rig holds a free base is not known, so neither is what the robot would touch.
+    if log.base == "fixed" and not any(joint.type == mujoco.mjtJoint.mjJNT_FREE for joint in spec.joints):
+        touching = spec.compile()
+        for run in log.runs:
+            # Positions of the wrong joints or units touch anything.
+            if not any(one.wrong for one in found[run.name]):
+                found[run.name] += contacts(run, log.joints, touching)
+    return found
 
 
 def shared_findings(found: Mapping[str, Sequence[Finding]]) -> list[tuple[Finding, list[str]]]:
@@ -82,13 +95,15 @@ def diagnose(run: Run, joints: tuple[str, ...], model: mujoco.MjModel, base: str
         forces that were not measured.
 
     Returns:
-      Findings of structure first, then of physics; an empty list where nothing is suspected.
+      Findings of names and structure first, then of physics and of clipping; an empty list where nothing is suspected.
     """
     found, clean = structure(run)
+    found = misspelt(run, joints) + found
+    cut_off = clipped(run, joints)
     if len(clean.time) < _LEAST_ROWS:
         text = (
             f"only {len(clean.time)} consecutive rows are in order, expected {_LEAST_ROWS} or more: "
             "joints, signs, units and delays were not checked"
         )
-        return [*found, Finding("in pieces", "t", (), float(len(clean.time)), text)]
-    return found + physics(clean, joints, model, base == "fixed")
+        return [*found, Finding("in pieces", "t", (), float(len(clean.time)), text), *cut_off]
+    return [*found, *physics(clean, joints, model, base == "fixed"), *cut_off]

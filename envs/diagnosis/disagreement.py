@@ -43,6 +43,7 @@ class Disagreement:
         self._dof = np.array([place.dofadr[0] for place in places])
         limited = np.array([bool(model.jnt_limited[place.id]) for place in places])
         span = np.array([place.range for place in places])
+        self._smoothed: dict[tuple[bytes, bytes], np.ndarray] = {}
         self._range = np.where(limited[:, None], span, [-np.inf, np.inf]).T
 
     def __call__(self, run: Run) -> float:
@@ -54,24 +55,60 @@ class Disagreement:
 
         Use it to see which of the comparisons is responsible for a disagreement.
         """
-        # From positions alone, or the slope would follow the velocities that it is compared with.
-        position, slope = np.moveaxis(smoothed(replace(run, signals={"q": run.signals["q"]})), 1, 0)
+        pairs = self._pairs(run)
+        weights = {"target": 0.5}
+        found = {name: weights.get(name, 1.0) * relative_difference(*pair) for name, pair in pairs.items()}
+        position = self.motion(run)[0]
+        low, high = self._range
+        return found | {"range": _MOST * ((position < low - 0.1) | (position > high + 0.1)).mean(axis=0)}
+
+    def magnitudes(self, run: Run) -> float:
+        """Computes how much the sizes of compared signals differ, whatever their order and signs.
+
+        Wrong units change it by the logarithm of their factor; swapped joints and flipped signs hardly change it. Use
+        it to see cheaply whether units can be wrong at all.
+
+        Returns:
+          The sum over comparisons of the mean difference of logarithms of sizes, which are sorted over joints.
+        """
+        total = 0.0
+        for pair in self._pairs(run).values():
+            one, other = (np.sort(np.log(np.sqrt((values**2).mean(axis=0)) + 1e-6)) for values in pair)
+            total += float(np.abs(one - other).mean())
+        return total
+
+    def _pairs(self, run: Run) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        """Lists the signals that should be equal, [rows, joints] each, by the name of their comparison."""
+        position, slope = self.motion(run)
         found = {}
         if "dq" in run.signals:
-            found["velocity"] = relative_difference(run.signals["dq"], slope)
+            found["velocity"] = run.signals["dq"], slope
         commanded = self.commanded(run)
         if commanded is not None and "tau" in run.signals:
-            found["torque"] = relative_difference(run.signals["tau"], commanded)
+            found["torque"] = run.signals["tau"], commanded
         if "target" in run.signals:
-            found["target"] = 0.5 * relative_difference(run.signals["target"], position)
-        low, high = self._range
-        found["range"] = _MOST * ((position < low - 0.1) | (position > high + 0.1)).mean(axis=0)
+            found["target"] = run.signals["target"], position
         given = commanded if commanded is not None else run.signals.get("tau")
         if self.dynamics and given is not None:
-            needed, rows = self.needed(run, position, slope)
+            needed, rows = self.needed(run)
             # Averaged like the accelerations behind `needed`, so that both are equally smooth.
-            found["dynamics"] = relative_difference(_together(given)[rows], needed)
+            found["dynamics"] = _together(given)[rows], needed
         return found
+
+    def motion(self, run: Run) -> tuple[np.ndarray, np.ndarray]:
+        """Estimates smoothed positions in rad and their slopes in rad/s, [rows, joints] each.
+
+        From positions alone, or the slopes would follow the velocities that they are compared with. Repairs leave most
+        columns as they are, so every column is smoothed once and kept.
+        """
+        columns, time = run.signals["q"].T, run.time.tobytes()
+        keys = [(time, column.tobytes()) for column in columns]
+        new = {key: column for key, column in zip(keys, columns, strict=True) if key not in self._smoothed}
+        if new:
+            states = smoothed(replace(run, signals={"q": np.stack(list(new.values()), axis=1)}))
+            self._smoothed |= dict(zip(new, np.moveaxis(states, 2, 0), strict=True))
+        states = np.stack([self._smoothed[key] for key in keys], axis=2)
+        return states[:, 0], states[:, 1]
 
     def commanded(self, run: Run) -> np.ndarray | None:
         """Computes the torque that the controller commanded, by its law and the readings of the log.
@@ -81,20 +118,19 @@ class Disagreement:
         """
         if not self._driven:
             return None
-        speed = run.signals["dq"] if "dq" in run.signals else smoothed(run)[:, 1]
+        speed = run.signals["dq"] if "dq" in run.signals else self.motion(run)[1]
         return run.impedance().torque(run.signals["target"], run.signals["q"], speed)
 
-    def needed(self, run: Run, position: np.ndarray, slope: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def needed(self, run: Run) -> tuple[np.ndarray, np.ndarray]:
         """Computes the torque that the model needs for the measured motion, by MuJoCo's inverse dynamics.
 
         Args:
-          run: for its time stamps.
-          position: smoothed, [rows, joints] rad.
-          slope: of the positions, smoothed, [rows, joints] rad/s.
+          run: for its time stamps and positions.
 
         Returns:
           Torques [some rows, joints] Nm, and the indices of these rows.
         """
+        position, slope = self.motion(run)
         acceleration = np.gradient(_together(slope), run.time, axis=0)
         # At the ends the fit behind the smoothed states is one-sided.
         rows = np.unique(np.linspace(10, len(run.time) - 11, _ROWS).astype(int))

@@ -5,6 +5,20 @@ from dataclasses import dataclass
 MEASURED = ("q", "dq", "tau")
 """Signals of the joints that sensors give, in contrast to targets."""
 
+MISLEADING = (
+    "swapped joints",
+    "flipped sign",
+    "degrees",
+    "radians twice",
+    "millinewtonmetres",
+    "missing rows",
+    "clock jump",
+    "misspelt column",
+    "contact",
+)
+"""Kinds of findings that would make a discovery name something else, so that it refuses the log. All others (a low
+rate, repeated rows, quantisation, clipping, drift, a delay, an offset) limit what can be learnt, or are effects."""
+
 _WRONG = ("swapped joints", "flipped sign", "degrees", "radians twice", "millinewtonmetres")
 
 
@@ -34,3 +48,8 @@ class Finding:
         Nothing can be learnt from such a log before it is corrected; other findings only limit what can be learnt.
         """
         return self.kind in _WRONG
+
+    @property
+    def misleading(self) -> bool:
+        """Whether a discovery from the log would answer wrongly; wrong numbers, wrong times and signals not read."""
+        return self.kind in MISLEADING

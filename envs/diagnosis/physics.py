@@ -1,6 +1,6 @@
 """Finds swapped joints, flipped signs, wrong units, offsets and delays by trying repairs; then drift and quantisation.
 
-Drift, quantisation and clipping are looked for in the repaired run, because an encoder would look coarse in degrees.
+Drift and quantisation are looked for in the repaired run, because an encoder would look coarse in degrees.
 """
 
 from collections.abc import Callable, Mapping
@@ -14,7 +14,7 @@ import numpy as np
 from envs.diagnosis.disagreement import Disagreement, relative_difference
 from envs.diagnosis.finding import MEASURED, Finding
 from envs.logs import Run
-from envs.segments import quantum_of, smoothed
+from envs.segments import quantum_of
 
 # A repair is believed if the disagreement falls by more than both of these.
 _BETTER = 0.25  # in units of one joint's whole signal
@@ -22,13 +22,11 @@ _SHARE = 0.1  # of the disagreement before
 _MOST_REPAIRS = 3
 _KEPT_ROWS = 1500  # of a long run; more take time and change nothing
 _UNITS = ("degrees", "radians twice", "millinewtonmetres")
+_LEAST_UNITS = 1.0  # by which a change of units must lower `Disagreement.magnitudes` to be tried with another repair
 _DELAYS_S = (0.004, 0.008, 0.012, 0.016, 0.024, 0.032, 0.045)
 _LEAST_OFFSET_RAD = 0.025
 _LEAST_DRIFT = 0.015
 _COARSE = 0.004  # largest step of an encoder, as a share of the joint's range of motion
-# A signal is clipped where at least this share and this number of rows lie at its own largest or smallest value.
-_CLIPPED = 0.01
-_LEAST_CLIPPED = 8
 
 
 @dataclass(frozen=True)
@@ -52,7 +50,7 @@ def physics(run: Run, joints: tuple[str, ...], model: mujoco.MjModel, held: bool
       held: whether the base is fixed, so that the model's inverse dynamics hold.
 
     Returns:
-      Findings: repairs in the order in which they were made, then drift of the clock, quantisation and clipping.
+      Findings: repairs in the order in which they were made, then drift of the clock and quantisation.
     """
     run, found = _thinned(run), []
     # With coarse encoders accelerations are mostly rounding errors, so the inverse dynamics are not compared.
@@ -63,16 +61,17 @@ def physics(run: Run, joints: tuple[str, ...], model: mujoco.MjModel, held: bool
         chain, repaired, then = _best([[repair] for repair in repairs], run, disagreement)
         if chain[0].kind in _UNITS or not _believed(now, then):
             # Nothing agrees in wrong units, so a second error shows only once the units are repaired: try both at once.
-            units = [repair for repair in repairs if repair.kind in _UNITS]
+            size = disagreement.magnitudes(run) - _LEAST_UNITS
+            units = [one for one in repairs if one.kind in _UNITS and disagreement.magnitudes(one.apply(run)) < size]
             others = [repair for repair in repairs if repair.kind in ("swapped joints", "flipped sign")]
-            both = _best([[unit, other] for unit in units for other in others], run, disagreement)
-            if _believed(min(now, then), both[2]):
-                chain, repaired, then = both
+            both = [[unit, other] for unit in units for other in others]
+            if both and _believed(min(now, then), (best := _best(both, run, disagreement))[2]):
+                chain, repaired, then = best
         if not _believed(now, then):
             break
         found += [_as_finding(repair, joints) for repair in chain]
         run, now = repaired, then
-    return [*found, *_drift(run), *_coarse(run, joints), *_clipped(run, joints)]
+    return [*found, *_drift(run, disagreement), *_coarse(run, joints)]
 
 
 def _best(chains: list[list[_Repair]], run: Run, disagreement: Disagreement) -> tuple[list[_Repair], Run, float]:
@@ -104,7 +103,8 @@ def _repairs(run: Run, disagreement: Disagreement) -> list[_Repair]:
     groups = {"measured": measured} | {name: (name,) for name in (*MEASURED, "target") if name in run.signals}
     groups["all"] = tuple(dict.fromkeys([*measured, *(["target"] if "target" in run.signals else [])]))
     found = []
-    for label, names in groups.items():
+    # Groups may be of the same signals; the first name is kept.
+    for label, names in {names: (label, names) for label, names in reversed(groups.items())}.values():
         for pair in combinations(range(count), 2):
             order = np.arange(count)
             order[list(pair)] = pair[::-1]
@@ -151,8 +151,7 @@ def _offsets(run: Run, disagreement: Disagreement) -> list[_Repair]:
     commanded = disagreement.commanded(run)
     if commanded is None or not disagreement.dynamics:
         return []
-    position, slope = np.moveaxis(smoothed(replace(run, signals={"q": run.signals["q"]})), 1, 0)
-    needed, rows = disagreement.needed(run, position, slope)
+    needed, rows = disagreement.needed(run)
     # A torque at its limit, or of motors that are off, says nothing of the offset.
     free = np.abs(commanded[rows]) < 0.98 * run.controller.gains["torque_limit_nm"]
     on = run.signals.get("enabled", np.ones(len(run.time)))[rows, None] > 0
@@ -169,11 +168,11 @@ def _offsets(run: Run, disagreement: Disagreement) -> list[_Repair]:
     return found
 
 
-def _drift(run: Run) -> list[Finding]:
+def _drift(run: Run, disagreement: Disagreement) -> list[Finding]:
     """Finds a clock that runs fast or slow: velocities and slopes of positions differ by one factor at all joints."""
     if "dq" not in run.signals:
         return []
-    slope = smoothed(replace(run, signals={"q": run.signals["q"]}))[:, 1]
+    slope = disagreement.motion(run)[1]
     # With a fast clock time stamps are too far apart, and slopes of positions too small.
     ratio = (run.signals["dq"] * slope).sum(axis=0) / np.maximum((slope**2).sum(axis=0), 1e-12)
     drift = float(np.median(ratio) - 1.0)
@@ -196,35 +195,6 @@ def _coarse(run: Run, joints: tuple[str, ...]) -> list[Finding]:
 
 def _is_coarse(run: Run) -> bool:
     return quantum_of(run.signals["q"]).max() > _COARSE * float(np.median(np.ptp(run.signals["q"], axis=0)))
-
-
-def _clipped(run: Run, joints: tuple[str, ...]) -> list[Finding]:
-    """Finds signals that stay at their own largest or smallest value too often, without being at the torque limit."""
-    found = []
-    for name in ("q", "dq", "tau"):
-        if name not in run.signals:
-            continue
-        values = run.signals[name]
-        limit = (
-            run.controller.gains.get("torque_limit_nm", np.full(values.shape[1], np.inf)) if name == "tau" else np.inf
-        )
-        quantum = np.maximum(quantum_of(values), 1e-9)
-        for side, end in ((1.0, values.max(axis=0)), (-1.0, values.min(axis=0))):
-            inward = side * (end - values)
-            stays = (inward < 0.5 * quantum) & (np.abs(end) < 0.99 * limit)
-            # A rounded signal returns to every one of its values; a clipped one returns to its end more often than to
-            # the values beside it.
-            beside = (inward < 3.5 * quantum).mean(axis=0) - stays.mean(axis=0)
-            moving = np.ptp(values, axis=0) > 20 * quantum
-            share = np.where(
-                moving & (stays.sum(axis=0) >= _LEAST_CLIPPED) & (stays.mean(axis=0) > 2.0 * beside),
-                stays.mean(axis=0),
-                0.0,
-            )
-            for joint in np.flatnonzero(share > _CLIPPED):
-                text = f"{name}: {joints[joint]} is clipped at {end[joint]:.4g}, in {share[joint]:.0%} of the rows"
-                found.append(Finding("clipped", name, (joints[joint],), float(end[joint]), text))
-    return found
 
 
 _SENTENCES: Mapping[str, str] = {

@@ -1,12 +1,14 @@
 """Designs motions that make missing effects distinguishable, for a robot that is suspended or clamped.
 
-Every run moves about one posture with one controller gain. It consists of slow triangular reversals (friction,
-backlash), a chirp to 10 Hz (delay, lag, inertia), steps that may saturate the motors (torque limits), and a swing with
-the motors off (mass and friction without the actuators). Posture and gain differ from run to run, so that a log can be
-split by condition, with every kind of motion in every part.
+Every run of the `medley` moves about one posture with one controller gain. It consists of slow triangular reversals
+(friction, backlash), a chirp to 10 Hz (delay, lag, inertia), steps that may saturate the motors (torque limits), and a
+swing with the motors off (mass and friction without the actuators). Posture and gain differ from run to run, so that a
+log can be split by condition, with every kind of motion in every part.
+
+The other motions have one of these each. `deciding` chooses the one in which two suspects differ most.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import mujoco
@@ -16,7 +18,37 @@ from envs.logs import Controller
 from envs.models import suspended
 
 _CHIRP_HZ = (0.5, 10.0)
-_SHARES = {"triangle": 0.35, "chirp": 0.3, "steps": 0.2, "swing": 0.15}  # of a run's time
+_LEAST_ROWS = 10  # of a piece
+
+
+@dataclass(frozen=True, kw_only=True)
+class Motion:
+    """What the runs of a log do, whatever the robot; a row of `MOTIONS`."""
+
+    shares: Mapping[str, float]
+    """Parts of a run's time in their order, by the name of a piece (`_PIECES`)."""
+    gains: tuple[float, float] = (1.0, 0.5)
+    """Factors on kp and kd, which alternate within every split."""
+    size: float = 1.0
+    """Factor on the amplitudes of the pieces."""
+    shows: str
+    """What the motion makes visible, for a person."""
+
+
+MOTIONS = {
+    "medley": Motion(
+        shares={"triangle": 0.35, "chirp": 0.3, "steps": 0.2, "swing": 0.15},
+        shows="a little of everything, for a first log",
+    ),
+    "slow_triangles": Motion(shares={"triangle": 1.0}, shows="friction and backlash, at slow reversals"),
+    "small_steps": Motion(shares={"steps": 1.0}, size=0.25, shows="deadband, backlash and delay, below all limits"),
+    "large_steps": Motion(shares={"steps": 1.0}, shows="limits of torque and speed"),
+    "chirp": Motion(shares={"chirp": 1.0}, gains=(1.0, 1.0), shows="delay, lag and inertia, up to 10 Hz"),
+    "soft_chirp": Motion(shares={"chirp": 1.0}, gains=(0.5, 0.5), shows="inertia and compliance, at half the gains"),
+    "swing": Motion(shares={"steps": 0.3, "swing": 0.7}, shows="mass and friction without the motors"),
+    "holds": Motion(shares={"holds": 1.0}, shows="gravity, bias and scale of torque, in two postures a run"),
+}
+"""Motions by name: what `excite --motion` writes, and what `deciding` chooses among (all but the medley)."""
 
 
 @dataclass(frozen=True)
@@ -39,8 +71,60 @@ class TargetRun:
     """[rows] 0 where the motors are off."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Decision:
+    """The motion that would decide between two suspects, of all candidates."""
+
+    name: str
+    """Of the motion, for `python -m experiments.excite --motion NAME`."""
+    motion: list[TargetRun]
+    scores: Mapping[str, float]
+    """Of every candidate, by name; minus infinity where a score was no number."""
+
+
+def deciding(
+    spec: mujoco.MjSpec,
+    joints: Sequence[str],
+    score: Callable[[list[TargetRun]], float],
+    *,
+    runs: int = 4,
+    seconds: float = 3.0,
+    rate_hz: float = 500.0,
+    seed: int = 0,
+) -> Decision:
+    """Chooses the motion with the largest score, of all but the medley.
+
+    Args:
+      spec: the robot.
+      joints: names, in the order of the targets' columns.
+      score: of a motion, larger where it decides better: say the difference of two suspects' simulations over noise.
+      runs: number of runs, 4 or more.
+      seconds: length of a run in s.
+      rate_hz: rows per second.
+      seed: of postures, paces and steps; `excite` writes the same targets with the same numbers.
+
+    Raises:
+      ValueError: fewer runs than can be split, or no score is a number.
+    """
+    candidates = [name for name in MOTIONS if name != "medley"]
+    motions = {name: excitation(spec, joints, runs, seconds, rate_hz, seed, name) for name in candidates}
+    scores = {name: float(score(motion)) for name, motion in motions.items()}
+    # A simulation that diverges under a suspect decides nothing.
+    scores = {name: value if np.isfinite(value) else -np.inf for name, value in scores.items()}
+    best = max(scores, key=scores.__getitem__)
+    if scores[best] == -np.inf:
+        raise ValueError(f"score: got no finite number for any of {', '.join(scores)}")
+    return Decision(name=best, motion=motions[best], scores=scores)
+
+
 def excitation(
-    spec: mujoco.MjSpec, joints: Sequence[str], runs: int, seconds: float, rate_hz: float, seed: int = 0
+    spec: mujoco.MjSpec,
+    joints: Sequence[str],
+    runs: int,
+    seconds: float,
+    rate_hz: float,
+    seed: int = 0,
+    motion: str = "medley",
 ) -> list[TargetRun]:
     """Makes the target runs of a log in which effects are distinguishable.
 
@@ -51,15 +135,24 @@ def excitation(
       seconds: length of a run in s.
       rate_hz: rows per second.
       seed: of postures, paces and steps.
+      motion: a name of `MOTIONS`.
 
     Returns:
-      Runs, split into train, select and sealed so that every split has both controller gains.
+      Runs, split into train, select and sealed so that every split has both of the motion's gains.
 
     Raises:
-      ValueError: fewer runs than can be split.
+      ValueError: fewer runs than can be split, fewer rows than the motion needs, or the motion is unknown.
     """
+    if motion not in MOTIONS:
+        raise ValueError(f"motion: got '{motion}', expected one of {', '.join(MOTIONS)}")
     if runs < 4:
         raise ValueError(f"runs: got {runs}, expected 4 or more: two for train, one for select and one for sealed")
+    chosen = MOTIONS[motion]
+    if not min(chosen.shares.values()) * seconds * rate_hz >= _LEAST_ROWS:
+        raise ValueError(
+            f"seconds: got {seconds:g} s at {rate_hz:g} rows a second, expected {_LEAST_ROWS} rows or more for every "
+            f"part of '{motion}'"
+        )
     rng = np.random.default_rng(seed)
     low, high, home = _ranges(suspended(spec), joints)
     splits = ("train", "select", "train", "sealed")
@@ -67,11 +160,11 @@ def excitation(
     for number in range(runs):
         posture = home + 0.25 * (high - low) * rng.uniform(-1, 1, len(joints))
         room = np.minimum(np.minimum(high - posture, posture - low), 0.6)
-        target, enabled = _medley(posture, np.maximum(room, 0.05), seconds, rate_hz, rng)
+        target, enabled = _targets(chosen, posture, room, seconds, rate_hz, rng)
         split = splits[number % len(splits)]
         # The gain alternates within every split. Of four runs one is for select, and it has the lower gain.
-        earlier = sum(motion.split == split for motion in motions)
-        gain = (1.0, 0.5)[(earlier + (split == "select")) % 2]
+        earlier = sum(one.split == split for one in motions)
+        gain = chosen.gains[(earlier + (split == "select")) % 2]
         motions.append(
             TargetRun(
                 f"run_{number:03d}",
@@ -96,29 +189,47 @@ def _ranges(model: mujoco.MjModel, joints: Sequence[str]) -> tuple[np.ndarray, n
     return low, high, middle
 
 
-def _medley(posture, room, seconds, rate_hz, rng) -> tuple[np.ndarray, np.ndarray]:
-    rows = {name: round(share * seconds * rate_hz) for name, share in _SHARES.items()}
-    count = len(posture)
-    pieces = []
+def _targets(motion: Motion, posture, room, seconds, rate_hz, rng) -> tuple[np.ndarray, np.ndarray]:
+    """Puts the pieces of a run together; returns targets [rows, joints] and whether the motors are on [rows]."""
+    rows = {name: round(share * seconds * rate_hz) for name, share in motion.shares.items()}
+    offsets = [_PIECES[name](count, len(posture), rate_hz, rng) for name, count in rows.items()]
+    on = [np.full(count, float(name != "swing")) for name, count in rows.items()]
+    return posture + motion.size * room * np.concatenate(offsets), np.concatenate(on)
+
+
+def _triangle(rows: int, joints: int, rate_hz: float, rng: np.random.Generator) -> np.ndarray:
     # Joints move at different paces, so that coupling between them shows.
-    time = np.arange(rows["triangle"]) / rate_hz
-    pace = rng.uniform(0.8, 1.6, count) / (rows["triangle"] / rate_hz) * 1.5
-    phase = (time[:, None] * pace + rng.uniform(0, 1, count)) % 1.0
-    pieces.append(posture + 0.7 * room * (4 * np.abs(phase - 0.5) - 1))
-    time = np.arange(rows["chirp"]) / rate_hz
-    length = rows["chirp"] / rate_hz
+    pace = rng.uniform(0.8, 1.6, joints) / (rows / rate_hz) * 1.5
+    phase = (np.arange(rows)[:, None] / rate_hz * pace + rng.uniform(0, 1, joints)) % 1.0
+    return 0.7 * (4 * np.abs(phase - 0.5) - 1)
+
+
+def _chirp(rows: int, joints: int, rate_hz: float, rng: np.random.Generator) -> np.ndarray:
+    share, length = np.arange(rows) / rows, rows / rate_hz
     ratio = _CHIRP_HZ[1] / _CHIRP_HZ[0]
-    cycles = _CHIRP_HZ[0] * length / np.log(ratio) * (ratio ** (time / length) - 1)
-    fade = 0.4 / (1 + 3 * time / length)
-    pieces.append(posture + (fade[:, None] * room) * np.sin(2 * np.pi * (cycles[:, None] + rng.uniform(0, 1, count))))
+    cycles = _CHIRP_HZ[0] * length / np.log(ratio) * (ratio**share - 1)
+    fade = 0.4 / (1 + 3 * share)
+    return fade[:, None] * np.sin(2 * np.pi * (cycles[:, None] + rng.uniform(0, 1, joints)))
+
+
+def _steps(rows: int, joints: int, rate_hz: float, rng: np.random.Generator) -> np.ndarray:
     every = max(1, round(0.15 * rate_hz))
-    levels = rng.uniform(-1, 1, (-(-rows["steps"] // every), count))
-    pieces.append(posture + 0.8 * room * np.repeat(levels, every, axis=0)[: rows["steps"]])
-    pieces.append(np.repeat(posture[None], rows["swing"], axis=0))
-    target = np.concatenate(pieces)
-    enabled = np.ones(len(target))
-    enabled[-rows["swing"] :] = 0.0
-    return target, enabled
+    levels = rng.uniform(-1, 1, (-(-rows // every), joints))
+    return 0.8 * np.repeat(levels, every, axis=0)[:rows]
+
+
+def _holds(rows: int, joints: int, rate_hz: float, rng: np.random.Generator) -> np.ndarray:
+    # The way between both postures takes a third of the time, so that little is excited but gravity.
+    side = np.where(rng.uniform(size=joints) < 0.5, -1.0, 1.0)
+    return 0.8 * side * np.clip(3.0 * (2.0 * np.arange(rows)[:, None] / rows - 1.0), -1.0, 1.0)
+
+
+def _rest(rows: int, joints: int, rate_hz: float, rng: np.random.Generator) -> np.ndarray:
+    return np.zeros((rows, joints))
+
+
+# Of rows, joints, rows per second and random numbers: targets as shares of the room, [rows, joints].
+_PIECES = {"triangle": _triangle, "chirp": _chirp, "steps": _steps, "holds": _holds, "swing": _rest}
 
 
 def scaled(controller: Controller, gain: float) -> Controller:

@@ -1,0 +1,44 @@
+"""Finds contacts that a suspended or clamped robot must have had, by the model's geometry at the measured positions."""
+
+import mujoco
+import numpy as np
+
+from envs.diagnosis.finding import Finding
+from envs.logs import Run
+
+_ROWS = 50  # of a run, at most
+_DEEP_M = 0.002
+_SHARES = (0.05, 0.95)  # of the rows: fewer are a graze, and bodies that always overlap are drawn so
+
+
+def contacts(run: Run, joints: tuple[str, ...], model: mujoco.MjModel) -> list[Finding]:
+    """Finds bodies that touch in part of the rows; in the simulations of discovery they go through each other.
+
+    Args:
+      run: as it was read.
+      joints: names of the joints, in the log's order.
+      model: of the robot with contacts and a fixed base.
+    """
+    data = mujoco.MjData(model)
+    address = [int(model.joint(name).qposadr[0]) for name in joints]
+    rows = np.unique(np.linspace(0, len(run.time) - 1, _ROWS).astype(int))
+    touched: dict[tuple[str, str], int] = {}
+    for row in rows:
+        data.qpos[address] = run.signals["q"][row]
+        mujoco.mj_fwdPosition(model, data)
+        deep = data.contact.geom[data.contact.dist < -_DEEP_M]
+        pairs = {tuple(sorted(model.body(body).name for body in model.geom_bodyid[pair])) for pair in deep}
+        for pair in pairs:
+            touched[pair] = touched.get(pair, 0) + 1
+    return [
+        Finding(
+            "contact",
+            "q",
+            (),
+            count / len(rows),
+            f"by the model's geometry {one} touches {other} in {count / len(rows):.0%} of the rows; record a robot "
+            "that touches nothing, or correct the geometry: contacts are not simulated",
+        )
+        for (one, other), count in touched.items()
+        if _SHARES[0] < count / len(rows) < _SHARES[1]
+    ]

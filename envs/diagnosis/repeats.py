@@ -1,0 +1,86 @@
+"""Finds rows that repeat the row before although the robot must have moved; a robot that stands still repeats itself.
+
+A stay is a piece of consecutive rows in which every measured value is that of the row before the piece. It counts as
+repeated where one of these says so:
+
+- other rows: a joint moves on in the same direction before and after the stay;
+- speed: the readings, though constant, include a velocity that would have moved the joint far;
+- noise: in the rows around the stay readings change from row to row and back, as they do at rest too.
+
+Targets that go far say nothing: a weak servo sticks for seconds while its target moves on.
+"""
+
+import numpy as np
+
+from envs.diagnosis.finding import MEASURED
+from envs.logs import Run
+from envs.segments import quantum_of
+
+_SUDDEN_S = 0.008  # in which no robot stops, and starts again as fast
+_NEAR = 25  # rows before and after a stay, from which noise is estimated
+_LEAST_QUANTA = 3.0  # of motion that must have been seen
+_CHANCE = 0.3  # stays that noise may bring about in a run, at most
+_FAR = 0.3  # of the joint's own range of motion
+
+
+def repeated(run: Run) -> np.ndarray:
+    """Marks rows, without the first [rows - 1], that repeat the row before although the robot must have moved."""
+    measured = [run.signals[name] for name in (*MEASURED, "gyro", "acc", "vel") if name in run.signals]
+    values = np.concatenate([one.reshape(len(run.time), -1) for one in measured], axis=1)
+    same = (np.diff(values, axis=0) == 0).all(axis=1)
+    joints = run.signals["q"].shape[1]
+    edges = np.flatnonzero(np.diff(same, prepend=False, append=False))
+    quanta = np.array([quantum_of(column[:, None]) for column in values.T])
+    for first, last in zip(edges[::2], edges[1::2], strict=True):
+        # Rows from `first` to `last` are equal, both included.
+        if not (
+            _passes(run, first, last, quanta[:joints])
+            or _driven(run, first, last)
+            or _noisy(values, first, last, quanta)
+        ):
+            same[first:last] = False
+    return same
+
+
+def _passes(run: Run, first: int, last: int, quanta: np.ndarray) -> bool:
+    """Whether a joint moves in the same direction up to a stay and from its end on, without slowing down for it."""
+    position = run.signals["q"]
+    width = max(1, round(_SUDDEN_S / float(np.median(np.diff(run.time)))))
+    if first < 2 * width or last + 2 * width >= len(position):
+        return False
+    far, near = np.diff(position[[first - 2 * width, first - width, first]], axis=0)
+    leaving, gone = np.diff(position[[last, last + width, last + 2 * width]], axis=0)
+    # Of a constant deceleration to rest, the last piece is a third of the one before.
+    sudden = (near * far > 0.6 * far**2) & (leaving * gone > 0.6 * gone**2) & (near * leaving > 0)
+    return bool((sudden & (np.minimum(np.abs(near), np.abs(leaving)) > _LEAST_QUANTA * quanta)).any())
+
+
+def _driven(run: Run, first: int, last: int) -> bool:
+    """Whether recorded speeds, constant in a stay, would have moved a joint far."""
+    speed = np.abs(run.signals["dq"][first]) if "dq" in run.signals else np.zeros(run.signals["q"].shape[1])
+    far = np.maximum(_FAR * np.ptp(run.signals["q"], axis=0), 1e-6)
+    return bool((speed * (run.time[last] - run.time[first]) > far).any())
+
+
+def _noisy(values: np.ndarray, first: int, last: int, quanta: np.ndarray) -> bool:
+    """Whether two readings scatter in all rows around a stay, so that it is by no chance that all of them stay."""
+    sides = [values[max(0, first - _NEAR) : first + 1], values[last : last + 1 + _NEAR]]
+    rows = [side[np.append(True, (np.diff(side, axis=0) != 0).any(axis=1))] for side in sides]
+    # Of neighbours that stand still as well, too few rows differ.
+    if any(len(side) < max(_NEAR // 2, 0.4 * count) for side, count in zip(rows, map(len, sides), strict=True)):
+        return False
+    third = [np.diff(side, n=3, axis=0) for side in rows]
+    sd = np.min([1.4826 * np.median(np.abs(each), axis=0) / np.sqrt(20.0) for each in third], axis=0)
+    # Of white noise three in four third differences have the other sign than the one before; of motion hardly any.
+    turns = np.min([(np.sign(each[1:]) * np.sign(each[:-1]) < 0).mean(axis=0) for each in third], axis=0)
+    # Rounding and a change to and fro between neighbouring values have half a quantum.
+    noise = (turns > 0.5) & (sd > np.maximum(0.8 * quanta, 1e-9))
+    # Two readings of noise are equal with this probability.
+    same = np.maximum(quanta[noise] / (sd[noise] * np.sqrt(4 * np.pi)), 0.25 / _NEAR)
+    return bool(noise.sum() >= 2 and np.prod(same) ** (last - first) * len(values) < _CHANCE)
+
+
+def slope(time: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Computes the least-squares slope of values [rows, ...] over time [rows]."""
+    time = time - time.mean()
+    return time @ (values - values.mean(axis=0)) / max(time @ time, 1e-12)

@@ -1,0 +1,120 @@
+"""Decides before any computing whether discovery can answer from a log: what makes it impossible, and what misleads.
+
+A log from which nothing can be learnt is refused. One that the log doctor suspects of an error that would make the
+answer wrong (`envs.diagnosis.finding.MISLEADING`) is refused unless the user trusts it. Everything else is a note.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from envs import segments
+from envs.diagnosis import diagnose_log, shared_findings
+from envs.logs import Log, Run, splits
+from experiments.discovery.setup import without_sealed
+
+_LEAST_SEGMENTS = 3  # of the longest horizon in every split
+_REST = 2e-3  # rad or m, and in quanta: what a joint at rest may wander, averaged over a tenth of a second
+_REST_QUANTA = 3.0
+_SATURATED = 0.95  # of the rows in which motors are on
+
+
+def check(log: Log, horizons: Sequence[float], trust: bool = False) -> list[str]:
+    """Checks that a log can answer, without its sealed runs, whose time stamps alone are looked at.
+
+    Args:
+      log: of all runs, its base fixed.
+      horizons: lengths of the segments in s.
+      trust: whether what the doctor suspects is a note too.
+
+    Returns:
+      Notes: sentences of the log doctor with the runs that they are true of.
+
+    Raises:
+      ValueError: nothing can be learnt from the log, or it is misleading and not trusted.
+    """
+    _check_length(log, max(horizons))
+    log = without_sealed(log)
+    _check_driven(log)
+    _check_motion(log)
+    said = [
+        (finding.misleading and not trust, f"{finding.sentence} ({_some(runs)})")
+        for finding, runs in shared_findings(diagnose_log(log))
+    ]
+    if refused := [sentence for misleading, sentence in said if misleading]:
+        raise ValueError(f"{'; '.join(refused)}: correct the log, or use --trust-log where it is right")
+    # After the doctor, because everything is at its limit in wrong units.
+    _check_saturation(log)
+    return [sentence for _, sentence in said]
+
+
+def _some(names: Sequence[str], most: int = 3) -> str:
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+
+
+def _check_length(log: Log, longest_s: float) -> None:
+    for split, runs in splits(log).items():
+        lasts = [run.time[-1] - run.time[0] - segments.HISTORY_S for run in runs]
+        count = sum(max(0, int(last / longest_s)) for last in lasts)
+        if count < _LEAST_SEGMENTS:
+            raise ValueError(
+                f"runs: '{split}' has room for {count} segment(s) of {longest_s:g} s, expected {_LEAST_SEGMENTS} or "
+                "more: record longer runs or more of them, or choose shorter horizons"
+            )
+
+
+def _check_driven(log: Log) -> None:
+    """Refuses joints whose torque nobody knows: targets without gains."""
+    silent = np.ones(len(log.joints), bool)
+    goes = np.zeros(len(log.joints), bool)
+    for run in log.runs:
+        if run.controller.kind != "pd" or "target" not in run.signals:
+            return
+        silent &= run.controller.gains["kp"] == 0
+        goes |= np.ptp(run.signals["target"], axis=0) > 0
+    # The target of a passive joint stays where it is.
+    missing = [name for name, bad in zip(log.joints, silent & (goes | silent.all()), strict=True) if bad]
+    if missing:
+        remedy = (
+            "or no target.* columns, so that tau.* is what drives the robot"
+            if all("tau" in run.signals for run in log.runs)
+            else "or the torques that were sent, in tau.* in the place of target.*"
+        )
+        raise ValueError(f"controller.kp: got 0 for {', '.join(missing)}, expected the controller's gains, {remedy}")
+
+
+def _check_motion(log: Log) -> None:
+    wander = {}
+    for run in log.runs:
+        for name, column in zip(log.joints, run.signals["q"].T, strict=True):
+            rows = min(len(column), max(1, round(0.1 / np.median(np.diff(run.time)))))
+            mean = np.convolve(column, np.full(rows, 1.0 / rows), "valid")
+            least = max(_REST, _REST_QUANTA * segments.quantum_of(column[:, None]))
+            wander[run.name, name] = np.ptp(mean) / least
+    (where, joint), most = max(wander.items(), key=lambda each: each[1])
+    if most <= 1.0:
+        raise ValueError(
+            f"q: got a robot at rest in all runs (most moves {joint} in {where}, no more than noise), expected motion; "
+            "`python -m experiments.excite` writes targets"
+        )
+
+
+def _check_saturation(log: Log) -> None:
+    """Refuses a log in which every motor is at its limit nearly always: then position errors have no effect."""
+    shares = np.stack([share for run in log.runs if (share := _saturated(run)) is not None] or [np.zeros((2, 1))])
+    on, at_limit = shares.sum(axis=0)
+    if (on > 0).any() and (at_limit > _SATURATED * on)[on > 0].all():
+        raise ValueError(
+            f"tau: got controllers at their limit in {at_limit.sum() / on.sum():.0%} of the rows, at every joint, "
+            "expected motion below the limit: check kp and torque_limit_nm, or record smaller motion"
+        )
+
+
+def _saturated(run: Run) -> np.ndarray | None:
+    """Counts rows with motors on, and those of them at the controller's limit, [2, joints]."""
+    if "target" not in run.signals or (run.controller.kind == "servo" and "volts" not in run.signals):
+        return None
+    law, speed = run.impedance(), segments.smoothed(run)[:, 1]
+    on = law.limit > 0
+    torque = np.abs(law.torque(run.signals["target"], run.signals["q"], speed))
+    return np.stack([on.sum(axis=0), (on & (torque >= 0.999 * law.limit)).sum(axis=0)])

@@ -1,0 +1,171 @@
+"""What `excite` writes: motions within limits, one model file that needs no other, and errors that name the option."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from envs import models
+from envs.logs import read
+from experiments import excite
+from experiments.discovery.blind_cases import ARM
+from experiments.discovery.excitation import MOTIONS, deciding, excitation
+
+JOINTS = ("shoulder", "elbow")
+LEG = """<mujoco model="leg">
+  <compiler meshdir="shapes" {}/>
+  <include file="assets.xml"/>
+  <worldbody>
+    <body name="thigh">
+      <joint name="hip" axis="0 1 0" range="-1 1" limited="true" armature="0.01"/>
+      <geom name="shell" type="mesh" mesh="shape" material="grey" density="500"/>
+      <body name="shin" pos="0 0 -0.4">
+        <joint name="knee" axis="0 1 0" range="-2 0" limited="true"/>
+        <geom type="capsule" fromto="0 0 0 0 0 -0.3" size="0.02"/>
+        <geom type="mesh" mesh="shape" density="100"/>
+      </body>
+    </body>
+  </worldbody>
+  {}
+</mujoco>"""
+ASSETS = """<mujoco><asset>
+  <mesh name="shape" file="shape.obj"/><material name="grey" rgba=".5 .5 .5 1"/>
+</asset></mujoco>"""
+WEDGE = """v 0 0 0\nv 0.1 0 0\nv 0 0.05 0\nv 0 0 -0.4\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n"""
+
+
+@pytest.fixture(scope="module")
+def spec():
+    return models.spec(str(ARM))
+
+
+def leg(folder, compiler="", extra=""):
+    (folder / "shapes").mkdir()
+    (folder / "shapes" / "shape.obj").write_text(WEDGE)
+    (folder / "assets.xml").write_text(ASSETS)
+    (folder / "leg.xml").write_text(LEG.format(compiler, extra))
+    return folder / "leg.xml"
+
+
+@pytest.mark.parametrize("motion", MOTIONS)
+def test_every_motion_stays_within_limits_and_can_be_split(spec, motion):
+    runs = excitation(spec, JOINTS, 4, 2.0, 200.0, seed=1, motion=motion)
+    low, high = np.array([[-1.6, 1.6], [-2.0, 2.0]]).T
+    assert [run.split for run in runs] == ["train", "select", "train", "sealed"]
+    assert len({run.condition for run in runs}) == 4
+    for run in runs:
+        assert run.target.shape == (400, 2)
+        assert ((run.target >= low) & (run.target <= high)).all()
+        assert run.enabled.any()
+
+
+def test_narrow_joints_stay_within_their_limits(spec):
+    text = ARM.read_text().replace("-2.0 2.0", "0.1 0.16")
+    for motion in MOTIONS:
+        for run in excitation(mujoco.MjSpec.from_string(text), JOINTS, 4, 2.0, 200.0, motion=motion):
+            assert 0.1 <= run.target[:, 1].min() <= run.target[:, 1].max() <= 0.16
+
+
+def test_motions_do_what_they_are_named_after(spec):
+    def of(name):
+        return excitation(spec, JOINTS, 4, 3.0, 200.0, motion=name)[0]
+
+    fast = {name: np.abs(np.diff(of(name).target, axis=0)).max() * 200.0 for name in ("slow_triangles", "holds")}
+    assert max(fast.values()) < 5.0  # rad/s: no step, which would be 200 a second
+    size = {name: np.ptp(of(name).target, axis=0).max() for name in ("small_steps", "large_steps")}
+    assert size["large_steps"] == pytest.approx(4 * size["small_steps"])
+    assert {of("chirp").gain, of("soft_chirp").gain} == {1.0, 0.5}
+    assert of("swing").enabled.mean() == pytest.approx(0.3)
+    # Two postures, each held for a third of the run.
+    assert [len(np.unique(of("holds").target[rows], axis=0)) for rows in (slice(0, 195), slice(405, 600))] == [1, 1]
+
+
+def test_the_motion_with_the_largest_score_is_chosen(spec):
+    def speed(motion):
+        return float(np.mean([np.abs(np.diff(run.target, axis=0)).mean() for run in motion]))
+
+    slow = deciding(spec, JOINTS, lambda motion: -speed(motion), seconds=2.0, rate_hz=200.0)
+    assert slow.name == "holds"
+    assert set(slow.scores) == set(MOTIONS) - {"medley"}
+    quick = deciding(spec, JOINTS, speed, seconds=2.0, rate_hz=200.0)
+    assert quick.scores[quick.name] == max(quick.scores.values())
+    assert quick.name in ("chirp", "soft_chirp", "large_steps")
+
+
+def test_scores_that_are_no_numbers_decide_nothing(spec):
+    chosen = deciding(spec, JOINTS, lambda motion: 1.0 if motion[0].enabled.min() == 0 else np.nan, seconds=2.0)
+    assert chosen.name == "swing"
+    with pytest.raises(ValueError, match="score: got no finite number"):
+        deciding(spec, JOINTS, lambda motion: np.inf, seconds=2.0)
+
+
+def test_the_command_writes_the_motion_that_was_chosen(tmp_path, spec):
+    chosen = deciding(spec, JOINTS, lambda motion: motion[0].gain == motion[1].gain == 0.5, seconds=2.0)
+    excite.main(excite.Args(out=tmp_path / "log", robot=str(ARM), runs=4, seconds=2.0, motion=chosen.name))
+    log = read(tmp_path / "log", measured=False)
+    for run, wanted in zip(log.runs, chosen.motion, strict=True):
+        np.testing.assert_allclose(run.signals["target"], wanted.target)
+        assert run.controller.gains["kp"] == pytest.approx(30.0)
+    assert (tmp_path / "log" / "arm.xml").read_text() == ARM.read_text()
+
+
+@pytest.mark.parametrize("compiler", ["", 'inertiafromgeom="true"'])
+def test_a_model_of_several_files_becomes_one_with_the_same_masses(tmp_path, compiler):
+    path = leg(tmp_path, compiler)
+    excite.main(excite.Args(out=tmp_path / "log", robot=str(path), runs=4, seconds=1.0))
+    before = mujoco.MjModel.from_xml_path(str(path))
+    for needed in ("assets.xml", "leg.xml", "shapes/shape.obj"):
+        (tmp_path / needed).unlink()
+    after = mujoco.MjModel.from_xml_path(str(tmp_path / "log" / "leg.xml"))
+    assert after.nmesh == 0
+    assert [after.joint(i).name for i in range(after.njnt)] == ["hip", "knee"]
+    for name in ("body_mass", "body_inertia", "body_ipos", "jnt_range", "dof_armature"):
+        np.testing.assert_allclose(getattr(after, name), getattr(before, name), rtol=1e-4, atol=1e-8)
+    # Whatever the order of the axes of inertia, the same motion needs the same torques.
+    torques = []
+    for model in (before, after):
+        data = mujoco.MjData(model)
+        data.qpos[:], data.qvel[:], data.qacc[:] = (0.3, -0.7), (1.0, 2.0), (5.0, -3.0)
+        mujoco.mj_inverse(model, data)
+        torques.append(data.qfrc_inverse.copy())
+    np.testing.assert_allclose(*torques, rtol=1e-4)
+    assert read(tmp_path / "log", measured=False).joints == ("hip", "knee")
+
+
+def test_what_needs_a_mesh_is_said_by_name(tmp_path):
+    path = leg(tmp_path, extra='<contact><pair geom1="shell" geom2="shell"/></contact>')
+    with pytest.raises(ValueError, match="robot: "):
+        excite.main(excite.Args(out=tmp_path / "log", robot=str(path), runs=4, seconds=1.0))
+    assert not (tmp_path / "log").exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"kd": -1.0}, "kd: got -1.0, expected a finite number that is not negative"),
+        ({"kd": float("nan")}, "kd: got nan"),
+        ({"kp": 0.0}, "kp: got 0.0, expected a positive, finite number"),
+        ({"seconds": float("inf")}, "seconds: got inf"),
+        ({"rate_hz": -5.0}, "rate_hz: got -5.0"),
+        ({"control_hz": 0.0}, "control_hz: got 0.0"),
+        ({"torque_limit_nm": -1.0}, "torque_limit_nm: got -1.0"),
+        ({"runs": 3}, "runs: got 3, expected 4 or more"),
+        ({"seed": -1}, "seed: got -1, expected a number that is not negative"),
+        ({"motion": "dance"}, "motion: got 'dance', expected one of medley, slow_triangles"),
+        ({"seconds": 0.01}, "seconds: got 0.01 s at 500 rows a second, expected 10 rows"),
+        ({"robot": "nobody.xml"}, "robot: got 'nobody.xml'"),
+    ],
+)
+def test_options_that_are_wrong_are_named(tmp_path, change, message):
+    with pytest.raises(ValueError, match=message):
+        excite.main(replace(excite.Args(out=tmp_path / "log", robot=str(ARM)), **change))
+    assert not (tmp_path / "log").exists()
+
+
+def test_a_folder_that_is_not_empty_is_left_as_it_is(tmp_path):
+    (tmp_path / "mine").write_text("")
+    with pytest.raises(ValueError, match="out: got"):
+        excite.main(excite.Args(out=tmp_path, robot=str(ARM)))
+    assert [path.name for path in Path(tmp_path).iterdir()] == ["mine"]
