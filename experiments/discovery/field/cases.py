@@ -9,7 +9,7 @@ from experiments.discovery.field.outside import OUTSIDE
 from experiments.discovery.field.robots import TOPOLOGIES
 from experiments.discovery.field.sizes import FAMILY
 
-GENERATORS = ("mujoco_c",)
+GENERATORS = ("mujoco_c", "bullet", "pinocchio")
 _SHARES = {"arm2": 4, "arm3": 5, "leg4": 4, "arm5": 3, "biped": 3, "arm7": 1}
 _OUTSIDE_SEVERITY = (6.0, 20.0)
 

@@ -45,8 +45,8 @@ def _viscous(setting: Setting):
 @FORMS.add("outside", scalar=False)
 def _stribeck(setting: Setting):
     """A Gaussian of speed, on a hysteresis."""
-    rub = Friction(setting.size, setting.dt, setting.zeros(), 0.003)
-    return lambda torque, now: torque - rub(now.v) * np.exp(-((now.v / 0.12) ** 2))
+    rub = Friction(setting.size, setting.dt, setting.zeros(), 0.001)
+    return lambda torque, now: torque - rub(now.v) * np.exp(-((now.v / 0.25) ** 2))
 
 
 @FORMS.add("outside", scalar=False)
@@ -97,12 +97,12 @@ def _command_delay(setting: Setting):
 
 @FORMS.add("command", scalar=False)
 def _target_slew(setting: Setting):
-    """A follower that saturates smoothly: dx/dt = rate tanh((target - x) / (rate 15 ms))."""
+    """A follower that saturates smoothly: dx/dt = rate tanh((target - x) / (rate 1 ms))."""
     state: dict[str, np.ndarray] = {}
 
     def act(target: np.ndarray, now: Now) -> np.ndarray:
         x = state.setdefault("x", target.copy())
-        state["x"] = x + setting.dt * setting.size * np.tanh((target - x) / (setting.size * 0.015))
+        state["x"] = x + setting.dt * setting.size * np.tanh((target - x) / (setting.size * 0.001))
         return state["x"]
 
     return act
@@ -171,7 +171,7 @@ class Gear:
 @FORMS.add("gear")
 def _backlash(setting: Setting):
     """The rotor runs free within the play, and hits a stiff spring at its ends."""
-    return Gear(setting, setting.kp * 60.0, setting.size)
+    return Gear(setting, setting.kp * 400.0, setting.size)
 
 
 @FORMS.add("gear", scalar=False)
@@ -252,14 +252,15 @@ def _sensor_lag(setting: Setting):
 def _drag(setting: Setting, links: Kinematics, at: list[int]):
     """force = -c speed (0.5 + 0.5 |speed| / (0.5 m/s)) at the centre of mass."""
 
-    def act(q: np.ndarray, v: np.ndarray, com: np.ndarray) -> np.ndarray:
+    com = links.com(at[0])
+
+    def act(q: np.ndarray, v: np.ndarray) -> np.ndarray:
         reach = links.jacobian(q, at[0], com)
         speed = (reach @ v[..., None])[..., 0]
-        fast = np.linalg.norm(speed, axis=1, keepdims=True)
-        force = -setting.size * speed * (0.5 + fast)
+        force = -setting.size * speed * (0.5 + np.linalg.norm(speed, axis=1, keepdims=True))
         return (reach.transpose(0, 2, 1) @ force[..., None])[..., 0]
 
-    return lambda q, v: act(q, v, links.com(at[0]))
+    return act
 
 
 @FORMS.add("outside", differs=False)

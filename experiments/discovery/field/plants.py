@@ -135,8 +135,9 @@ class BulletPlant:
         flags = pybullet.URDF_USE_INERTIA_FROM_FILE
         bodies = []
         with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "robot.urdf"
-            for robot in robots:
+            for number, robot in enumerate(robots):
+                # Each in a file of its own: Bullet keeps the content of files by their names.
+                path = Path(folder) / f"robot_{id(self)}_{number}.urdf"
                 path.write_text(urdf(robot))
                 bodies.append(self._client.loadURDF(str(path), useFixedBase=1, flags=flags))
         self._lanes = [bodies[number] for number in robot_of]
@@ -165,7 +166,10 @@ class BulletPlant:
 
 def urdf(robot: Robot) -> str:
     """Writes the robot's bodies as a URDF; each inertia is turned into its principal axes, which Bullet needs."""
-    parts = ['<robot name="robot"><link name="base"/>']
+    parts = [
+        '<robot name="robot"><link name="base"><inertial><mass value="1"/>'
+        '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>',
+    ]
     for number, parent in enumerate(robot.parents):
         values, turn = np.linalg.eigh(robot.inertia[number])
         turn = turn * np.sign(np.linalg.det(turn))

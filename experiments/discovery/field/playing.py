@@ -16,6 +16,7 @@ from experiments.discovery.field.robots import Robot
 LEAD_S = 0.4
 """Time before the first row in which the robot settles at the first target."""
 
+_MOST_NM, _MOST_RAD_S = 1e5, 300.0  # beyond which a simulation has diverged
 _CARRIED = 0.9  # share of a joint's armature that is behind its gears, where they have play or a spring
 
 
@@ -142,7 +143,8 @@ def play(plant_type, friction_type, robots: Sequence[Robot], script: Script, lan
     Returns:
       Readings without noise.
     """
-    return _Play(plant_type, friction_type, robots, script, lanes, hidden).trace()
+    with np.errstate(invalid="ignore", over="ignore"):
+        return _Play(plant_type, friction_type, robots, script, lanes, hidden).trace()
 
 
 class _Play:
@@ -183,6 +185,7 @@ class _Play:
             links = (Kinematics(robots[0]), at) if one.form.stage == "links" else ()
             self._stages.setdefault(one.form.stage, []).append((at, one.form.make(setting, *links)))
         self._held = lanes.held.copy()
+        self._lost = np.zeros(len(lanes.run), bool)
 
     def _through(self, stage: str, signal: np.ndarray, now: Now) -> np.ndarray:
         """Sends a signal [lanes, joints] through the effects of a stage."""
@@ -209,12 +212,15 @@ class _Play:
             if at_row:
                 on = script.enabled[lanes.run, row][:, None]
             tick = script.ticks[lanes.run, np.minimum(lead + first * each + step, steps_all - 1)][:, None]
-            share = ((first * each + step) / steps_all)[:, None]
+            share = (np.maximum(first * each + step, 0) / steps_all)[:, None]
             q, v, torque = self._step(target, on, tick, share, count)
             if at_row and step >= 0:
                 for name, value in (("q", q), ("v", v), ("held", torque), ("bristle", self._friction.bristle)):
                     kept[name].append(value.copy())
-        return Trace(**{name: np.stack(values, axis=1) for name, values in kept.items()})
+        stacked = {name: np.stack(values, axis=1) for name, values in kept.items()}
+        for values in stacked.values():
+            values[self._lost] = np.nan
+        return Trace(**stacked)
 
     def _targets(self, row: np.ndarray, step: int, last: int) -> np.ndarray:
         script, run = self._script, self._lanes.run
@@ -252,9 +258,12 @@ class _Play:
         total = self._through("outside", total, now) - self._friction(joint_v)
         for _, act in self._stages.get("links", ()):
             total = total + act(plant.q, plant.v)[:, :count]
-        every = np.zeros_like(plant.q)
-        every[:, :count] = total
-        plant.step(every - self._damping * plant.v)
+        every = -self._damping * plant.v
+        every[:, :count] += total
+        # A lane that diverges goes on without torques, and is reported as not finite.
+        self._lost |= ~(np.abs(every) < _MOST_NM).all(axis=1) | ~(np.abs(plant.v) < _MOST_RAD_S).all(axis=1)
+        every[self._lost] = 0.0
+        plant.step(every)
         return q, v, held
 
 

@@ -22,7 +22,7 @@ _HORIZON_S = 0.15
 _BIN_S = 0.01
 _PRIOR = {"mass": 0.1, "armature": 0.1, "damping": 0.1, "friction": 0.1, "kp": 0.035, "kd": 0.035}
 _MOST = 3.0  # prior deviations that a parameter may be off
-_RUNS, _STARTS = 4, 7  # that are measured, and segments of each
+_RUNS, _STARTS = 4, 9  # that are measured, and segments of each
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,9 +54,12 @@ class Meter:
         self.row_s = script.steps_a_row * generator.plant.dt
         self._chosen = np.unique(np.linspace(0, runs - 1, min(runs, _RUNS)).astype(int))
         self._long = max(2, round(_HORIZON_S / self.row_s)) + 1
-        self._starts = np.linspace(0.12 * rows, rows - self._long - 1, _STARTS).astype(int)
+        rng = np.random.default_rng(seed)
+        # Spread over each run, at other times in each.
+        self._starts = (rng.uniform(0, 1, (len(self._chosen), _STARTS)) + np.arange(_STARTS)) / _STARTS
+        self._starts = (self._starts * (rows - self._long - 1)).astype(int)
         self._plain = generator.play([robot], script, whole(1, script, self._chosen))
-        self._floor = self._measure_floor(sensors, np.random.default_rng(seed))
+        self._floor = self._measure_floor(sensors, rng)
         self._slopes = self._measure_slopes()
 
     def scales(self, joint: int) -> Scales:
@@ -86,7 +89,7 @@ class Meter:
     def severities(self, trace: Trace) -> np.ndarray:
         """Returns the severity of each robot of a trace of `play`; infinite where a simulation diverged."""
         difference = self._difference(trace, trace)
-        count = len(difference) // (len(self._chosen) * len(self._starts))
+        count = len(difference) // self._starts.size
         found = np.empty(count)
         for number, one in enumerate(np.split(difference, count)):
             # A robot that throws itself about is more severe than any that is wanted.
@@ -110,13 +113,13 @@ class Meter:
         """Returns what was read less what segments without the effect show, [segments, bins, joints] rad."""
         lanes = self._segments(starts)
         simulated = self._generator.play([robot or self._robot], self._script, lanes)
-        lane = np.repeat(np.arange(len(measured.q)), len(self._starts))
+        lane = np.repeat(np.arange(len(measured.q)), _STARTS)
         row = lanes.row[:, None] + np.arange(self._long)
         return self._binned(measured.q[lane[:, None], row] - simulated.q)
 
     def _segments(self, trace: Trace) -> Lanes:
-        lane = np.repeat(np.arange(len(trace.q)), len(self._starts))
-        row = np.tile(self._starts, len(trace.q))
+        lane = np.repeat(np.arange(len(trace.q)), _STARTS)
+        row = np.tile(self._starts.ravel(), len(trace.q) // len(self._chosen))
         return Lanes(
             robot=np.zeros(len(lane), int),
             run=np.tile(self._chosen, len(trace.q) // len(self._chosen))[lane],

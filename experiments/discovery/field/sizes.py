@@ -50,7 +50,7 @@ def bounds(effect: str, robot: Robot, place: int, scales: Scales) -> tuple[float
     found = {
         "coulomb": (0.02 * torque, 2.0 * torque),
         "viscous": (0.02 * torque / speed, 2.0 * torque / speed),
-        "stribeck": (0.03 * torque, 3.0 * torque),
+        "stribeck": (0.03 * torque, 4.0 * torque),
         "load_friction": (0.01, 0.7),
         "torque_limit": (scales.peak_nm, 0.3 * torque),
         "torque_speed": (0.1 * limit / scales.peak_rad_s, 2.0 * limit / speed),
@@ -65,7 +65,7 @@ def bounds(effect: str, robot: Robot, place: int, scales: Scales) -> tuple[float
         "torque_scale": (0.98, 0.35),
         "gain_error": (0.98, 0.35),
         "deadband": (0.002, 0.18),
-        "backlash": (0.002, 0.15),
+        "backlash": (0.0004, 0.15),
         "encoder_bias": (0.001, 0.25),
         # Outside the library.
         "cogging": (0.03 * torque, 2.0 * torque),
