@@ -35,7 +35,7 @@ class Args:
     """Relative error of the nominal parameters. Each is wrong by 0.5 to 1.5 times this, up or down; gains by a third of
     that."""
     write_only: bool = False
-    """Write the logs of the cases, and answer none (sizes of `field` alone)."""
+    """Write the logs of the cases, and answer none."""
     limit: int = 0
     """Number of cases to work on, the first ones of the seed; 0 for all."""
     piece: str = "0/1"

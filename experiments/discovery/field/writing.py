@@ -131,25 +131,22 @@ class Scene:
 def draw_places(case: FieldCase, scene: Scene, rng: np.random.Generator) -> list[tuple[int, ...]]:
     """Draws the places of a case's effects: one joint or body mostly, now and then a left and right pair or all.
 
-    Several effects sit at different joints.
+    Several effects sit at different joints, as far as there are as many.
     """
     names, count = scene.topology.joints, len(scene.topology.joints)
-    if case.kind in ("pair", "triple"):
-        return [(int(place),) for place in rng.permutation(count)[: len(case.effects)]] if count >= len(
-            case.effects
-        ) else [(int(place),) for place in np.arange(len(case.effects)) % count]
-    first = int(rng.integers(count))
+    if len(case.effects) > 1:
+        order = rng.permutation(count)
+        return [(int(order[number % count]),) for number in range(len(case.effects))]
     if case.effects[0] == "loose_foot":
         return [(count - 1,)]
-    together = case.kind != "outside" and case.effects[0] not in ON_BODY
-    draw = rng.uniform()
-    if together and draw < 0.1:
+    first, draw = int(rng.integers(count)), rng.uniform()
+    if case.kind == "outside" or case.effects[0] in ON_BODY or draw > 0.4:
+        return [(first,)]
+    if draw < 0.1:
         return [tuple(range(count))]
-    pair = names[first].replace("left", "right").replace("right", "left") if "left" in names[first] else names[first]
-    twin = names[first].replace("left", "right")
-    if together and draw < 0.4 and twin != names[first] and pair in names:
-        return [(first, names.index(twin))]
-    return [(first,)]
+    left = names[first].replace("right", "left")
+    right = left.replace("left", "right")
+    return [(first,)] if left == right else [(names.index(left), names.index(right))]
 
 
 def prepared(case: FieldCase, error: float, seed: int) -> tuple[Scene, list[Placed], Trace]:
@@ -212,6 +209,27 @@ def write_case(case: FieldCase, error: float, seed: int, out: Path) -> Path:
     return folder
 
 
+_NOMINAL = {"coulomb": "friction", "viscous": "damping", "armature": "armature"}
+_NOMINAL_RATIO = {"gain_error": "kp", "link_mass": "mass"}
+
+
+def _value(placed: Placed, scene: Scene) -> float:
+    """Returns what discovery should report of an effect's first parameter, which is relative to the nominal model."""
+    at = list(placed.places)
+
+    def of(robot: robots.Robot, field: str) -> np.ndarray:
+        return getattr(robot, field)[at]
+
+    # Where the nominal number is of the same kind as the effect, its error is part of what is missing.
+    if placed.effect in _NOMINAL:
+        field = _NOMINAL[placed.effect]
+        return float(placed.size + (of(scene.real, field) - of(scene.nominal, field)).mean())
+    if placed.effect in _NOMINAL_RATIO:
+        field = _NOMINAL_RATIO[placed.effect]
+        return float(placed.size * (of(scene.real, field) / of(scene.nominal, field)).mean())
+    return placed.size
+
+
 def _truth(case: FieldCase, scene: Scene, placed: Sequence[Placed]) -> dict:
     effects = []
     for one, asked in zip(placed, case.severities, strict=True):
@@ -223,7 +241,7 @@ def _truth(case: FieldCase, scene: Scene, placed: Sequence[Placed]) -> dict:
                 "family": FAMILY.get(one.effect),
                 "places": [names[place] for place in one.places],
                 "size": one.size,
-                "scalar": form.scalar,
+                "value": _value(one, scene) if form.scalar else None,
                 "asked": asked,
                 "severity": one.severity,
             }
