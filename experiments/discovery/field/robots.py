@@ -126,7 +126,7 @@ def draw(topology: Topology, rng: np.random.Generator) -> Robot:
       rng: random numbers.
 
     Returns:
-      A robot whose kp gives each joint a natural frequency of 1.6 to 3.5 Hz or so.
+      A robot whose kp gives each joint a natural frequency of 2 to 4 Hz.
     """
     count = len(topology.joints)
     scale = np.exp(rng.uniform(-0.35, 0.35))
@@ -168,18 +168,21 @@ def draw(topology: Topology, rng: np.random.Generator) -> Robot:
 def _motors(body: Robot, topology: Topology, rng: np.random.Generator) -> Robot:
     """Gives every joint a motor, gains and friction that suit the mass that it moves."""
     count = len(body.joints)
-    bent = rng.uniform(0.2, 0.5, count)
-    moved, weight = _loads(body, bent)
+    postures = rng.uniform(-0.9, 0.9, (6, count))
+    # An arm is heavy to turn where it is stretched out, and its gains must do there too.
+    moved = np.max([np.diag(_mass_matrix(body, posture)) for posture in postures], axis=0)
+    weight = _weights(body)
     armature = rng.uniform(0.15, 0.8, count) * np.maximum(moved, 0.003)
     if topology.name == "biped":
         armature[3:] = armature[:3]
     moved = moved + armature
-    frequency = rng.uniform(10.0, 20.0, count)
+    frequency = rng.uniform(13.0, 26.0, count)
     kp = moved * frequency**2
     kd = 2 * rng.uniform(0.25, 0.7, count) * np.sqrt(kp * moved)
     # A sampled controller is unstable where it takes too much of a joint's speed within a period.
     with_motors = replace(body, armature=armature)
-    kd = np.minimum(kd, 0.35 * topology.control_hz * _alone(with_motors, bent))
+    alone = np.min([1 / np.diag(np.linalg.inv(_mass_matrix(with_motors, posture))) for posture in postures], axis=0)
+    kd = np.minimum(kd, 0.35 * topology.control_hz * alone)
     limit = weight + kp * rng.uniform(0.7, 1.2, count)
     return replace(
         with_motors,
@@ -189,17 +192,16 @@ def _motors(body: Robot, topology: Topology, rng: np.random.Generator) -> Robot:
     )
 
 
-def _loads(robot: Robot, bent: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the inertia that each joint moves in kg m^2, and a bound on its gravity torque in Nm."""
-    mass = _mass_matrix(robot, bent)
-    weights = np.zeros(len(bent))
-    for number in range(len(bent)):
+def _weights(robot: Robot) -> np.ndarray:
+    """Returns a bound on the gravity torque of each joint in Nm."""
+    weights = np.zeros(len(robot.joints))
+    for number in range(len(weights)):
         at, reach = number, np.linalg.norm(robot.com[number])
         while at >= 0:
             weights[at] += _GRAVITY * robot.mass[number] * reach
             reach += np.linalg.norm(robot.pos[at])
             at = robot.parents[at]
-    return np.diag(mass), weights * np.abs(robot.axis[:, :2]).max(axis=1).clip(0.2)
+    return weights * np.abs(robot.axis[:, :2]).max(axis=1).clip(0.2)
 
 
 def _mass_matrix(robot: Robot, bent: np.ndarray) -> np.ndarray:
@@ -210,11 +212,6 @@ def _mass_matrix(robot: Robot, bent: np.ndarray) -> np.ndarray:
     full = np.zeros((model.nv, model.nv))
     mujoco.mj_fullM(model, data, full)
     return full
-
-
-def _alone(robot: Robot, bent: np.ndarray) -> np.ndarray:
-    """Returns the inertia that resists each joint if all others are free, in kg m^2."""
-    return 1.0 / np.diag(np.linalg.inv(_mass_matrix(robot, bent)))
 
 
 def mistaken(robot: Robot, error: float, rng: np.random.Generator) -> Robot:
