@@ -29,6 +29,7 @@ class Segment:
     """
 
     target: jax.Array  # [before + after, joints] rad; a row's target holds until the next row
+    between: jax.Array  # [before + after, joints] rad, linear less held targets
     feed: jax.Array  # [before + after, joints] Nm, torque that was sent directly, where there are no targets
     stiffness: jax.Array  # [before + after, joints] Nm/rad of the controller, zero where it is off
     damping: jax.Array  # [before + after, joints] Nm s/rad
@@ -247,6 +248,7 @@ class _Prepared:
         none = np.zeros((len(run.time), joints))
         self._held = {
             "target": run.signals.get("target", none),
+            "between": none,
             "feed": none if "target" in run.signals else run.signals["tau"],
             "stiffness": controller.stiffness,
             "damping": controller.damping,

@@ -50,6 +50,7 @@ def cut_log(log: Log, dt: float, signals: Sequence[str], horizons: Sequence[floa
             data[split][horizon] = Segments(
                 inputs=jax.tree.map(lambda leaf, mine=mine: leaf[mine], cut.segments),
                 signals={name: cut.signals[name][mine] for name in signals},
+                steps=cut.segments.target.shape[1] - round(segments.HISTORY_S / dt),
                 run=cut.run[mine],
                 regimes=label[mine],
             )

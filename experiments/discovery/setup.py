@@ -1,21 +1,21 @@
 """Turns measured logs and a nominal model into the problem that discovery works on."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import mujoco
 import numpy as np
 
 from envs import models, segments
-from envs.effects import LIBRARY, RESIDUAL
+from envs.effects import LEARNED, LIBRARY
 from envs.logs import Log, read, read_xl330, splits
 from envs.null_logs import simulate_null_log
 from envs.regimes import REGIMES
 from envs.rig import Rig
 from envs.scales import measure_scales
 from experiments.discovery.cutting import BIN_S, cut_log
-from experiments.discovery.hypotheses import hypotheses, timing_directions
+from experiments.discovery.hypotheses import hypotheses, learned_torque, timing_directions
 from jaxtune.discovery.problem import Problem
 
 HORIZONS_S = (0.05, 0.15, 0.45)
@@ -41,13 +41,14 @@ class Question:
 
 @dataclass(frozen=True)
 class _Simulator:
-    """Simulates some signals of a rig. Two with the same rig and signals are equal, so they share compiled programs."""
+    """Simulates some signals of a rig. Two of equal layout and signals are equal, so they share compiled programs."""
 
-    rig: Rig
+    rig: Rig = field(compare=False)
+    layout: Hashable
     signals: tuple[str, ...]
 
-    def __call__(self, values, inputs):
-        read = self.rig.simulate(self.rig.tree(values), inputs)
+    def __call__(self, system, values, inputs, steps):
+        read = self.rig.on(system).simulate(self.rig.tree(values), inputs, steps)
         return {name: read[name] for name in self.signals}
 
 
@@ -123,24 +124,26 @@ def build_question(
     axes = {(axis.effect, axis.place): number for number, axis in enumerate(rig.axes)}
     library = {name: row for name, row in rig.effects.items() if name in LIBRARY}
     every = hypotheses(rig.axes, rig.places, library)
-    residual = hypotheses(rig.axes, rig.places, {RESIDUAL.name: RESIDUAL})
-    timing = timing_directions(rig.axes, rig.control_hz)
+    timing, timing_bounds = timing_directions(rig.axes, rig.control_hz)
     simulated = [simulate_null_log(log, spec, seed + number) for number in range(null_logs)]
     measured, *nulls = (cut_log(one, rig.dt, signals, horizons) for one in (log, *simulated))
     problem = Problem(
-        simulate=_Simulator(plain, signals),
+        simulate=_Simulator(plain, plain.layout, signals),
+        system=plain.system,
         values=rig.inner,
         axes=len(rig.axes),
         hypotheses=every,
         prior=np.array([axis.prior_sd for axis in rig.axes]),
         timing=timing,
+        timing_bounds=timing_bounds,
+        trees=rig.trees,
         data=measured,
         null_logs=nulls,
         bin_rows=segments.rows_together(1.0 / log.rate_hz, BIN_S),
         regimes=REGIMES,
         components={name: tuple("xyz") if name == "gravity" else rig.joints for name in signals},
         push={joint: axes["constant_push", joint] for joint in rig.joints},
-        residual={one.places[0]: one for one in residual if len(one.places) == 1},
+        residual=learned_torque(rig.axes, LEARNED),
     )
     names = {split: tuple(run.name for run in runs) for split, runs in splits(log).items()}
     return Question(problem, rig, names, notes)
