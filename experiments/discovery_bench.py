@@ -15,6 +15,8 @@ from experiments.common import checkpoint
 from experiments.common.cli import console, run
 from experiments.discovery.blind_bench import Bench
 from experiments.discovery.blind_cases import SIZES
+from experiments.discovery.field.bench import FieldBench
+from experiments.discovery.field.cases import FIELD_SIZES
 from experiments.discovery.scores import shown
 
 
@@ -25,13 +27,17 @@ class Args:
     out: Path = Path("runs/discovery_bench")
     """Folder of the cases and the scores."""
     size: str = "smoke"
-    """Cases: smoke (6 two-joint arms, to see that it works), arm (75 arms, an hour), standard (98 BITenos, a night on a
+    """Cases: field (184 robots of six kinds in three engines, 6 hours on two cores), field_smoke (6 of them), smoke (6 two-joint arms, to see that it works), arm (75 arms, an hour), standard (98 BITenos, a night on a
     CPU) or full (BITenos with longer logs, for a GPU or a few nights)."""
     seed: int = 0
     """Random seed of the cases, their places, sizes and wrong parameters."""
     nominal_error: float = 0.1
     """Relative error of the nominal parameters. Each is wrong by 0.5 to 1.5 times this, up or down; gains by a third of
     that."""
+    write_only: bool = False
+    """Write the logs of the cases, and answer none."""
+    limit: int = 0
+    """Number of cases to work on, the first ones of the seed; 0 for all."""
     piece: str = "0/1"
     """Share of the cases to work on, as NUMBER/COUNT: 0/2 and 1/2 in two processes make all."""
 
@@ -43,15 +49,20 @@ def main(args: Args) -> None:
       ValueError: an option is wrong, or the folder holds another benchmark.
     """
     checkpoint.set_up_compiler(checkpoint.a_device_a_core())
-    if args.size not in SIZES:
-        raise ValueError(f"size: got '{args.size}', expected one of {', '.join(SIZES)}")
+    if args.size not in (*SIZES, *FIELD_SIZES):
+        raise ValueError(f"size: got '{args.size}', expected one of {', '.join((*SIZES, *FIELD_SIZES))}")
     number, _, pieces = args.piece.partition("/")
     if not (number.isdigit() and pieces.isdigit() and int(number) < int(pieces)):
         raise ValueError(f"piece: got '{args.piece}', expected '0/1', '0/2', '1/2', ...")
     identity = {"size": args.size, "seed": args.seed, "nominal_error": args.nominal_error}
     checkpoint.open_run(args.out, identity)
-    bench = Bench(args.out, args.size, args.seed, args.nominal_error)
-    cases = bench.cases[int(number) :: int(pieces)]
+    made = FieldBench if args.size in FIELD_SIZES else Bench
+    bench = made(args.out, args.size, args.seed, args.nominal_error)
+    cases = bench.cases[: args.limit or None][int(number) :: int(pieces)]
+    if args.write_only:
+        for done, case in enumerate(cases, start=1):
+            console.print(f"{done}/{len(cases)} {bench.write(case)}")
+        return
     for done, case in enumerate(cases, start=1):
         answer = bench.answer(case)
         names = ", ".join(effect["name"] for effect in [*answer["effects"], *answer["parameter_changes"]])

@@ -1,51 +1,97 @@
-"""Scores the blind benchmark: what was right in each case, rates with intervals over all cases, and a page."""
+"""Scores a benchmark of discovery: what was right in each case, rates with intervals over all cases, and a page."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from envs.effects import LIBRARY
-from experiments.discovery.blind_robots import OUTSIDE
-
 SEVERITIES = (2.0, 5.0, 15.0)
-"""Severities at which effects are hidden, in floor units."""
+"""Severities at which effects are hidden in the sizes `arm` and `standard`, in floor units."""
+
+EMPTY = ("empty", "linear")
+"""Kinds of cases in which nothing is hidden."""
+
+_HARM = (1.1, 0.2)  # ratio and floor units by which a model may be worse than the better of nominal and null
+_REACHED = 0.7  # least share of the wanted severity: an effect that could not be made so severe is not counted
+_STRONG = 15.0
 
 
 def score(truth: dict, answer: dict) -> dict:
     """Compares the answer of one case with its truth.
 
+    A model that was withdrawn after the look at the sealed runs counts as `unnamed`, and so does a case that failed.
+
     Args:
-      truth: what was hidden, with its intended severity (`asked`) and the severity that was reached.
-      answer: the answer of discovery, as in `summary.json`.
+      truth: `kind` of the case (`single`, `weak`, `pair`, `triple`, `empty`, `linear` or `outside`) and its `effects`,
+        each with `name`, `family`, `places`, `value` of the first parameter (None where the generator's formula has no
+        such number), and its `asked` and reached `severity`.
+      answer: content of `summary.json`, or the verdict `failed` with its `message`.
 
     Returns:
       What was hidden and named; whether name, family, place and reported set are right; gaps in floor units.
     """
-    named = [*answer["effects"], *answer["parameter_changes"]]
+    withdrawn = bool(answer.get("withdrawn", False))
+    named = [] if withdrawn else [*answer.get("effects", ()), *answer.get("parameter_changes", ())]
     first = named[0] if named else None
-    reported = {first["name"], *first["confusable_with"]} if first else set()
-    effect, gap = truth["effect"], answer["gap"]
-    family = LIBRARY[effect].family if effect in LIBRARY else None
+    effects = truth["effects"]
+    main = _main(effects, first)
+    reported = sorted({first["name"], *first["confusable_with"]}) if first else []
+    gap = {name: _number(answer.get("gap", {}).get(name)) for name in ("before", "null", "after")}
+    right = bool(first) and bool(main) and first["name"] == main["name"]
+    place = bool(first) and bool(main) and set(first["places"]) == set(main["places"])
+    best = min(gap["before"], gap["null"])
+    where = answer.get("where") or [{"joint": None}]
     return {
-        "effect": effect,
-        "severity": truth["severity"],
-        "asked": truth["asked"],
-        "places": truth["truth"]["places"],
-        "verdict": answer["verdict"],
+        "kind": truth["kind"],
+        "effect": main["name"] if main else None,
+        "effects": [effect["name"] for effect in effects],
+        "places": main["places"] if main else [],
+        "severity": main["severity"] if main else 0.0,
+        "asked": main["asked"] if main else 0.0,
+        "reached": all(effect["severity"] > _REACHED * effect["asked"] for effect in effects),
+        "verdict": "unnamed" if withdrawn else answer["verdict"],
+        "message": answer.get("message"),
         "named": first["name"] if first else None,
         "named_places": first["places"] if first else [],
         "others": [other["name"] for other in named[1:]],
-        "set": sorted(reported),
-        "name": bool(first) and first["name"] == effect,
-        "family": bool(first) and first["family"] == family,
-        "in_set": effect in reported,
-        "place": bool(first) and set(first["places"]) == set(truth["truth"]["places"]),
-        "where": answer["where"][0]["joint"] if answer["where"] else None,
-        "before": gap["null"],
+        "set": reported,
+        "name": right,
+        "family": bool(first) and bool(main) and first["family"] == main["family"],
+        "in_set": bool(main) and main["name"] in reported,
+        "place": place,
+        "all_named": {effect["name"] for effect in effects} <= {one["name"] for one in named},
+        "extra": any(not _true(one, effects) for one in (named[1:] if len(effects) == 1 else named)),
+        "covered": _covered(main, first) if right and place else None,
+        "where": where[0]["joint"],
         "nominal": gap["before"],
+        "null": gap["null"],
         "after": gap["after"],
+        "harm": gap["after"] > _HARM[0] * best and gap["after"] > best + _HARM[1],
+        "withdrawn": withdrawn,
         "seconds": answer["seconds"],
     }
+
+
+def _main(effects: Sequence[Mapping], first: Mapping | None) -> Mapping | None:
+    """Returns the hidden effect that a case is scored by: of several the one that was named first, else the largest."""
+    same = [effect for effect in effects if first and effect["name"] == first["name"]]
+    return max(same or effects, key=lambda effect: effect["severity"], default=None)
+
+
+def _number(value) -> float:
+    return float("nan") if value is None else float(value)
+
+
+def _true(named: Mapping, effects: Sequence[Mapping]) -> bool:
+    """Whether a named effect is hidden, at one of the places that it was named at."""
+    return any(effect["name"] == named["name"] and set(effect["places"]) & set(named["places"]) for effect in effects)
+
+
+def _covered(effect: Mapping, named: Mapping) -> bool | None:
+    """Whether the 95 % interval of the first parameter holds the truth; None where there is no single true number."""
+    if effect.get("value") is None or not named.get("parameters"):
+        return None
+    interval = next(iter(named["parameters"].values()))
+    return bool(interval["low"] <= effect["value"] <= interval["high"])
 
 
 def wilson(hits: int, count: int, z: float = 1.96) -> tuple[float, float]:
@@ -73,37 +119,56 @@ def tally(rows: Sequence[dict]) -> list[dict]:
     Returns:
       Rows with `measure`, `value`, the ends `low` and `high` of the interval, `count` of cases and `goal`.
     """
-    # Some effects cannot be made as severe as intended; a weak one that is missed must not count as a strong one.
-    hidden = [row for row in rows if row["effect"] in LIBRARY and row["severity"] > 0.7 * row["asked"]]
-    outside = [row for row in rows if row["effect"] in OUTSIDE]
-    empty = [row for row in rows if row["effect"] is None]
-    plain = [row for row in hidden if row["asked"] >= 5.0]
-    measures = [
-        ("top-1 name, 5 floor units and more", plain, "name", ">= 0.90"),
-        *(
-            (f"top-1 name, {severity:g} floor units", [r for r in hidden if r["asked"] == severity], "name", "")
-            for severity in SEVERITIES
+    kinds = {
+        kind: [row for row in rows if row["kind"] == kind and row["reached"]]
+        for kind in ("single", "weak", "pair", "triple", "outside")
+    }
+    singles, outside = kinds["single"], kinds["outside"]
+    empty = [row for row in rows if row["kind"] in EMPTY]
+    right = [row for row in singles if row["name"]]
+    strong = [row for row in singles if row["severity"] >= _STRONG]
+    answered = [row for row in rows if row["verdict"] != "failed"]
+    unnamed = [row for row in outside if row["verdict"] == "unnamed"]
+
+    def each(group: Sequence[dict], key: str) -> list:
+        return [row[key] for row in group if row[key] is not None]
+
+    lines = [
+        _rate("top-1 name, 5 floor units and more", each(singles, "name"), ">= 0.85"),
+        _rate("top-1 name, 15 floor units and more", each(strong, "name"), ""),
+        _rate("top-1 name, 2 floor units", each(kinds["weak"], "name"), ""),
+        _rate("top-1 family, 5 floor units and more", each(singles, "family"), ">= 0.93"),
+        _rate("place right, 5 and more", each(singles, "place"), ">= 0.93"),
+        _rate("truth in the reported set, 5 and more", each(singles, "in_set"), ">= 0.95"),
+        _mean("mean size of the reported set", [len(row["set"]) for row in singles if row["set"]], "<= 2.5"),
+        _rate("extra wrong names, 5 and more", each(singles, "extra"), "<= 0.10"),
+        _rate("pairs: both named", each(kinds["pair"], "all_named"), ">= 0.65"),
+        _rate("pairs: a name that is not there", each(kinds["pair"], "extra"), ""),
+        _rate("triples: all three named", each(kinds["triple"], "all_named"), ""),
+        _rate("triples: a name that is not there", each(kinds["triple"], "extra"), ""),
+        _rate("names something where nothing is hidden", [row["named"] is not None for row in empty], "<= 0.05"),
+        _rate(
+            "`no_missing_effect` where nothing is hidden",
+            [row["verdict"] == "no_missing_effect" for row in empty],
+            ">= 0.90",
         ),
-        ("top-1 family, 5 floor units and more", plain, "family", ">= 0.93"),
-        ("truth in the reported set, 5 and more", plain, "in_set", ">= 0.95"),
-        ("place right, 5 and more", plain, "place", ">= 0.95"),
+        _rate("`unnamed` outside the library", [row["verdict"] == "unnamed" for row in outside], ">= 0.80"),
+        _rate("joint of the largest gap right where `unnamed`", [row["where"] in row["places"] for row in unnamed], ""),
+        _rate("95 % interval holds the truth", each(right, "covered"), "0.88 to 0.98"),
+        _mean("final gap, floor units, name right (median)", each(right, "after"), "<= 1.2", np.median),
+        _mean("final gap, floor units, name right (mean)", each(right, "after"), "<= 1.6"),
+        _mean(
+            "null over after at 15 floor units (median)",
+            [row["null"] / row["after"] for row in strong if row["after"] > 0],
+            ">= 8",
+            np.median,
+        ),
+        _rate("worse than the better of nominal and null", each(answered, "harm"), ""),
+        _rate("withdrawn after the look at sealed", each(answered, "withdrawn"), "<= 0.02"),
+        _rate("failed with an error", [row["verdict"] == "failed" for row in rows], ""),
+        _mean("seconds a case", each(rows, "seconds"), ""),
     ]
-    lines = [_rate(label, [row[key] for row in group], goal) for label, group, key, goal in measures]
-    lines.append(
-        _rate("names something where nothing is hidden", [row["named"] is not None for row in empty], "<= 0.05")
-    )
-    lines.append(_rate("`unnamed` outside the library", [row["verdict"] == "unnamed" for row in outside], ">= 0.80"))
-    blamed = [row["where"] in row["places"] for row in outside if row["verdict"] == "unnamed"]
-    lines.append(_rate("joint of the largest gap right where `unnamed`", blamed, ""))
-    sizes = [len(row["set"]) for row in plain if row["set"]]
-    strong = [row for row in hidden if row["asked"] == 15.0 and row["name"]]
-    lines.append(_mean("mean size of the reported set", sizes, "<= 2.5"))
-    lines.append(
-        _mean("gap shrink at 15 floor units, name right", [row["nominal"] / row["after"] for row in strong], ">= 8")
-    )
-    lines.append(_mean("final gap, floor units, name right", [row["after"] for row in plain if row["name"]], "<= 1.3"))
-    lines.append(_mean("seconds a case", [row["seconds"] for row in rows], "<= 300"))
-    return lines
+    return [line for line in lines if line["count"]]
 
 
 def _rate(label: str, hits: Sequence[bool], goal: str) -> dict:
@@ -112,9 +177,34 @@ def _rate(label: str, hits: Sequence[bool], goal: str) -> dict:
     return {"measure": label, "value": rate, "low": low, "high": high, "count": len(hits), "goal": goal}
 
 
-def _mean(label: str, values: Sequence[float], goal: str) -> dict:
-    value = float(np.mean(values)) if values else None
-    return {"measure": label, "value": value, "low": None, "high": None, "count": len(values), "goal": goal}
+def _mean(label: str, values: Sequence[float], goal: str, middle: Callable = np.mean) -> dict:
+    finite = [value for value in values if np.isfinite(value)]
+    value = float(middle(finite)) if finite else None
+    return {"measure": label, "value": value, "low": None, "high": None, "count": len(finite), "goal": goal}
+
+
+def wrong(row: dict) -> str | None:
+    """Says what is wrong with a scored case, for the list of failures; None where it is right.
+
+    Args:
+      row: of `score`.
+    """
+    if row["verdict"] == "failed":
+        return f"failed: {row['message']}"
+    if row["kind"] in EMPTY:
+        return "something is named" if row["named"] else None if row["verdict"] == "no_missing_effect" else "unsure"
+    if row["kind"] == "outside":
+        return None if row["verdict"] == "unnamed" else "not `unnamed`"
+    several = row["kind"] in ("pair", "triple")
+    checks = {
+        "harms": row["harm"],
+        "withdrawn": row["withdrawn"],
+        "not all named": several and not row["all_named"],
+        "wrong name": not several and not row["name"],
+        "wrong place": not several and row["name"] and not row["place"],
+        "extra name": row["extra"],
+    }
+    return ", ".join(label for label, there in checks.items() if there) or None
 
 
 def shown(lines: Sequence[dict]) -> list[tuple[str, ...]]:
@@ -131,20 +221,21 @@ def shown(lines: Sequence[dict]) -> list[tuple[str, ...]]:
     ]
 
 
-def page(identity: Mapping[str, object], done: int, count: int, lines: Sequence[dict]) -> str:
+def page(identity: Mapping[str, object], count: int, rows: Sequence[dict], lines: Sequence[dict]) -> str:
     """Writes the results as a Markdown page.
 
     Args:
       identity: options of the benchmark.
-      done: number of cases that are answered.
       count: number of cases in all.
+      rows: of `score`, with the name of the `case`.
       lines: table of `tally`.
     """
     table = "\n".join(f"| {' | '.join(cells)} |" for cells in shown(lines))
     options = " ".join(f"--{name.replace('_', '-')} {value}" for name, value in identity.items())
+    failures = "\n".join(_failure(row) for row in rows if wrong(row))
     return f"""# Blind benchmark of discovery, size `{identity["size"]}`
 
-`python -m experiments.discovery_bench {options}`, {done} of {count} robots.
+`python -m experiments.discovery_bench {options}`, {len(rows)} of {count} robots.
 Intervals are Wilson's. `scores.json` holds, for every robot, what was hidden and what discovery answered.
 
 | measure | value | 95 % interval | cases | to reach |
@@ -152,4 +243,19 @@ Intervals are Wilson's. `scores.json` holds, for every robot, what was hidden an
 {table}
 
 ![hidden effects against named effects](confusion.png)
+
+## Failures
+
+| case | hidden | severity | answered | gap: nominal, null, after | what is wrong |
+|---|---|---|---|---|---|
+{failures}
 """
+
+
+def _failure(row: dict) -> str:
+    hidden = " + ".join(row["effects"]) or "nothing"
+    said = " + ".join([row["named"], *row["others"]]) if row["named"] else row["verdict"]
+    gaps = ", ".join(f"{row[name]:.1f}" for name in ("nominal", "null", "after"))
+    places = ", ".join(row["places"])
+    cells = (row["case"], f"{hidden} ({places})" if places else hidden, f"{row['severity']:.1f}", said, gaps)
+    return f"| {' | '.join(cells)} | {wrong(row)} |"
