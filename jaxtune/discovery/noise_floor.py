@@ -23,6 +23,7 @@ FURTHEST = 3.0
 """Prior standard deviations that a nominal parameter may move. One that stops there is a finding, not a nuisance."""
 
 _STEPS = 3  # of the fits to null logs; a tenth off in the parameters, one step would leave an engine gap
+_FEW = 8  # null logs that scales are measured on, at most
 _LEAST_SHARE = 0.25  # of a component's mean floor: else the first rows of a segment would count without end
 
 Say = Callable[[str], None]
@@ -96,12 +97,14 @@ def measure(problem: Problem, say: Say) -> NoiseFloor:
     """
     prior, main = prior_directions(problem), problem.main_horizon
     say(f"noise floor at {main:g} s")
-    train = _merged(problem, "train", main)
+    train = _merged(problem, "train", main, len(problem.null_logs))
     fits, unit = _fit_null_logs(problem, prior, train)
     found = {}
     for horizon in problem.horizons:
         say(f"noise floor at {horizon:g} s")
-        left = {split: _simulated(problem, split, horizon, fits) for split in problem.data}
+        # All logs where thresholds come from them too; for a scale a few are enough.
+        logs = {split: len(fits) if (split, horizon) == ("train", main) else _FEW for split in problem.data}
+        left = {split: _simulated(problem, split, horizon, fits[: logs[split]]) for split in problem.data}
         scale = {split: _rms_floor(values) for split, values in left.items()}
         in_units = left["train"] / scale["train"]
         segments = {split: data[horizon] for split, data in problem.data.items()}
@@ -116,7 +119,7 @@ def measure(problem: Problem, say: Say) -> NoiseFloor:
             },
             on_some=partial(_on_some, problem, segments["train"], scale["train"]),
             prior=prior,
-            null_residuals=in_units.reshape(len(fits), -1),
+            null_residuals=in_units.reshape(len(in_units), -1),
         )
     return found
 
@@ -190,15 +193,15 @@ def _step(prior: Free, point: np.ndarray, residual: np.ndarray, slopes: np.ndarr
 
 def _simulated(problem: Problem, split: str, horizon: float, fits: np.ndarray) -> np.ndarray:
     """Residuals [logs, segments, bins, components] of every null log's own model [logs, axes]."""
-    segments = _merged(problem, split, horizon)
+    segments = _merged(problem, split, horizon, len(fits))
     which = np.repeat(np.arange(len(fits)), len(segments.run) // len(fits))
     found = paired_residuals(problem, fits, segments, which, np.arange(len(which)))
     return found.reshape(len(fits), -1, *found.shape[1:])
 
 
-def _merged(problem: Problem, split: str, horizon: float) -> Segments:
-    """The segments of all null logs behind each other; every log has as many."""
-    logs = [log[split][horizon] for log in problem.null_logs]
+def _merged(problem: Problem, split: str, horizon: float, count: int) -> Segments:
+    """The segments of the first null logs behind each other; every log has as many."""
+    logs = [log[split][horizon] for log in problem.null_logs[:count]]
     return replace(
         logs[0],
         inputs=jax.tree.map(lambda *leaves: np.concatenate(leaves), *(log.inputs for log in logs)),

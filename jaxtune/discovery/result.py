@@ -20,7 +20,7 @@ class Settings:
     """How many of the best hypotheses are screened with every other one as a pair."""
     pairs: int = 8
     """How many of the best pairs are fitted."""
-    finalists: int = 6
+    finalists: int = 4
     """How many of those are fitted on with fresh slopes."""
     most: int = 4
     """Largest number of effects that are accepted."""

@@ -17,9 +17,9 @@ from jaxtune.discovery.evaluate import worst
 from jaxtune.discovery.fit import Fit, begin, polish, refine
 from jaxtune.discovery.localise import localise
 from jaxtune.discovery.noise_floor import Floor, NoiseFloor, Say
-from jaxtune.discovery.problem import Problem, are_distinct
+from jaxtune.discovery.problem import Hypothesis, Problem, are_distinct
 from jaxtune.discovery.result import Settings
-from jaxtune.discovery.screen import Lead, Screen, screen
+from jaxtune.discovery.screen import Lead, Screen, on_segments, screen, spread_segments
 from jaxtune.discovery.state import State
 
 _MOST_PLACES = 3  # of one name among the leads that are fitted: they tell where; more would crowd out other names
@@ -99,8 +99,10 @@ def shortlist(settings: Settings, found: Screen, price: float) -> list[Lead]:
     return chosen + pairs[: settings.pairs]
 
 
-def fit_leads(settings: Settings, at: Floor, base: Fit, present: Sequence, leads: Sequence[Lead]) -> list[Candidate]:
-    """Fits leads beside a model on `train`, the best of them with fresh slopes, and simulates them on `select`.
+def fit_leads(
+    settings: Settings, at: Floor, base: Fit, present: Sequence[Hypothesis], leads: Sequence[Lead]
+) -> list[Candidate]:
+    """Fits leads beside a model: all of them on the screened segments, the best on the whole of `train`.
 
     Args:
       settings: rounds, and how many are finalists.
@@ -108,19 +110,34 @@ def fit_leads(settings: Settings, at: Floor, base: Fit, present: Sequence, leads
       base: the model without them.
       present: the effects that the model has.
       leads: what joins it.
+
+    Returns:
+      Models that could be simulated, on `train` and `select`; of the finalists with fresh slopes.
     """
     if not leads:
         return []
-    evaluate = at.residuals["train"]
-    begun = begin(base, *zip(*((lead.hypotheses, lead.point, lead.start) for lead in leads), strict=True), evaluate)
-    fits = refine(begun, evaluate, settings.rounds)
+    chosen = spread_segments(at, base)
+    some, evaluate = on_segments(at, base, chosen), at.on_some(chosen)
+    groups, points, starts = zip(*((lead.hypotheses, lead.point, lead.start) for lead in leads), strict=True)
+    fits = refine(begin(some, groups, points, starts, evaluate), evaluate, settings.rounds)
     order = [index for index in np.argsort([fit.cost for fit in fits]) if np.isfinite(fits[index].cost)]
-    finalists = order[: settings.finalists]
-    polished = polish([fits[index] for index in finalists], evaluate, settings.rounds) if finalists else []
-    for index, fit in zip(finalists, polished, strict=True):
-        fits[index] = fit
-    select = at.residuals["select"](np.stack([fits[index].vector for index in order])) if order else []
+    if not order:
+        return []
+    whole = _on_all(at, [fits[index] for index in order])
+    whole.sort(key=lambda pair: pair[1].cost)
+    best = polish([fit for _, fit in whole[: settings.finalists]], at.residuals["train"], settings.rounds)
+    every = [*best, *(fit for _, fit in whole[settings.finalists :])]
+    select = at.residuals["select"](np.stack([fit.vector for fit in every]))
     return [
-        Candidate((*present, *leads[index].hypotheses), fits[index], residual)
-        for index, residual in zip(order, select, strict=True)
+        Candidate((*present, *groups[order[index]]), fit, residual)
+        for (index, _), fit, residual in zip(whole, every, select, strict=True)
+    ]
+
+
+def _on_all(at: Floor, fits: Sequence[Fit]) -> list[tuple[int, Fit]]:
+    """The same models with their residuals on the whole of `train`, and without slopes; numbered."""
+    found = at.residuals["train"](np.stack([fit.vector for fit in fits]))
+    return [
+        (index, replace(fit, residual=residual, jacobian=np.zeros((len(residual), len(fit.coordinates)))))
+        for index, (fit, residual) in enumerate(zip(fits, found, strict=True))
     ]
