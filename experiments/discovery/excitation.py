@@ -7,7 +7,7 @@ split by condition, with every kind of motion in every part.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
@@ -127,4 +127,4 @@ def scaled(controller: Controller, gain: float) -> Controller:
     Two gains make effects of the controller (delay, gain error) distinguishable from those of the body.
     """
     gains = {name: values * (gain if name in ("kp", "kd") else 1.0) for name, values in controller.gains.items()}
-    return Controller(kind=controller.kind, rate_hz=controller.rate_hz, gains=gains)
+    return replace(controller, gains=gains)
