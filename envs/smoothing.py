@@ -9,9 +9,9 @@ import numpy as np
 from envs.logs import Run
 from envs.readings import aligned, fresh, noise_of
 
-_SMOOTHING_S = 0.012  # half width of the local fit
+_PARABOLA_S, _CUBIC_S = 0.012, 0.03  # half widths of the local fits
+_WIDEST_S = 0.018  # half width from which on a parabola no longer follows the motion
 _MIN_HALF_ROWS = 2  # a parabola needs three rows
-_WIDE = 1.5  # from this many times `_SMOOTHING_S` on, a parabola no longer follows the motion
 
 
 def smoothed(run: Run) -> np.ndarray:
@@ -22,8 +22,8 @@ def smoothed(run: Run) -> np.ndarray:
 
         q(t + s) = q + dq s + ddq s^2 / 2,   dq(t + s) = dq + ddq s
 
-    It is a cubic where the rows are so slow (100 Hz and less) that two of them span more than 18 ms. Stale readings
-    (`stale`) are left out.
+    Where the rows are so slow (100 Hz and less) that two of them span more than 18 ms, it is a cubic over 30 ms on both
+    sides. Stale readings (`envs.readings.stale`) are left out.
 
     Args:
       run: with `q` and perhaps `dq`.
@@ -43,8 +43,7 @@ def smoothed(run: Run) -> np.ndarray:
 
 def _fit(time: np.ndarray, parts: Sequence[tuple[np.ndarray, np.ndarray, float]]) -> np.ndarray:
     """Fits polynomials around every row to positions, and to velocities in the second part: [rows, 2]."""
-    half, width = _window(parts[0][0])
-    order = 2 if width < _WIDE * _SMOOTHING_S else 3
+    half, order, width = _window(parts[0][0])
     designs, values = [], []
     for derivative, (at, read, sd) in enumerate(parts):
         near = _nearest(at, time, half if derivative == 0 else _window(at)[0])
@@ -64,11 +63,13 @@ def _fit(time: np.ndarray, parts: Sequence[tuple[np.ndarray, np.ndarray, float]]
     return np.stack([fit[:, 0], fit[:, 1] / width], axis=1)
 
 
-def _window(time: np.ndarray) -> tuple[int, float]:
-    """Returns how many readings a fit takes on each side, and the time that they span."""
-    period = float(np.median(np.diff(time))) if len(time) > 1 else _SMOOTHING_S
-    half = max(_MIN_HALF_ROWS, round(_SMOOTHING_S / period))
-    return half, half * period
+def _window(time: np.ndarray) -> tuple[int, int, float]:
+    """Returns how many readings a fit takes on each side, its order, and the time that they span."""
+    period = float(np.median(np.diff(time))) if len(time) > 1 else _PARABOLA_S
+    half, order = max(_MIN_HALF_ROWS, round(_PARABOLA_S / period)), 2
+    if half * period > _WIDEST_S:
+        half, order = max(_MIN_HALF_ROWS, round(_CUBIC_S / period)), 3
+    return half, order, half * period
 
 
 def _nearest(at: np.ndarray, time: np.ndarray, half: int) -> np.ndarray:

@@ -1,6 +1,6 @@
 """Cuts logs into the segments that discovery works on, by split (train, select, sealed) and horizon."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import jax
@@ -10,6 +10,9 @@ from envs import segments
 from envs.logs import Log, Run, splits
 from envs.regimes import regimes
 from jaxtune.discovery.problem import Segments
+
+Cuts = Mapping[str, Mapping[float, Segments]]
+"""Segments by split and horizon."""
 
 BIN_S = 0.01
 """Time in s over which residuals are averaged."""
@@ -93,7 +96,25 @@ def _part(run: Run, split: str) -> Run:
     )
 
 
-def cut_log(log: Log, dt: float, signals: Sequence[str], horizons: Sequence[float]) -> dict[str, dict[float, Segments]]:
+def told_alike(null: Cuts, measured: Cuts) -> Cuts:
+    """Lets a null log share what the controller was told with the measured log, of which it is the same.
+
+    A long log is hundreds of megabytes otherwise, for every null log.
+
+    Args:
+      null: segments of a simulated null log.
+      measured: segments of the log that it imitates.
+    """
+    return {
+        split: {
+            horizon: replace(own, inputs=measured[split][horizon].inputs.replace(measured=own.inputs.measured))
+            for horizon, own in lengths.items()
+        }
+        for split, lengths in null.items()
+    }
+
+
+def cut_log(log: Log, dt: float, signals: Sequence[str], horizons: Sequence[float]) -> Cuts:
     """Cuts a log into segments of each horizon, and labels every row with the motion regime of its joints.
 
     Each segment is simulated from its measured first state, so that errors do not add up over a whole run.

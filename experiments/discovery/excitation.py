@@ -9,7 +9,7 @@ The other motions have one of these each. `deciding` chooses the one in which tw
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
@@ -238,4 +238,4 @@ def scaled(controller: Controller, gain: float) -> Controller:
     Two gains make effects of the controller (delay, gain error) distinguishable from those of the body.
     """
     gains = {name: values * (gain if name in ("kp", "kd") else 1.0) for name, values in controller.gains.items()}
-    return Controller(kind=controller.kind, rate_hz=controller.rate_hz, gains=gains)
+    return replace(controller, gains=gains)

@@ -15,7 +15,15 @@ from envs.null_logs import simulate_null_logs
 from envs.regimes import REGIMES
 from envs.rig import Rig
 from envs.scales import measure_scales
-from experiments.discovery.cutting import BIN_S, HORIZONS_S, cut_log, fitting_horizons, row_rate, split_in_time
+from experiments.discovery.cutting import (
+    BIN_S,
+    HORIZONS_S,
+    cut_log,
+    fitting_horizons,
+    row_rate,
+    split_in_time,
+    told_alike,
+)
 from experiments.discovery.hypotheses import hypotheses, learned_torque, timing_directions
 from jaxtune.discovery.problem import Problem
 
@@ -137,7 +145,8 @@ def build_question(
     every = hypotheses(rig.axes, rig.places, library)
     timing, timing_bounds = timing_directions(rig.axes, rig.control_hz)
     simulated = simulate_null_logs(log, spec, null_logs, seed)
-    measured, *nulls = (cut_log(one, rig.dt, signals, horizons) for one in (log, *simulated))
+    measured = cut_log(log, rig.dt, signals, horizons)
+    nulls = [told_alike(cut_log(one, rig.dt, signals, horizons), measured) for one in simulated]
     problem = Problem(
         simulate=_Simulator(plain, plain.layout, signals),
         system=plain.system,

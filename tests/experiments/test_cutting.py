@@ -1,0 +1,197 @@
+"""From logs as they are to a question: splits, horizons, what is compared, and what is refused."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import mujoco
+import numpy as np
+import pytest
+
+from envs import segments
+from envs.logs import Controller, Log, Run, splits, write
+from envs.models import suspended
+from envs.null_logs import replay
+from experiments.discovery.blind_cases import ARM
+from experiments.discovery.cutting import HORIZONS_S, fitting_horizons, split_in_time
+from experiments.discovery.setup import build_question, drop_filtered, read_logs
+
+MEASURED = Path(__file__).parents[3] / "shared" / "data"
+JOINTS = ("shoulder", "elbow")
+PD = {"kp": np.array([40.0, 20.0]), "kd": np.array([2.0, 0.8]), "torque_limit_nm": np.array([15.0, 15.0])}
+SERVO = {"gain": np.array([5.0, 5.0]), "kt": np.array([0.5, 0.5]), "resistance_ohm": np.array([0.5, 0.5])}
+
+
+@pytest.fixture(scope="module")
+def spec():
+    return mujoco.MjSpec.from_file(str(ARM))
+
+
+@pytest.fixture(scope="module")
+def played(spec):
+    """Twelve seconds of one motion at 50 rows a second, with velocities and torques that were measured."""
+    time = 3.0 + np.arange(600) / 50.0
+    target = 0.4 * np.sin(2 * np.pi * time[:, None] * [0.7, 1.1])
+    zero = np.zeros_like(target)
+    controller = Controller(kind="pd", rate_hz=500.0, gains=PD, between_rows="linear")
+    known = {name: {"noise_sd": np.full(2, 0.01)} for name in ("dq", "tau", "abs_tau")}
+    signals = {"q": zero, "dq": zero, "tau": zero, "abs_tau": zero, "target": target}
+    run = Run(
+        name="run_000",
+        condition="sines",
+        split=None,
+        controller=controller,
+        time=time,
+        signals=signals,
+        other={"heat": np.arange(600.0)},
+        known=known | {"q": {"noise_sd": np.full(2, 1e-4)}},
+    )
+    model = suspended(spec)
+    model.opt.timestep, model.opt.disableflags = 0.0005, model.opt.disableflags | mujoco.mjtDisableBit.mjDSBL_ACTUATION
+    run = replay(run, model, JOINTS, True, np.random.default_rng(0))
+    return Log(robot="arm.xml", base="fixed", rate_hz=50.0, joints=JOINTS, policy=None, runs=(run,))
+
+
+def folder(tmp_path, log, mjcf=None):
+    write(log, tmp_path / "log")
+    (tmp_path / "log" / "arm.xml").write_text(ARM.read_text() if mjcf is None else mjcf)
+    return (tmp_path / "log",)
+
+
+def with_signals(log, **changes):
+    signals = {name: values for name, values in {**log.runs[0].signals, **changes}.items() if values is not None}
+    return replace(log, runs=(replace(log.runs[0], signals=signals),))
+
+
+def test_one_condition_is_split_in_time(tmp_path, played):
+    log, _ = read_logs(folder(tmp_path, played))
+    assert len(log.notes) == 1
+    assert "cut in time" in log.notes[0]
+    parts = {split: run for split, (run,) in splits(log).items()}
+    begin = [(run.time[0] - 3.0) / 12.0 for run in parts.values()]
+    np.testing.assert_allclose(begin, [0.0, 0.5, 0.75], atol=0.01)
+    # Where a part begins, the one before has ended by the history of a segment.
+    train, select, sealed = parts.values()
+    for before, after in ((train, select), (select, sealed)):
+        assert segments.HISTORY_S <= after.time[0] - before.time[-1] <= segments.HISTORY_S + 0.04
+    for run in parts.values():
+        rows = np.searchsorted(played.runs[0].time, run.time)
+        np.testing.assert_array_equal(run.signals["q"], played.runs[0].signals["q"][rows])
+        np.testing.assert_array_equal(run.other["heat"], rows)
+
+
+def test_logs_that_can_be_split_by_condition_are_not_cut(played):
+    runs = tuple(replace(played.runs[0], name=f"run_{i}", condition=str(i)) for i in range(3))
+    three = replace(played, runs=runs)
+    assert split_in_time(three) is three
+    # Nor are those that say how they are to be split, although it leaves no test.
+    said = replace(played, runs=(replace(runs[0], split="train"),))
+    assert split_in_time(said) is said
+
+
+def test_a_run_too_short_to_be_cut_is_named(played):
+    run = played.runs[0]
+    signals = {name: values[:30] for name, values in run.signals.items()}
+    short = replace(run, time=run.time[:30], signals=signals, other={})
+    with pytest.raises(ValueError, match="run_000: got 4 rows for 'select', expected 8"):
+        split_in_time(replace(played, runs=(short,)))
+
+
+@pytest.mark.parametrize(("rate_hz", "least"), [(50.0, (0.08, 0.24, 0.72)), (100.0, HORIZONS_S), (500.0, HORIZONS_S)])
+def test_horizons_follow_the_rows(played, rate_hz, least):
+    time = np.arange(100) / rate_hz
+    log = replace(played, runs=(replace(played.runs[0], time=time),))
+    np.testing.assert_allclose(fitting_horizons(log), least, rtol=1e-6)
+    asked = (4 / rate_hz, 12 / rate_hz, 36 / rate_hz)
+    assert fitting_horizons(log, asked) == asked
+    with pytest.raises(ValueError, match=r"horizons: got .* s, expected .* s or more, which are 4 of"):
+        fitting_horizons(log, (2 / rate_hz, *asked))
+
+
+def test_what_was_measured_is_compared_and_the_rig_reads_it(played, spec):
+    log = split_in_time(played)
+    question = build_question(log, spec, null_logs=1)
+    problem = question.problem
+    assert problem.horizons == pytest.approx((0.08, 0.24, 0.72))
+    assert set(problem.components) == {"q", "dq", "tau", "abs_tau"}
+    assert question.notes == log.notes
+    data = problem.data["train"][problem.main_horizon]
+    null = problem.null_logs[0]["train"][problem.main_horizon]
+    for name, of in data.inputs.items():
+        assert (getattr(null.inputs, name) is of) == (name != "measured"), name
+    values = np.asarray(problem.values(np.zeros((1, problem.axes))))[0].astype(np.float32)
+    read = jax.jit(jax.vmap(problem.simulate, in_axes=(None, 0)))(values, data.inputs)
+    for name, size in {"q": 1e-3, "dq": 0.02, "tau": 0.02, "abs_tau": 0.02}.items():
+        error = np.sqrt(((read[name] - data.signals[name]) ** 2).mean())
+        assert error < size, name
+        assert data.signals[name].std() > 20 * size, name
+    np.testing.assert_allclose(read["abs_tau"], np.abs(read["tau"]), rtol=1e-6)
+
+
+def test_torques_that_were_sent_are_not_compared(played, spec):
+    log = split_in_time(with_signals(played, target=None, abs_tau=None))
+    assert set(build_question(log, spec, null_logs=0).problem.components) == {"q", "dq"}
+
+
+def test_filters_that_the_log_declares_are_heeded_and_said(played):
+    (run,) = played.runs
+    known = {"dq": {"filter_hz": np.array([np.nan, 20.0])}, "q": {"filter_hz": np.array([40.0, 40.0])}}
+    log, notes = drop_filtered(split_in_time(replace(played, runs=(replace(run, known=known),))))
+    assert notes == (
+        "q was filtered at 40 Hz, as the log says; the delay is taken out",
+        "dq was filtered at 20 Hz, as the log says, and is not used",
+    )
+    assert all(set(run.signals) == {"q", "tau", "abs_tau", "target"} for run in log.runs)
+
+
+def test_readings_that_a_bus_repeated_are_said(played, spec):
+    held = played.runs[0].signals["q"][np.arange(600) // 2 * 2]
+    log = split_in_time(with_signals(played, q=held, dq=None, tau=None, abs_tau=None))
+    notes = build_question(log, spec, null_logs=0).notes
+    assert len(notes) == 2
+    assert notes[1].endswith("of the readings of q repeat an older one; they are interpolated")
+
+
+def test_a_servos_supply_is_a_column_or_a_number(played, spec):
+    servo = Controller(kind="servo", rate_hz=500.0, gains=SERVO)
+    log = split_in_time(replace(played, runs=(replace(played.runs[0], controller=servo),)))
+    with pytest.raises(ValueError, match=r"column 'volts' is missing, and so is controller\.volts of the servo"):
+        build_question(log, spec, null_logs=0)
+    fixed = replace(servo, gains=SERVO | {"volts": np.array([8.0, 8.0])})
+    log = replace(log, runs=tuple(replace(run, controller=fixed) for run in log.runs))
+    problem = build_question(log, spec, null_logs=0).problem
+    np.testing.assert_allclose(problem.data["train"][problem.main_horizon].inputs.limit, 8.0, rtol=1e-6)
+
+
+def test_joints_that_nobody_reads_are_named_with_what_to_do(played, spec):
+    log = split_in_time(replace(played, joints=("shoulder",)))
+    with pytest.raises(ValueError, match=r"joints: got a log without elbow, .* taking their <joint> out of the MJCF"):
+        build_question(log, spec, null_logs=0)
+
+
+def test_flags_that_switch_physics_off_are_cleared_if_told(tmp_path, played):
+    mjcf = ARM.read_text().replace("<option", '<option><flag constraint="disable"/></option><option', 1)
+    logs = folder(tmp_path, played, mjcf)
+    with pytest.raises(ValueError, match=r"robot: option flag: got constraint disabled.*--clear-flags"):
+        read_logs(logs)
+    log, spec = read_logs(logs, clear_flags=True)
+    assert log.notes[0] == "flags of the model that disabled constraint were cleared"
+    assert not spec.option.disableflags & mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+
+
+@pytest.mark.parametrize(
+    ("name", "signals", "note"),
+    [
+        ("xl330_pendulum", {"q"}, "dq lags q"),
+        ("so101_sage", {"q", "abs_tau"}, "dq lags q"),
+        ("go2_hung", {"q"}, None),
+    ],
+)
+def test_real_logs_become_questions(name, signals, note):
+    if not (MEASURED / name).is_dir():
+        pytest.skip(f"no recordings at {MEASURED / name}")
+    question = build_question(*read_logs((MEASURED / name,)), null_logs=0)
+    assert set(question.problem.components) == signals
+    assert [text.startswith(note) for text in question.notes] == ([True] if note else [])
+    # Nothing of them is taken for stale.
+    assert not any("repeat" in text for text in question.notes)
