@@ -18,7 +18,8 @@ from envs.segments import quantum_of
 
 _SUDDEN_S = 0.008  # in which no robot stops, and starts again as fast
 _NEAR = 25  # rows before and after a stay, from which noise is estimated
-_LEAST_QUANTA = 3.0  # of motion that must have been seen
+_LEAST_QUANTA = 3.0  # of motion before and after a stay, for its speed to be known
+_MISSED_QUANTA = 1.5  # of motion that must have been seen during the stay
 _CHANCE = 0.3  # stays that noise may bring about in a run, at most
 _FAR = 0.3  # of the joint's own range of motion
 
@@ -52,7 +53,10 @@ def _passes(run: Run, first: int, last: int, quanta: np.ndarray) -> bool:
     leaving, gone = np.diff(position[[last, last + width, last + 2 * width]], axis=0)
     # Of a constant deceleration to rest, the last piece is a third of the one before.
     sudden = (near * far > 0.6 * far**2) & (leaving * gone > 0.6 * gone**2) & (near * leaving > 0)
-    return bool((sudden & (np.minimum(np.abs(near), np.abs(leaving)) > _LEAST_QUANTA * quanta)).any())
+    pace = np.minimum(np.abs(near), np.abs(leaving))
+    # Rounding alone makes a slow joint stay.
+    missed = pace * (last - first) / width
+    return bool((sudden & (pace > _LEAST_QUANTA * quanta) & (missed > _MISSED_QUANTA * quanta)).any())
 
 
 def _driven(run: Run, first: int, last: int) -> bool:
