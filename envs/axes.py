@@ -11,7 +11,7 @@ from jaxtune.types import Effect, Parameter
 # damping and dry friction. Each may be wrong by a tenth of its nominal value (one prior standard deviation). Discovery
 # fits them under all hypotheses, the null included, so that an inaccurate number is not taken for a missing effect.
 _PRIOR_SHARE = 0.1
-_NOMINAL_RATIOS = ("link_mass", "gain_error")
+_NOMINAL_RATIOS = ("link_mass", "gain_error", "damping_gain")
 _NOMINAL_FIELDS = {"armature": "dof_armature", "viscous": "dof_damping", "coulomb": "dof_frictionloss"}
 _MOST_TAKEN = 0.9  # of a field of the model: armature and damping must stay positive
 

@@ -42,6 +42,7 @@ class Now:
     rotor: jax.Array  # [joints] kg m^2, the rotor's part of the joint's inertia
     carried: jax.Array  # [joints] Nm, the part of the torque that accelerates the rotor along with the joint
     body_velocity: jax.Array  # [bodies, 3] m/s of the centres of mass
+    between: jax.Array  # [joints] rad, how far targets are from the held ones if they move on between rows
 
 
 @chex.dataclass(frozen=True)
@@ -204,7 +205,8 @@ class Chain:
         target, memory = self.stage("command", values, x["target"], now, memory)
         error, memory = self.stage("error", values, target - readings[0], now, memory)
         # A controller holds its torque from one reading of the joint to the next.
-        held = jnp.where(x["sample"], self._law(x, error, readings[1]), memory["held"])
+        speed, memory = self.stage("speed", values, readings[1], now, memory)
+        held = jnp.where(x["sample"], self._law(x, error, speed), memory["held"])
         memory["held"] = held
         torque, memory = self.stage("torque", values, held, now, memory)
         none = jnp.zeros_like(held)
@@ -237,6 +239,7 @@ class Chain:
             rotor=jnp.zeros_like(state[1]),
             carried=jnp.zeros_like(state[1]),
             body_velocity=velocity,
+            between=x["between"],
         )
 
 

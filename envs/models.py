@@ -7,6 +7,7 @@ measured and contact is chaotic.
 from pathlib import Path
 
 import mujoco
+import numpy as np
 
 from envs import pendulum
 from envs.biteno import constants
@@ -21,16 +22,97 @@ BUILT_IN = {
 def spec(robot: str) -> mujoco.MjSpec:
     """Loads the MJCF of a robot as a spec, which can be changed before it is compiled.
 
+    It needs no other file: included files are part of it, and meshes, height fields and textures are left out
+    (`without_files`). Saved as XML, it loads again from any folder.
+
     Args:
       robot: the name of a built-in robot, or the path of an MJCF file, as in a log's `meta.yaml`.
 
     Raises:
-      ValueError: it is neither, or the file is no MJCF.
+      ValueError: it is neither, the file is no MJCF, or a file that it refers to is missing.
     """
     path = BUILT_IN[robot][0] if robot in BUILT_IN else Path(robot)
     if not path.is_file():
         raise ValueError(f"robot: got '{robot}', expected {', '.join(BUILT_IN)} or the path of an MJCF file")
-    return mujoco.MjSpec.from_file(str(path))
+    try:
+        return without_files(mujoco.MjSpec.from_file(str(path)))
+    except ValueError as error:
+        raise ValueError(f"robot: {path}: {error}") from error
+
+
+def without_files(spec: mujoco.MjSpec) -> mujoco.MjSpec:
+    """Returns a robot without what is stored in files of its own: meshes, height fields, skins and textures.
+
+    Bodies whose inertia follows from a mesh get it written out. Contacts of meshes are lost; on a test rig there are
+    none.
+
+    Args:
+      spec: of the robot; it may be changed.
+
+    Raises:
+      ValueError: a file is missing.
+    """
+    textures = [texture for texture in spec.textures if texture.file or any(texture.cubefiles)]
+    elements = (*spec.meshes, *spec.hfields, *spec.skins, *textures)
+    if not elements:
+        return spec
+    whole = spec.copy()
+    whole.compiler.fusestatic = whole.compiler.discardvisual = False
+    model = whole.compile()
+    from_geoms = spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
+    filed = (mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtGeom.mjGEOM_HFIELD)
+    for body, compiled in zip(spec.bodies, whole.bodies, strict=True):
+        # A primitive may be fitted to a mesh, which it then names.
+        mine = [geom for geom in body.geoms if geom.type in filed or geom.meshname]
+        if (mine or from_geoms) and body.name != "world":
+            _write_inertia(body, model, compiled.id)
+        for geom in mine:
+            spec.delete(geom)
+    spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
+    lost = {texture.name for texture in textures}
+    for material in spec.materials:
+        material.textures = ["" if name in lost else name for name in material.textures]
+    for element in elements:
+        spec.delete(element)
+    return spec
+
+
+def _write_inertia(body: mujoco.MjsBody, model: mujoco.MjModel, number: int) -> None:
+    body.explicitinertial = True
+    body.mass = model.body_mass[number]
+    body.ipos, body.iquat, body.inertia = (
+        getattr(model, f"body_{field}")[number] for field in ("ipos", "iquat", "inertia")
+    )
+    # The compiler refuses a body that has both forms of inertia.
+    body.fullinertia = np.full(6, np.nan)
+
+
+_PHYSICS = ("constraint", "equality", "frictionloss", "limit", "spring", "damper", "gravity")
+
+
+def check_flags(spec: mujoco.MjSpec, clear: bool = False) -> tuple[str, ...]:
+    """Refuses a model whose flags switch physics off that effects need, or clears these flags.
+
+    Args:
+      spec: of the robot; it is changed where flags are cleared.
+      clear: whether to clear them.
+
+    Returns:
+      Names of the flags that were cleared.
+
+    Raises:
+      ValueError: there are some, and they are not to be cleared.
+    """
+    bits = {name: int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name.upper()}")) for name in _PHYSICS}
+    off = tuple(name for name, bit in bits.items() if spec.option.disableflags & bit)
+    if off and not clear:
+        raise ValueError(
+            f"robot: option flag: got {', '.join(off)} disabled, expected enabled: no effect that works through it "
+            "could be seen. Correct the MJCF, or clear the flags with --clear-flags"
+        )
+    for name in off:
+        spec.option.disableflags &= ~bits[name]
+    return off
 
 
 def suspended(spec: mujoco.MjSpec) -> mujoco.MjModel:

@@ -30,6 +30,9 @@ from jaxtune.types import Effect, Parameter
 ByEffect = Mapping[str, Mapping[str, jax.Array]]
 """Coordinates or values by effect and parameter, [places] each."""
 
+System = tuple[mjx.Model, mjx.Data, jax.Array]
+"""A robot's model and first state in MJX, and the direction of gravity in its IMU's frame, [3]."""
+
 # Of MJX's solver. With friction in every joint, readings differ from those with twice as many iterations by 0.003 floor
 # units (rms over the rms of the noise floor). With four line searches it would be 0.2.
 _ITERATIONS, _LINE_SEARCHES = 4, 6
@@ -74,6 +77,7 @@ class Rig:
             if model.body_weldid[i] > 0 and model.body_mass[i] > 0 and model.body(i).name
         ]
         self._bodies = np.array(moving)
+        self.trees = model.dof_treeid[self.dof].copy()
         self.bodies = tuple(model.body(i).name for i in moving)
         self.mj_model = model
         # Joints that move but are neither controlled nor read; `check_matches` refuses a model that has some.
@@ -96,6 +100,24 @@ class Rig:
         self.axes = self._describe_axes()
         # The IMU is taken to sit on the first body, which carries the others.
         self._gravity = sensing.projected_gravity(jnp.asarray(model.body_quat[1], jnp.float32))
+
+    @property
+    def system(self) -> System:
+        """The numbers of this robot, which programs take as an argument; see `on`."""
+        # Not on a device yet: a program may run on several.
+        return jax.tree.map(np.asarray, (self._model, self._data, self._gravity))
+
+    @property
+    def layout(self) -> tuple:
+        """All that compiled programs depend on beside `system`: robots of equal layout can share them."""
+        addresses = (self.qpos.tobytes(), self.dof.tobytes(), self._bodies.tobytes())
+        return self.joints, self.bodies, self.dt, addresses, jax.tree.structure(self.system)
+
+    def on(self, system: System) -> "Rig":
+        """Returns the rig with another robot of the same layout on it, also inside a compiled program."""
+        other = copy.copy(self)
+        other._model, other._data, other._gravity = system
+        return other
 
     def check_matches(self, joints: Sequence[str], control_hz: float) -> None:
         """Checks that the rig can be compared with a log: its joints and rate, and no other joint that may move.
@@ -242,7 +264,7 @@ class Rig:
             for name, row in self.effects.items()
         }
 
-    def simulate(self, values: ByEffect, segment: Segment) -> dict[str, jax.Array]:
+    def simulate(self, values: ByEffect, segment: Segment, steps: jax.Array | None = None) -> dict[str, jax.Array]:
         """Simulates a segment of a log under one hypothesis.
 
         First the measured history before the segment fills the memories of the effects. Then the robot starts from its
@@ -251,6 +273,8 @@ class Rig:
         Args:
           values: of all effects, as `values` returns them.
           segment: the controller's inputs, and the motion measured before the segment.
+          steps: how many steps are simulated, all where None; later rows repeat zeros. As it may be traced, segments of
+            all lengths can share one program.
 
         Returns:
           Readings at the segment's rows by signal: `q`, `dq` and `tau` [rows, joints], `gravity` [rows, 3].
@@ -260,7 +284,7 @@ class Rig:
         before = len(segment.measured) - 1 - round(LONGEST_S / self.dt)
         drive = {
             name: getattr(segment, name)
-            for name in ("target", "feed", "stiffness", "damping", "limit", "emf", "sample")
+            for name in ("target", "between", "feed", "stiffness", "damping", "limit", "emf", "sample")
         }
         past = jax.tree.map(lambda x: x[:before], drive)
         future = jax.tree.map(lambda x: x[before:], drive)
@@ -288,12 +312,16 @@ class Rig:
             qacc=self._data.qacc.at[self.dof].set(acceleration[before]),
         )
 
-        def move(carry, x):
-            data, memory = carry
-            data, memory, read = chain.step(model, data, memory, values, x)
-            return (data, memory), read
+        def move(index, carry):
+            data, memory, reads = carry
+            data, memory, read = chain.step(model, data, memory, values, take(index))
+            return data, memory, jax.tree.map(lambda all, now: all.at[index].set(now), reads, read)
 
-        _, read = jax.lax.scan(move, (data, memory), future)
+        take = lambda index: jax.tree.map(lambda x: x[index], future)  # noqa: E731
+        count = len(future["sample"])
+        one = jax.eval_shape(lambda: chain.step(model, data, memory, values, take(0))[2])
+        reads = jax.tree.map(lambda x: jnp.zeros((count, *x.shape), x.dtype), one)
+        _, _, read = jax.lax.fori_loop(0, count if steps is None else steps, move, (data, memory, reads))
         # The rows of a log lie between steps of the simulation, so readings are interpolated.
         step, share = segment.row_step, segment.row_share[:, None]
         following = jnp.minimum(step + 1, len(future["sample"]) - 1)

@@ -21,6 +21,7 @@ def measure_scales(rig: Rig, runs: Sequence[Run]) -> dict[str, np.ndarray]:
 
         torque     rms(tau)                    Nm
         damping    rms(tau) / rms(dq)          Nm s/rad
+        quadratic  rms(tau) / rms(dq)^2        Nm s^2/rad^2
         stiffness  rms(tau) / 0.02             Nm/rad
         inertia    diagonal of the joint-space inertia in the mean pose, kg m^2
         mass       mass of the body            kg
@@ -51,6 +52,7 @@ def measure_scales(rig: Rig, runs: Sequence[Run]) -> dict[str, np.ndarray]:
     return {
         "torque": _rms(torque),
         "damping": _rms(torque) / _rms(speed),
+        "quadratic": _rms(torque) / _rms(speed) ** 2,
         "stiffness": _rms(torque) / 0.02,  # of a spring that winds up by 20 mrad under the rms torque
         "inertia": inertia,
         "mass": mass,

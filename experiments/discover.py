@@ -12,7 +12,7 @@ from experiments.common import checkpoint
 from experiments.common.cli import bars, console, run
 from experiments.discovery import gate, report
 from experiments.discovery.investigate import investigate
-from experiments.discovery.setup import HORIZONS_S, read_logs
+from experiments.discovery.setup import read_logs
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,9 +24,9 @@ class Args:
     too."""
     out: Path = Path("runs/discover")
     """Folder of the results. The same command with the same folder continues after the last accepted effect."""
-    horizons: tuple[float, ...] = HORIZONS_S
+    horizons: tuple[float, ...] | None = None
     """Three increasing lengths in s. Runs are cut into segments of each length, which are simulated from their measured
-    first state."""
+    first state. Lengths that fit the rate of the rows if not given."""
     healthy: int = 20
     """Number of null logs: simulated logs in which no effect is missing. They set the noise floor and the
     thresholds."""
@@ -65,8 +65,9 @@ def main(args: Args) -> None:
 
 
 def _check(args: Args) -> None:
-    if len(args.horizons) != 3 or sorted(set(args.horizons)) != list(args.horizons) or args.horizons[0] <= 0:
-        raise ValueError(f"horizons: got {args.horizons}, expected three increasing lengths in s, all above zero")
+    lengths = args.horizons
+    if lengths is not None and (len(lengths) != 3 or sorted(set(lengths)) != list(lengths) or lengths[0] <= 0):
+        raise ValueError(f"horizons: got {lengths}, expected three increasing lengths in s, all above zero")
     if args.healthy < 2:
         raise ValueError(f"healthy: got {args.healthy}, expected 2 or more")
 

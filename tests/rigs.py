@@ -87,6 +87,7 @@ def segment(rig, start, target, kp=0.0, kd=0.0, limit=np.inf, feed=0.0, emf=0.0,
     every = round(1.0 / rig.control_hz / rig.dt)
     return Segment(
         target=target.astype(np.float32),
+        between=np.zeros_like(target, np.float32),
         **{name: np.broadcast_to(value, target.shape).astype(np.float32) for name, value in held.items()},
         sample=(np.arange(len(target)) - before) % every == 0,
         measured=measured.astype(np.float32),

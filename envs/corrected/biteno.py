@@ -118,6 +118,7 @@ class CorrectedBiteno(Biteno):
             "damping": -model.actuator_biasprm[:, 2],
             "limit": model.actuator_forcerange[:, 1],
             "emf": none,
+            "between": none,
             "sample": jnp.ones((), bool),
         }
 

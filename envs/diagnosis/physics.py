@@ -14,7 +14,7 @@ import numpy as np
 from envs.diagnosis.disagreement import Disagreement, relative_difference
 from envs.diagnosis.finding import MEASURED, Finding
 from envs.logs import Run
-from envs.segments import quantum_of
+from envs.readings import quantum_of
 
 # A repair is believed if the disagreement falls by more than both of these.
 _BETTER = 0.25  # in units of one joint's whole signal
@@ -186,7 +186,7 @@ def _drift(run: Run, disagreement: Disagreement) -> list[Finding]:
 
 def _coarse(run: Run, joints: tuple[str, ...]) -> list[Finding]:
     """Finds positions that were rounded more coarsely than the motion allows."""
-    quantum = quantum_of(run.signals["q"])
+    quantum = quantum_of(run.signals["q"]).max()
     if not _is_coarse(run):
         return []
     text = f"quantisation: positions come in steps of {quantum:.3g} rad; smaller motion cannot be seen"
@@ -194,7 +194,7 @@ def _coarse(run: Run, joints: tuple[str, ...]) -> list[Finding]:
 
 
 def _is_coarse(run: Run) -> bool:
-    return quantum_of(run.signals["q"]) > _COARSE * float(np.median(np.ptp(run.signals["q"], axis=0)))
+    return quantum_of(run.signals["q"]).max() > _COARSE * float(np.median(np.ptp(run.signals["q"], axis=0)))
 
 
 _SENTENCES: Mapping[str, str] = {

@@ -16,10 +16,8 @@ Bounds, priors and sizes in the rows are coordinates (`jaxtune.types.Parameter`)
 name, or in units of its `scale` where it has one; logarithms for ratios, reciprocals for limits and stiffnesses.
 """
 
-from envs.effects import actuator, contact, external, inertia, joint_friction, sensing, transmission
-
-RESIDUAL = external.RESIDUAL
-"""The torque that discovery fits to what no effect explains; it is not a hypothesis (`envs.effects.external`)."""
+from envs.effects import actuator, contact, external, inertia, joint_friction, nominal, sensing, transmission
+from envs.effects.learned import LEARNED
 
 LIBRARY = {
     row.name: row
@@ -28,5 +26,8 @@ LIBRARY = {
 }
 """All effects that can be named, by name."""
 
-EVERY = {**LIBRARY, RESIDUAL.name: RESIDUAL}
-"""The library and the residual torque, in the order in which they act."""
+NOMINAL = {row.name: row for row in nominal.ROWS}
+"""Rows that are fitted under every hypothesis and cannot be named as missing, by name."""
+
+EVERY = {**NOMINAL, **LIBRARY, LEARNED.name: LEARNED}
+"""All rows, in the order in which they act."""

@@ -11,6 +11,13 @@ import numpy as np
 GAINS = {"pd": ("kp", "kd", "torque_limit_nm"), "servo": ("gain", "kt", "resistance_ohm")}
 """Names of a controller's numbers by its type; each is given for all joints or one per joint."""
 
+OPTIONAL_GAINS = {"pd": ("kt",), "servo": ("volts",)}
+"""Further numbers that a controller may have: the torque constant, for logs of motor currents, and the supply voltage,
+where it was not recorded."""
+
+BETWEEN_ROWS = ("hold", "linear", "unknown")
+"""How targets go on between two rows of a log: held until the next row, in a straight line to it, or unknown."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Impedance:
@@ -42,7 +49,8 @@ class Impedance:
           [..., joints] Nm.
         """
         torque = self.stiffness * (target - position) - self.damping * velocity
-        return np.clip(torque, -self.limit, self.limit)
+        # As np.clip, which takes several times as long for a few joints.
+        return np.minimum(np.maximum(torque, -self.limit), self.limit)
 
     def __getitem__(self, index) -> "Impedance":
         """Takes some rows (or joints, of one without rows), as of an array."""
@@ -74,18 +82,23 @@ class Controller:
     rate_hz: float
     """How often it reads the joint; its torque is held in between."""
     gains: Mapping[str, np.ndarray]
-    """[joints] by name, the names of `GAINS`: kp Nm/rad, kd Nm s/rad, torque_limit_nm Nm; gain 1/rad, kt Nm/A at the
-    joint, resistance_ohm Ohm."""
+    """[joints] by name, the names of `GAINS` and, where they are known, `OPTIONAL_GAINS`: kp Nm/rad, kd Nm s/rad,
+    torque_limit_nm Nm; gain 1/rad, kt Nm/A at the joint, resistance_ohm Ohm, volts V."""
+    between_rows: str = "unknown"
+    """How targets go on between two rows, one of `BETWEEN_ROWS`."""
 
     def impedance(self, enabled: np.ndarray | None = None, volts: np.ndarray | None = None) -> Impedance:
         """Writes the controller as a limited spring and damper, the same form for both types.
 
         Args:
           enabled: [rows], 0 where the motors are switched off and 1 elsewhere; always on where None.
-          volts: [rows] V, the supply; a servo needs it, a PD controller ignores it.
+          volts: [rows] V, the recorded supply; where None, a servo takes its gain `volts`. A PD controller ignores it.
 
         Returns:
           Of shapes [rows, joints], or [joints] where nothing that was given has rows.
+
+        Raises:
+          ValueError: a servo has neither.
         """
         gains, on = self.gains, 1.0 if enabled is None else np.asarray(enabled)[..., None]
         if self.kind == "pd":
@@ -97,7 +110,10 @@ class Controller:
                 limit=np.where(on > 0, gains["torque_limit_nm"], 0.0),
                 back_emf=np.zeros_like(stiffness),
             )
-        stall = on * np.asarray(volts)[..., None] * gains["kt"] / gains["resistance_ohm"]
+        if volts is None and "volts" not in gains:
+            raise ValueError("controller.volts: is missing, and so is a column 'volts'; a servo needs one of them")
+        supply = gains["volts"] if volts is None else np.asarray(volts)[..., None]
+        stall = on * supply * gains["kt"] / gains["resistance_ohm"]
         return Impedance(
             stiffness=stall * gains["gain"],
             damping=np.zeros_like(stall),

@@ -10,7 +10,9 @@ import yaml
 
 from envs.logs.bags import SUFFIXES, is_bag, read_bag
 from envs.logs.format import (
+    FACTS,
     JOINT_SIGNALS,
+    MEASURED,
     SCALAR_SIGNALS,
     VECTOR_SIGNALS,
     Controller,
@@ -96,6 +98,8 @@ def write(log: Log, folder: Path, suffix: str = ".csv") -> None:
         "controller": _as_meta(log.runs[0].controller),
         "runs": {},
     }
+    if known := _facts_as_meta(log):
+        meta["signals"] = known
     if log.policy is not None:
         meta["policy"] = dict(log.policy)
     for run in log.runs:
@@ -115,7 +119,23 @@ def write(log: Log, folder: Path, suffix: str = ".csv") -> None:
 def _as_meta(controller: Controller) -> dict:
     # No limit is an infinite one, which `meta.yaml` expresses by leaving it out.
     gains = {name: values.tolist() for name, values in controller.gains.items() if np.isfinite(values).all()}
-    return {"type": controller.kind, "rate_hz": controller.rate_hz, **gains}
+    own = {"type": controller.kind, "rate_hz": controller.rate_hz, "target_between_rows": controller.between_rows}
+    return own | gains
+
+
+def _facts_as_meta(log: Log) -> dict:
+    """Writes what is known of every column that the first run has; all runs must know the same."""
+    first, found = log.runs[0], {}
+    for run in log.runs:
+        for signal, fact in ((signal, fact) for signal in MEASURED if signal in run.signals for fact in FACTS):
+            values = run.fact(signal, fact)
+            same = signal in first.signals and np.array_equal(values, first.fact(signal, fact), equal_nan=True)
+            if not same and np.isfinite(values).any():
+                raise ValueError(f"{run.name}: {signal}: got another {fact} than in {first.name}, expected one")
+            for column, value in zip(column_names(signal, log.joints), values, strict=True):
+                if np.isfinite(value):
+                    found.setdefault(column, {})[fact] = float(value)
+    return found
 
 
 def _run(path: Path, meta: Meta, needed: str) -> Run:
@@ -131,8 +151,14 @@ def _run(path: Path, meta: Meta, needed: str) -> Run:
     rate = 1.0 / np.median(np.diff(time))
     if not 1 / _RATE_RATIO <= rate / meta.rate_hz <= _RATE_RATIO:
         raise ValueError(f"{path}, column 't': got {rate:.6g} rows a second, expected rate_hz, {meta.rate_hz:g}")
-    signals = _signals(path, columns, meta, needed)
+    signals = _signals(path, columns, meta)
     entry = meta.runs.get(path.stem, {"controller": meta.controller})
+    known = {signal: dict(facts) for signal, facts in meta.facts.items() if signal in signals}
+    _convert(path, signals, known, meta, entry["controller"])
+    if needed not in signals:
+        raise ValueError(f"{path}, column '{column_names(needed, meta.joints)[0]}': is missing")
+    if not {"target", "tau"} & set(signals):
+        raise ValueError(f"{path}: there is neither '{column_names('target', meta.joints)[0]}' nor 'tau' or 'current'")
     return Run(
         name=path.stem,
         condition=entry.get("condition", path.stem),
@@ -141,11 +167,12 @@ def _run(path: Path, meta: Meta, needed: str) -> Run:
         time=time,
         signals=signals,
         other=columns,
+        known=known,
     )
 
 
-def _signals(path: Path, columns: dict[str, np.ndarray], meta: Meta, needed: str) -> dict[str, np.ndarray]:
-    """Takes the signals out of the columns and converts them to the model's units and signs."""
+def _signals(path: Path, columns: dict[str, np.ndarray], meta: Meta) -> dict[str, np.ndarray]:
+    """Takes the signals out of the columns and checks them."""
     signals = {}
     for signal in (*JOINT_SIGNALS, *VECTOR_SIGNALS, *SCALAR_SIGNALS):
         names = column_names(signal, meta.joints)
@@ -159,20 +186,37 @@ def _signals(path: Path, columns: dict[str, np.ndarray], meta: Meta, needed: str
         for name, one in zip(names, values, strict=True):
             check_values(path, signal, meta.columns.get(name, name), one)
         signals[signal] = np.stack(values, axis=1) if len(names) > 1 or "." in names[0] else values[0]
-    if needed not in signals:
-        raise ValueError(f"{path}, column '{column_names(needed, meta.joints)[0]}': is missing")
-    if not {"target", "tau"} & set(signals):
-        raise ValueError(f"{path}: there is neither '{column_names('target', meta.joints)[0]}' nor 'tau'")
     for signal in ("gravity", "quat"):
         if signal in signals:
             norm = np.linalg.norm(signals[signal], axis=1)
             refuse_first(path, f"{signal}.*", norm, abs(norm - 1) > _UNIT_NORM, "a vector of length one")
-    # Actions keep their unit and sign: they are the policy's, not the model's.
-    sign = np.array([meta.signs[joint] for joint in meta.joints])
-    for signal, factor in {"q": meta.angle, "dq": meta.angle, "target": meta.angle, "tau": meta.torque}.items():
-        if signal in signals:
-            signals[signal] = signals[signal] * factor * sign
     return signals
+
+
+def _convert(path: Path, signals: dict, known: dict, meta: Meta, controller: Controller) -> None:
+    """Converts signals, and what is known of them, to the model's units and signs, and currents to torques."""
+    # Actions keep their unit and sign: they are the policy's, not the model's.
+    unit = dict.fromkeys(("q", "dq", "target"), meta.angle) | dict.fromkeys(("tau", "abs_tau"), meta.torque)
+    sign = np.array([meta.signs[joint] for joint in meta.joints])
+    for signal in (*unit, "current"):
+        if signal in signals:
+            factor = unit.get(signal, 1.0)
+            signals[signal] = signals[signal] * factor * (1.0 if signal == "abs_tau" else sign)
+            _scale(known.get(signal, {}), factor)
+    if "current" in signals and "tau" not in signals:
+        if "kt" not in controller.gains:
+            name = column_names("current", meta.joints)[0]
+            raise ValueError(f"{path}, column '{name}': {meta.path}: controller.kt: is missing, in Nm/A at the joint")
+        signals["tau"] = controller.gains["kt"] * signals.pop("current")
+        if "current" in known:
+            known["tau"] = known.pop("current")
+            _scale(known["tau"], controller.gains["kt"])
+
+
+def _scale(facts: dict[str, np.ndarray], factor) -> None:
+    for name in ("noise_sd", "quantum"):
+        if name in facts:
+            facts[name] = facts[name] * factor
 
 
 def _rename(path: Path, columns: dict[str, np.ndarray], meta: Meta) -> dict[str, np.ndarray]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from envs.logs.controller import Controller, Impedance
 
-JOINT_SIGNALS = ("q", "dq", "target", "tau", "action")
+JOINT_SIGNALS = ("q", "dq", "target", "tau", "abs_tau", "current", "action")
 """Signals with a column for every joint."""
 
 VECTOR_SIGNALS = {
@@ -29,6 +29,14 @@ VECTOR_SIGNALS = {
 
 SCALAR_SIGNALS = ("enabled", "volts")
 """Signals with one column."""
+
+MEASURED = ("q", "dq", "tau", "abs_tau", "current", "gyro", "acc", "gravity", "vel", "pos", "quat", "volts")
+"""Signals that sensors read, of which `meta.yaml` may say what is known (`Run.known`)."""
+
+FACTS = ("filter_hz", "offset_s", "noise_sd", "quantum")
+"""What may be known of a signal: the corner frequency of the low-pass filter that it went through, in Hz; by how much
+later than the row's `t` it was read (earlier where negative), in s; the standard deviation of its noise, and the step
+of its rounding, both in the signal's unit."""
 
 SPLITS = ("train", "select", "sealed")
 """Parts of a log: the runs that are fitted (train), the validation set (select), and the held-out test, which is read
@@ -59,6 +67,19 @@ class Run:
     rad/s, phases in cycles. `gyro`, `acc`, `vel` and the unit vector `gravity` are in the body frame."""
     other: Mapping[str, np.ndarray] = field(default_factory=dict)
     """Columns that the format does not know, [rows] by name, unchanged."""
+    known: Mapping[str, Mapping[str, np.ndarray]] = field(default_factory=dict)
+    """What is known of a signal's columns, [columns] by signal and name (`FACTS`), NaN where it is not known. Signals
+    are never changed by it: who uses them corrects them (`envs.readings`)."""
+
+    def fact(self, signal: str, name: str) -> np.ndarray:
+        """Returns what is known of a signal's columns, [columns], NaN where it is not known.
+
+        Args:
+          signal: one of the run's signals.
+          name: one of `FACTS`.
+        """
+        columns = self.signals[signal].shape[1:] or (1,)
+        return self.known.get(signal, {}).get(name, np.full(columns, np.nan))
 
     def impedance(self) -> Impedance:
         """Returns the controller's impedance at every row, [rows, joints]; zero where the motors were switched off.
@@ -90,6 +111,8 @@ class Log:
     policy: Mapping[str, Any] | None
     """`rate_hz`, `action_scale` and `base` of the policy that was running; None where none was."""
     runs: tuple[Run, ...]
+    notes: tuple[str, ...] = ()
+    """Sentences about what was made of the log since it was read; they are not written."""
 
 
 def splits(log: Log) -> dict[str, tuple[Run, ...]]:

@@ -13,9 +13,11 @@ import mujoco
 import numpy as np
 import yaml
 
-from envs.logs.controller import GAINS, Controller
+from envs.logs.controller import BETWEEN_ROWS, GAINS, OPTIONAL_GAINS, Controller
 from envs.logs.format import (
+    FACTS,
     JOINT_SIGNALS,
+    MEASURED,
     SCALAR_SIGNALS,
     SPLITS,
     VECTOR_SIGNALS,
@@ -31,6 +33,7 @@ _META = {
     "rate_hz": True,
     "joints": True,
     "controller": True,
+    "signals": False,
     "units": False,
     "sign": False,
     "columns": False,
@@ -56,6 +59,10 @@ class _Loader(yaml.SafeLoader):
                     None, None, f"key {_short.repr(key)} is there twice", node.start_mark
                 )
         return super().construct_mapping(node, deep)
+
+
+def _is_column(item: tuple[str, Any]) -> bool:
+    return "." in item[0]
 
 
 class Meta:
@@ -99,6 +106,7 @@ class Meta:
         # One column of a file cannot be two signals.
         if len(set(self.columns.values())) < len(self.columns):
             self._refuse("columns", self.columns, "another column of the file for each name")
+        self.facts = self._read_facts(meta.get("signals"))
         policy = {"rate_hz": False, "action_scale": False, "base": False}
         self.policy = None
         if meta.get("policy") is not None:
@@ -119,6 +127,24 @@ class Meta:
         signals = (*JOINT_SIGNALS, *VECTOR_SIGNALS, *SCALAR_SIGNALS)
         return [name for signal in signals for name in column_names(signal, self.joints)]
 
+    def _read_facts(self, entry: Any) -> dict[str, dict[str, np.ndarray]]:
+        """Reads what is known of signals, [columns] by signal and fact; a column's own entry counts for it."""
+        columns = {name: column_names(name, self.joints) for name in MEASURED}
+        places = {name: (name, slice(None)) for name in MEASURED} | {
+            column: (name, slice(i, i + 1)) for name, own in columns.items() for i, column in enumerate(own) if own[1:]
+        }
+        read = {}
+        # Whole signals come before their columns, whatever their order in the file.
+        for place, facts in sorted(self._mapping("signals", entry, dict.fromkeys(places)).items(), key=_is_column):
+            signal, index = places[place]
+            for name, value in self._mapping(f"signals.{place}", facts, dict.fromkeys(FACTS, False)).items():
+                where = f"signals.{place}.{name}"
+                zero, negative = name in ("noise_sd", "quantum"), name == "offset_s"
+                number = self._number(where, value, zero=zero, negative=negative)
+                facts_of = read.setdefault(signal, {})
+                facts_of.setdefault(name, np.full(len(columns[signal]), np.nan))[index] = number
+        return read
+
     def _read_run(self, name: str, entry: Any) -> dict:
         where = f"runs.{name}"
         entry = self._mapping(where, entry, {"condition": False, "split": False, "controller": False})
@@ -137,10 +163,16 @@ class Meta:
     def _read_controller(self, where: str, entry: Any) -> Controller:
         entry = self._mapping(where, entry, None)
         kind = self._one_of(f"{where}.type", entry.get("type"), GAINS)
-        self._mapping(where, entry, {"type": True, "rate_hz": True} | {n: n != "torque_limit_nm" for n in GAINS[kind]})
-        gains = {name: self._gain(f"{where}.{name}", entry.get(name, np.inf), name) for name in GAINS[kind]}
-        rate = self._number(f"{where}.rate_hz", entry["rate_hz"])
-        return Controller(kind=kind, rate_hz=rate, gains=gains)
+        own = {name: name != "torque_limit_nm" for name in GAINS[kind]} | dict.fromkeys(OPTIONAL_GAINS[kind], False)
+        self._mapping(where, entry, {"type": True, "rate_hz": True, "target_between_rows": False} | own)
+        there = [name for name in own if name in GAINS[kind] or name in entry]
+        between = entry.get("target_between_rows", "unknown")
+        return Controller(
+            kind=kind,
+            rate_hz=self._number(f"{where}.rate_hz", entry["rate_hz"]),
+            gains={name: self._gain(f"{where}.{name}", entry.get(name, np.inf), name) for name in there},
+            between_rows=self._one_of(f"{where}.target_between_rows", between, BETWEEN_ROWS),
+        )
 
     def _gain(self, where: str, value: Any, name: str) -> np.ndarray:
         if name == "torque_limit_nm" and value is np.inf:
@@ -194,16 +226,18 @@ class Meta:
             self._refuse(where, value, "a text")
         return value
 
-    def _number(self, where: str, value: Any, *, zero: bool = False) -> float:
-        """Checks for a finite number that is positive or, with `zero`, not negative."""
+    def _number(self, where: str, value: Any, *, zero: bool = False, negative: bool = False) -> float:
+        """Checks for a finite number that is positive or, with `zero`, not negative, or, with `negative`, any."""
+        least = -_LARGEST if negative else 0
         # In Python, booleans are integers.
         if (
             isinstance(value, bool)
             or not isinstance(value, int | float)
-            or not 0 <= value < _LARGEST
-            or (value == 0 and not zero)
+            or not least <= value < _LARGEST
+            or (value == 0 and not (zero or negative))
         ):
-            self._refuse(where, value, "a number that is not negative" if zero else "a positive number")
+            wanted = "a number" if negative else "a number that is not negative" if zero else "a positive number"
+            self._refuse(where, value, wanted)
         return float(value)
 
     def _one_of(self, where: str, value: Any, allowed) -> Any:

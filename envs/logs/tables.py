@@ -29,7 +29,9 @@ def check_time(path: Path, name: str, time: np.ndarray) -> None:
 
 
 def check_values(path: Path, signal: str, name: str, values: np.ndarray) -> None:
-    """Refuses values that a signal cannot have: flags are 0 or 1, phases 0 to 1 cycle, the supply not negative.
+    """Refuses values that a signal cannot have.
+
+    Flags are 0 or 1, phases 0 to 1 cycle; the supply and torques without a sign are not negative.
 
     Args:
       path: of the file, for the message.
@@ -44,7 +46,7 @@ def check_values(path: Path, signal: str, name: str, values: np.ndarray) -> None
         refuse_first(path, name, values, (values != 0) & (values != 1), "0 or 1")
     elif signal == "phase":
         refuse_first(path, name, values, (values < 0) | (values > 1), "0 to 1 cycle")
-    elif signal == "volts":
+    elif signal in ("volts", "abs_tau"):
         refuse_first(path, name, values, values < 0, "a number that is not negative")
 
 

@@ -1,19 +1,96 @@
 """Cuts logs into the segments that discovery works on, by split (train, select, sealed) and horizon."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import jax
 import numpy as np
 
 from envs import segments
-from envs.logs import Log, splits
+from envs.logs import Log, Run, splits
 from envs.regimes import regimes
 from jaxtune.discovery.problem import Segments
 
 BIN_S = 0.01
 """Time in s over which residuals are averaged."""
 
+HORIZONS_S = (0.05, 0.15, 0.45)
+"""Default lengths in s of the segments that are simulated, for rows that are fast enough. Short ones stay close to the
+measurement; long ones show biases and delays."""
+
+_HORIZON_ROWS = (4, 12, 36)  # least lengths by default; the first is the least of all
+_PARTS = {"train": (0.0, 0.5), "select": (0.5, 0.75), "sealed": (0.75, 1.0)}  # of a run that is cut in time
+_LEAST_ROWS = 8  # of such a part
 _LEAST_SEGMENTS = 3  # of a split: a bootstrap needs a few to draw from
+
+
+def row_rate(log: Log) -> float:
+    """Returns the rows a second by the time stamps of a log, in Hz."""
+    return 1.0 / float(np.median([np.median(np.diff(run.time)) for run in log.runs]))
+
+
+def fitting_horizons(log: Log, asked: Sequence[float] | None = None) -> tuple[float, ...]:
+    """Returns lengths of segments in s that fit the rows of a log.
+
+    Args:
+      log: as it was read.
+      asked: the lengths; where None, `HORIZONS_S`, or 4, 12 and 36 rows where these are longer.
+
+    Raises:
+      ValueError: a length that was asked for has fewer than four rows.
+    """
+    rate = row_rate(log)
+    if asked is None:
+        return tuple(max(length, rows / rate) for length, rows in zip(HORIZONS_S, _HORIZON_ROWS, strict=True))
+    if round(min(asked) * rate) < _HORIZON_ROWS[0]:
+        raise ValueError(
+            f"horizons: got {min(asked):g} s, expected {_HORIZON_ROWS[0] / rate:.3g} s or more, which are "
+            f"{_HORIZON_ROWS[0]} of {rate:.0f} rows a second"
+        )
+    return tuple(asked)
+
+
+def split_in_time(log: Log) -> Log:
+    """Cuts every run into three, for train, select and sealed, where a log has too few conditions to be split by them.
+
+    The first half of a run is fitted, the third quarter decides, and the last is the held-out test. Between two parts
+    the history of a segment is left out, so that they share no readings.
+
+    Args:
+      log: as it was read. One that names splits, or has three conditions, is returned as it is.
+
+    Returns:
+      The log, with a note if it was cut.
+
+    Raises:
+      ValueError: a run is too short.
+    """
+    conditions = {run.condition for run in log.runs}
+    if len(conditions) >= len(_PARTS) or any(run.split for run in log.runs):
+        return log
+    note = (
+        f"the log has {len(conditions)} condition(s), too few to split by: its runs were cut in time, so the held-out "
+        "test is on the same motion, later"
+    )
+    runs = tuple(_part(run, split) for run in log.runs for split in _PARTS)
+    return replace(log, runs=runs, notes=(*log.notes, note))
+
+
+def _part(run: Run, split: str) -> Run:
+    begin, end = (run.time[0] + share * (run.time[-1] - run.time[0]) for share in _PARTS[split])
+    later = begin + segments.HISTORY_S if begin > run.time[0] else begin
+    rows = (run.time >= later) & (run.time <= end)
+    if rows.sum() < _LEAST_ROWS:
+        raise ValueError(f"{run.name}: got {rows.sum()} rows for '{split}', expected {_LEAST_ROWS}: record longer runs")
+    return replace(
+        run,
+        name=f"{run.name}_{split}",
+        condition=f"{run.condition}_{split}",
+        split=split,
+        time=run.time[rows],
+        signals={name: values[rows] for name, values in run.signals.items()},
+        other={name: values[rows] for name, values in run.other.items()},
+    )
 
 
 def cut_log(log: Log, dt: float, signals: Sequence[str], horizons: Sequence[float]) -> dict[str, dict[float, Segments]]:
@@ -50,6 +127,7 @@ def cut_log(log: Log, dt: float, signals: Sequence[str], horizons: Sequence[floa
             data[split][horizon] = Segments(
                 inputs=jax.tree.map(lambda leaf, mine=mine: leaf[mine], cut.segments),
                 signals={name: cut.signals[name][mine] for name in signals},
+                steps=cut.segments.target.shape[1] - round(segments.HISTORY_S / dt),
                 run=cut.run[mine],
                 regimes=label[mine],
             )

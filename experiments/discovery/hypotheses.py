@@ -1,5 +1,6 @@
-"""Lists the hypotheses of discovery: every effect at every place alone, at left and right pairs, and at all places."""
+"""Lists the hypotheses of discovery: every effect at every place alone, and at sets of places that are alike."""
 
+import re
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -7,6 +8,9 @@ import numpy as np
 from envs.axes import Axis
 from jaxtune.discovery.problem import Hypothesis
 from jaxtune.types import Effect
+
+_LARGE = 0.7  # of the bounds: the largest size that is screened
+_BENT, _STRAIGHT = 5, 3  # sizes of an effect without a slope at zero, and of one with
 
 
 def hypotheses(
@@ -28,32 +32,84 @@ def hypotheses(
     )
 
 
+_RIGHT = {"left": "right", "l": "r", "fl": "fr", "rl": "rr", "hl": "hr", "bl": "br"}
+_RIGHT |= {"lf": "rf", "lr": "rr", "lh": "rh", "lb": "rb"}
+_SIDES = {*_RIGHT, *_RIGHT.values(), "front", "rear", "hind", "back"}
+_WORDS = re.compile(r"left|right|[a-z0-9]+?(?=left|right|[^a-z0-9]|$)", re.IGNORECASE)
+
+
 def place_sets(places: Sequence[str]) -> list[tuple[str, ...]]:
-    """Lists the sets of places at which an effect is tried: each place alone, left and right pairs, and all together.
+    """Lists the sets of places at which an effect is tried.
 
-    Pairs and all places are common in robots (the same motor in both knees), and one size for all of them is easier to
-    confirm than a size for each.
+    They are each place alone, pairs of left and right, all of one kind on several legs (such as four calves), and all
+    places. Such sets are common in robots (the same motor in both knees), and one size for all of them is easier to
+    confirm than a size for each. Sides are words of a name: `left`, `L`, `FL` (front left), `LH` (left hind), `rear`.
     """
-    pairs = [(one, one.replace("left", "right")) for one in places if "left" in one]
-    sets = [(place,) for place in places] + [pair for pair in pairs if pair[1] in places]
-    return sets if len(places) < 2 or tuple(places) in sets else [*sets, tuple(places)]
+    pairs = [(one, _mirrored(one)) for one in places if _mirrored(one) in places]
+    kinds: dict[str, list[str]] = {}
+    for place in places:
+        kinds.setdefault(_kind(place), []).append(place)
+    several = [tuple(kind) for kind in kinds.values() if len(kind) > 1]
+    sets = [(place,) for place in places] + pairs + several + [tuple(places)]
+    # The first of several in another order.
+    return list({frozenset(one): one for one in reversed(sets)}.values())[::-1]
 
 
-def timing_directions(axes: Sequence[Axis], control_hz: float) -> np.ndarray:
-    """Returns two directions in the rig's coordinates: a delay of all readings, and a delay of all targets.
+def _mirrored(place: str) -> str | None:
+    """Returns the name of the same place on the right, or None for a place that is not on the left."""
+    for word in _WORDS.finditer(place):
+        right = _RIGHT.get(word[0].lower())
+        if right is not None:
+            right = right.upper() if word[0].isupper() else right.title() if word[0].istitle() else right
+            return place[: word.start()] + right + place[word.end() :]
+    return None
 
-    A log does not say when within its period the controller read and acted. So discovery leaves both delays free under
-    every hypothesis; otherwise `command_delay` or `sensor_delay` would be named for a robot that has neither.
+
+def _kind(place: str) -> str:
+    """Returns a name without its side."""
+    return _WORDS.sub(lambda word: "" if word[0].lower() in _SIDES else word[0], place)
+
+
+def timing_directions(axes: Sequence[Axis], control_hz: float) -> tuple[np.ndarray, np.ndarray]:
+    """Returns directions in the rig's coordinates along what a log does not say of its times, and their bounds.
+
+    They are a delay of all readings, a delay of all targets, and the share in which targets move on between two rows. A
+    log does not say when within its period the controller read and acted. So discovery leaves these free under every
+    hypothesis; otherwise `command_delay` or `sensor_delay` would be named for a robot that has neither.
 
     Args:
       axes: coordinates of the rig.
       control_hz: rate of the controller in Hz.
 
     Returns:
-      [2, axes], each of the size of half a period.
+      [3, axes] of the size of half a period or of half the way between rows, and [3, 2] least and largest coordinate.
     """
-    late = [[axis.effect == effect for axis in axes] for effect in ("sensor_delay", "command_delay")]
-    return np.array(late, float) * 0.5 / control_hz
+    half = {"sensor_delay": 0.5 / control_hz, "command_delay": 0.5 / control_hz, "target_between_rows": 0.5}
+    directions = [[size * (axis.effect == effect) for axis in axes] for effect, size in half.items()]
+    # Nothing acts before it is time, and nothing is later than a whole period.
+    return np.array(directions, float), np.tile([0.0, 2.0], (len(half), 1))
+
+
+def learned_torque(axes: Sequence[Axis], row: Effect) -> Hypothesis:
+    """Makes the hypothesis of a learned torque, in which every parameter at every joint is a coordinate of its own.
+
+    Args:
+      axes: coordinates of the rig.
+      row: the learned torque.
+    """
+    mine = [number for number, axis in enumerate(axes) if axis.effect == row.name]
+    parameters = {parameter.name: parameter for parameter in row.parameters}
+    each = [parameters[axes[number].parameter] for number in mine]
+    return Hypothesis(
+        name=row.name,
+        family=row.family,
+        places=tuple(dict.fromkeys(axes[number].place for number in mine)),
+        directions=np.eye(len(axes))[mine],
+        probes=row.sizes[0] * np.eye(len(mine)),
+        bounds=np.array([parameter.bounds for parameter in each], float),
+        prior=np.array([parameter.prior for parameter in each], float),
+        joints=(),
+    )
 
 
 def _hypothesis(axes: Sequence[Axis], index: Mapping, row: Effect, places: tuple[str, ...]) -> Hypothesis:
@@ -73,24 +129,35 @@ def _hypothesis(axes: Sequence[Axis], index: Mapping, row: Effect, places: tuple
         family=row.family,
         places=places,
         directions=directions,
-        probes=_probes(row),
+        probes=_probes(row, bounds[0, 0]),
         bounds=bounds,
         prior=np.array([parameter.prior for parameter in row.parameters]),
         joints=tuple(sorted({joint for axis in first for joint in axes[axis].joints})),
     )
 
 
-def _probes(row: Effect) -> np.ndarray:
+def _probes(row: Effect, least: float) -> np.ndarray:
     """Returns the coordinates [probes, parameters] at which the screen simulates an effect.
 
     Shape parameters, such as the speed scale of Stribeck friction, stay zero, since they mean nothing without a size.
-    If an effect has several sizes (x, y, z), each is tried alone.
+    If an effect has several sizes (x, y, z), each is tried alone. Else sizes grow by a constant factor, to where the
+    effect is large; more of them where it has no slope at zero. What can be subtracted is tried with both signs.
+
+    Args:
+      row: the effect.
+      least: smallest coordinate.
     """
     free = [number for number, parameter in enumerate(row.parameters) if not parameter.shape]
     if len(free) > 1:
         probes = np.zeros((len(free), len(row.parameters)))
         probes[np.arange(len(free)), free] = row.sizes[0]
         return probes
-    probes = np.zeros((len(row.sizes), len(row.parameters)))
-    probes[:, free[0]] = row.sizes
+    most, bends = row.parameters[free[0]].bounds[1], len(row.sizes) > 1
+    sizes = np.geomspace(row.sizes[0], _LARGE * most, _BENT if bends else _STRAIGHT)
+    below = [-size for size in sizes if -size > _LARGE * least]
+    # Armature and damping can be lowered by less than their smallest size of interest.
+    below = below or ([0.5 * least] if least < 0 else [])
+    values = np.array([*below, *sizes])
+    probes = np.zeros((len(values), len(row.parameters)))
+    probes[:, free[0]] = values
     return probes

@@ -72,5 +72,5 @@ def investigate(
     summary = summarise(question, result) | stamp
     write_json(out / "summary.json", summary)
     write_json(out / "details.json", details(question, result, free))
-    corrected.save(out / "model", spec, question.rig, (result.residual or result.fit).vector)
+    corrected.save(out / "model", spec, question.rig, result.model)
     return Answer(log=log, question=question, result=result, summary=summary, free=free)

@@ -1,27 +1,27 @@
 """Turns measured logs and a nominal model into the problem that discovery works on."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from envs import models, segments
-from envs.effects import LIBRARY, RESIDUAL
-from envs.logs import Log, read, read_xl330, splits
+from envs import models, readings, segments
+from envs.effects import LEARNED, LIBRARY
+from envs.logs import Log, Run, read, read_xl330, splits
 from envs.null_logs import simulate_null_log
 from envs.regimes import REGIMES
 from envs.rig import Rig
 from envs.scales import measure_scales
-from experiments.discovery.cutting import BIN_S, cut_log
-from experiments.discovery.hypotheses import hypotheses, timing_directions
+from experiments.discovery.cutting import BIN_S, HORIZONS_S, cut_log, fitting_horizons, row_rate, split_in_time
+from experiments.discovery.hypotheses import hypotheses, learned_torque, timing_directions
 from jaxtune.discovery.problem import Problem
 
-HORIZONS_S = (0.05, 0.15, 0.45)
-"""Default lengths in s of the segments that are simulated. Short ones stay close to the measurement; long ones show
-biases and delays."""
+__all__ = ["HORIZONS_S", "Question", "build_question", "drop_filtered", "read_logs", "without_sealed"]
 
+_LEAST_STALE = 0.02  # share of readings
 _LATE_S = 0.004  # a velocity that lags its position by more was filtered, and would be mistaken for a sensor's lag
 
 
@@ -36,32 +36,37 @@ class Question:
     splits: Mapping[str, tuple[str, ...]]
     """Names of the runs by split: train, select (validation) and sealed (held-out test)."""
     notes: tuple[str, ...]
-    """Sentences about signals that are not used, and why."""
+    """Sentences about what was made of the log: signals that are not used, and why, and how it was split."""
 
 
 @dataclass(frozen=True)
 class _Simulator:
-    """Simulates some signals of a rig. Two with the same rig and signals are equal, so they share compiled programs."""
+    """Simulates some signals of a rig. Two of equal layout and signals are equal, so they share compiled programs."""
 
-    rig: Rig
+    rig: Rig = field(compare=False)
+    layout: Hashable
     signals: tuple[str, ...]
 
-    def __call__(self, values, inputs):
-        read = self.rig.simulate(self.rig.tree(values), inputs)
+    def __call__(self, system, values, inputs, steps):
+        read = self.rig.on(system).simulate(self.rig.tree(values), inputs, steps)
+        read = read | {"abs_tau": jnp.abs(read["tau"])}
         return {name: read[name] for name in self.signals}
 
 
-def read_logs(folders: Sequence[Path]) -> tuple[Log, mujoco.MjSpec]:
-    """Reads the logs of one robot as a single log, and the robot's nominal model.
+def read_logs(folders: Sequence[Path], clear_flags: bool = False) -> tuple[Log, mujoco.MjSpec]:
+    """Reads the logs of one robot as a single log that can be split, and the robot's nominal model.
 
     Args:
       folders: of logs, or of the XL330 pendulum's JSON files.
+      clear_flags: whether flags of the model that switch physics off are cleared; else they are refused.
 
     Returns:
-      A log with the runs of all folders (of several, a run's name ends in the number of its folder), and the model.
+      A log with the runs of all folders (of several, a run's name ends in the number of its folder), cut in time where
+      its conditions are too few, and the model.
 
     Raises:
-      ValueError: a log cannot be read, the logs are not of one robot, or its base is free.
+      ValueError: a log cannot be read, the logs are not of one robot, its base is free, or its model has flags that
+        switch physics off.
     """
     logs = [
         read(folder) if (folder / "meta.yaml").exists() or not any(folder.glob("*.json")) else read_xl330(folder)
@@ -80,16 +85,18 @@ def read_logs(folders: Sequence[Path]) -> tuple[Log, mujoco.MjSpec]:
             raise ValueError(f"{folder}: robot: got {log.robot}, expected the same model as {first.robot}")
     # Loaded anew, because writing a specification compiles it, and a compiled one is saved with other geom masses.
     spec = models.spec(first.robot)
-    if len(logs) == 1:
-        return first, spec
-    runs = tuple(replace(run, name=f"{run.name}_{number}") for number, log in enumerate(logs) for run in log.runs)
-    return replace(first, runs=runs), spec
+    cleared = models.check_flags(spec, clear_flags)
+    notes = (f"flags of the model that disabled {', '.join(cleared)} were cleared",) if cleared else ()
+    runs = first.runs
+    if len(logs) > 1:
+        runs = tuple(replace(run, name=f"{run.name}_{number}") for number, log in enumerate(logs) for run in log.runs)
+    return split_in_time(replace(first, runs=runs, notes=notes)), spec
 
 
 def build_question(
     log: Log,
     spec: mujoco.MjSpec,
-    horizons: Sequence[float] = HORIZONS_S,
+    horizons: Sequence[float] | None = None,
     null_logs: int = 20,
     seed: int = 0,
     plain: Rig | None = None,
@@ -101,7 +108,7 @@ def build_question(
     Args:
       log: what was measured.
       spec: the nominal model.
-      horizons: lengths of the segments in s.
+      horizons: lengths of the segments in s; None takes those that fit the rows (`fitting_horizons`).
       null_logs: number of simulated null logs, which set the noise floor and the thresholds.
       seed: of the null logs.
       plain: a rig of the same robot and controller rate, from an earlier question, to reuse its compiled programs.
@@ -112,38 +119,45 @@ def build_question(
     Raises:
       ValueError: the runs cannot be split, are too short for a horizon, or lack what discovery needs.
     """
+    horizons = fitting_horizons(log, horizons)
     rate = _checked_rate(log, segments.HISTORY_S + min(horizons))
+    _check_joints(log, spec)
     log, notes = drop_filtered(log)
+    log = replace(log, runs=readings.with_noise(log.runs, without_sealed(log).runs))
     unsealed = without_sealed(log).runs
     plain = plain or Rig(spec, log.joints, rate)
     plain.check_matches(log.joints, rate)
     rig = plain.scaled(measure_scales(plain, unsealed))
     # A signal that some runs lack is not compared, since segments of all runs share one layout.
-    signals = tuple(name for name in ("dq", "gravity", "q") if all(name in run.signals for run in log.runs))
+    signals = tuple(name for name in sorted(segments.COMPARED) if all(name in run.signals for run in log.runs))
+    if not all("target" in run.signals for run in log.runs):
+        signals = tuple(name for name in signals if name != "tau")  # sent, not measured
     axes = {(axis.effect, axis.place): number for number, axis in enumerate(rig.axes)}
     library = {name: row for name, row in rig.effects.items() if name in LIBRARY}
     every = hypotheses(rig.axes, rig.places, library)
-    residual = hypotheses(rig.axes, rig.places, {RESIDUAL.name: RESIDUAL})
-    timing = timing_directions(rig.axes, rig.control_hz)
+    timing, timing_bounds = timing_directions(rig.axes, rig.control_hz)
     simulated = [simulate_null_log(log, spec, seed + number) for number in range(null_logs)]
     measured, *nulls = (cut_log(one, rig.dt, signals, horizons) for one in (log, *simulated))
     problem = Problem(
-        simulate=_Simulator(plain, signals),
+        simulate=_Simulator(plain, plain.layout, signals),
+        system=plain.system,
         values=rig.inner,
         axes=len(rig.axes),
         hypotheses=every,
         prior=np.array([axis.prior_sd for axis in rig.axes]),
         timing=timing,
+        timing_bounds=timing_bounds,
+        trees=rig.trees,
         data=measured,
         null_logs=nulls,
         bin_rows=segments.rows_together(1.0 / log.rate_hz, BIN_S),
         regimes=REGIMES,
         components={name: tuple("xyz") if name == "gravity" else rig.joints for name in signals},
         push={joint: axes["constant_push", joint] for joint in rig.joints},
-        residual={one.places[0]: one for one in residual if len(one.places) == 1},
+        residual=learned_torque(rig.axes, LEARNED),
     )
     names = {split: tuple(run.name for run in runs) for split, runs in splits(log).items()}
-    return Question(problem, rig, names, notes)
+    return Question(problem, rig, names, (*log.notes, *notes, *_stale_notes(unsealed)))
 
 
 def _checked_rate(log: Log, least_s: float) -> float:
@@ -154,11 +168,35 @@ def _checked_rate(log: Log, least_s: float) -> float:
             raise ValueError(
                 f"{run.name}: controller.rate_hz: got {run.controller.rate_hz:g}, expected {rate:g} for all"
             )
-        if run.controller.kind == "servo" and "target" in run.signals and "volts" not in run.signals:
-            raise ValueError(f"{run.name}: column 'volts' is missing, and the controller is a servo")
+        supplied = "volts" in run.signals or "volts" in run.controller.gains
+        if run.controller.kind == "servo" and "target" in run.signals and not supplied:
+            raise ValueError(f"{run.name}: column 'volts' is missing, and so is controller.volts of the servo")
         if run.time[-1] - run.time[0] < least_s:
             raise ValueError(f"{run.name}: got {run.time[-1] - run.time[0]:.3g} s, expected {least_s:.3g} s or more")
     return rate
+
+
+def _check_joints(log: Log, spec: mujoco.MjSpec) -> None:
+    """Refuses a log that says nothing of a joint that may move."""
+    model = models.suspended(spec)
+    names = [model.joint(i).name or f"joint {i}" for i in range(model.njnt)]
+    others = [name for name in names if name not in log.joints]
+    if others:
+        raise ValueError(
+            f"joints: got a log without {', '.join(others)}, expected all joints that may move: log these too, or "
+            "fix them by taking their <joint> out of the MJCF"
+        )
+
+
+def _stale_notes(runs: Sequence[Run]) -> list[str]:
+    """Says which signals repeat readings that a slow bus had not renewed."""
+    notes = []
+    for name in segments.COMPARED:
+        found = [readings.stale(run, name).ravel() for run in runs if name in run.signals]
+        share = np.concatenate(found).mean() if found else 0.0
+        if share > _LEAST_STALE:
+            notes.append(f"{share:.0%} of the readings of {name} repeat an older one; they are interpolated")
+    return notes
 
 
 def without_sealed(log: Log) -> Log:
@@ -171,9 +209,10 @@ def without_sealed(log: Log) -> Log:
 
 
 def drop_filtered(log: Log) -> tuple[Log, tuple[str, ...]]:
-    """Leaves out joint velocities that were filtered, because their lag would be mistaken for a sensor's.
+    """Leaves out signals that were filtered, because their lag would be mistaken for a sensor's.
 
-    A velocity counts as filtered if it lags the derivative of the position by more than 4 ms in the median run.
+    A signal counts as filtered if the log says so, and a velocity also if it lags the derivative of the position by
+    more than 4 ms in the median run. Positions stay: the delay of their filter is taken out (`envs.readings`).
 
     Args:
       log: as it was read.
@@ -182,12 +221,30 @@ def drop_filtered(log: Log) -> tuple[Log, tuple[str, ...]]:
       The log, with the row rate of its time stamps in the place of the declared one, and a note for every signal that
       was left out.
     """
-    notes = []
+    log, notes = _drop_declared(log)
     # Sealed runs are left out here too: nothing may be decided by them.
     late = [segments.velocity_lag(run) for run in without_sealed(log).runs if "dq" in run.signals]
     if late and np.median(late) > _LATE_S:
         notes.append(f"dq lags q by {1e3 * np.median(late):.0f} ms, so it was filtered and is not used")
-        runs = [replace(run, signals={k: v for k, v in run.signals.items() if k != "dq"}) for run in log.runs]
-        log = replace(log, runs=tuple(runs))
-    rate = 1.0 / float(np.median([np.median(np.diff(run.time)) for run in log.runs]))
-    return replace(log, rate_hz=rate), tuple(notes)
+        log = _without(log, "dq")
+    return replace(log, rate_hz=row_rate(log)), tuple(notes)
+
+
+def _drop_declared(log: Log) -> tuple[Log, list[str]]:
+    """Leaves out signals of which the log says that they were filtered; notes say which."""
+    notes = []
+    for name in segments.COMPARED:
+        # One column's filter counts for the signal.
+        corners = [corner for run in log.runs if name in run.signals for corner in run.fact(name, "filter_hz")]
+        sent = name == "tau" and not all("target" in run.signals for run in log.runs)
+        if sent or not np.isfinite(corners).any():
+            continue
+        corner = f"{name} was filtered at {np.nanmin(corners):g} Hz, as the log says"
+        notes.append(f"{corner}; the delay is taken out" if name == "q" else f"{corner}, and is not used")
+        log = log if name == "q" else _without(log, name)
+    return log, notes
+
+
+def _without(log: Log, signal: str) -> Log:
+    runs = [replace(run, signals={k: v for k, v in run.signals.items() if k != signal}) for run in log.runs]
+    return replace(log, runs=tuple(runs))

@@ -36,9 +36,8 @@ def summarise(question: Question, result: Result) -> dict:
     for number in result.changed:
         axis = question.rig.axes[number]
         if not any(change["name"] == axis.effect and axis.place in change["places"] for change in changes):
-            others = tuple(name for name in result.changed_alike[number] if name != axis.effect)
-            hypothesis = singles[f"{axis.effect}@{axis.place}"]
-            changes.append(_effect(question.rig, hypothesis, result.fit, result.errors, others))
+            if (hypothesis := singles.get(f"{axis.effect}@{axis.place}")) is not None:
+                changes.append(_effect(question.rig, hypothesis, result.fit, result.errors, ()))
     not_there = [name for name in LIBRARY if name not in question.rig.effects]
     return {
         "verdict": result.verdict,
@@ -51,6 +50,13 @@ def summarise(question: Question, result: Result) -> dict:
             if cell["low"] > 0
         ],
         "gap": {"unit": "floor", **result.gap, "split": "sealed"},
+        "suspects": [
+            {"name": hypothesis.name, "places": list(hypothesis.places), "form": None, "probability": probability}
+            for hypothesis, probability in result.suspects
+        ],
+        "withdrawn": result.withdrawn,
+        "explained_share": result.explained_share,
+        "model_is": result.model_is,
     }
 
 
@@ -100,7 +106,7 @@ def free_runs(log: Log, question: Question, result: Result) -> dict:
     vectors = {
         "before": np.zeros(len(rig.axes)),
         "null": result.null.vector,
-        "after": (result.residual or result.fit).vector,
+        "after": result.model,
     }
     values = np.asarray(rig.inner(np.stack(list(vectors.values()))), np.float32)
     found = {name: np.asarray(play(value, cut.segments)) for name, value in zip(vectors, values, strict=True)}
@@ -152,6 +158,8 @@ def details(question: Question, result: Result, free: dict) -> dict:
             for term in result.terms
         ],
         "rejected": result.rejected,
+        "dropped": result.dropped,
+        "models": result.details,
         "where": result.where,
         "needs_torque": result.needs_torque,
         "not_finite": result.not_finite,

@@ -1,244 +1,237 @@
-"""Whether a hypothesis is accepted, and under which name (step 7).
+"""Which of the fitted models is believed, how far, and whether each of its effects is proved (step 7).
 
-Finalists are compared on `select` (validation), segment by segment and paired, since segments differ far more than
-hypotheses do. All statistics resample blocks of segments (`resample`), since neighbours are not independent.
+Models are compared by their cost on `train` and `select` (validation) together, prior included, plus a price for every
+effect: what chance gains on null logs. A model is believed in the share of resampled logs in which it costs least, each
+model with the weight exp(-cost / 2): pseudo-Bayesian model averaging with a bootstrap (Yao et al., 2018).
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from jaxtune.discovery.fit import Fit
-from jaxtune.discovery.problem import Hypothesis
-from jaxtune.discovery.resample import (
-    alike,
-    bagged,
-    blocks,
-    confirmed,
-    losses,
-    max_t,
-    paired,
-    standard_errors,
-    t_statistic,
-)
+from jaxtune.discovery.fit import Fit, refine, without
+from jaxtune.discovery.noise_floor import Floor, NoiseFloor
+from jaxtune.discovery.problem import Hypothesis, Problem
+from jaxtune.discovery.resample import standard_errors, times_drawn, units
+from jaxtune.discovery.result import Settings
 
-_EQUAL = 2.0  # standard errors within which two hypotheses are not distinguishable
-_ABOUT_BEST = 1.0  # standard errors within which the simplest hypothesis is taken
-_PAYS = 1.0  # t below which an effect that was accepted earlier may go
+_ABLATION_ROUNDS = 3
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A model with some effects in it, fitted on `train` and simulated on `select`, both at the main horizon."""
+
+    hypotheses: tuple[Hypothesis, ...]
+    """Its effects; none in the null."""
+    fit: Fit
+    select: np.ndarray
+    """[features]: residuals on `select` in floor units."""
+
+    @property
+    def key(self) -> str:
+        """The keys of its effects in one word, such as `coulomb@elbow + payload@forearm`; `null` without any."""
+        return " + ".join(sorted(hypothesis.key for hypothesis in self.hypotheses)) or "null"
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """What speaks for a hypothesis against the model without it: one number or interval for each test of `passes`."""
+    """What speaks for an effect against the same model without it, whose other coordinates were fitted again."""
 
     gain: float
-    """Fall of the loss of the fit, on `train`."""
-    t: float
-    """On `select`: mean fall of what a segment counts for (`losses`), over its standard error."""
+    """Fall of the cost on `train` and `select`."""
     confirmed: float
-    """Fall of the loss on `select`, where nothing was fitted, without the block of segments that gains most; in units
-    of what is left."""
+    """Fall of the cost on `select` alone, where nothing was fitted."""
     floors: float
-    """Root of the largest fall of a single component's mean square, in floor units."""
+    """Root of the largest fall of a single component's mean square on `select`, in floor units."""
     interval: tuple[float, float]
-    """95 % interval of the coordinate that is clearest of zero; of a pair, of the part that is less clear."""
+    """95 % interval of the coordinate that is clearest of zero."""
     inside: bool
     """True if all coordinates are inside their bounds."""
     horizons: int
-    """Number of horizons at which it is best, or within a standard error of the best."""
-    chosen: float
-    """Share of bagged refits in which it, or one that is not distinguishable from it, is best."""
+    """Number of horizons at which `select` is explained better with it."""
 
 
 @dataclass(frozen=True)
 class Thresholds:
-    """What the evidence has to exceed (`t`, `gain`) or to reach (the others) for a hypothesis to be accepted."""
+    """What the evidence has to exceed (`gain`) or to reach (the others)."""
 
-    t: float
-    """Max-t threshold over all hypotheses that are compared on `select`, at once."""
     gain: float
-    """Gain that the best hypothesis exceeds on null logs with probability `Settings.level`; for a pair, twice that."""
+    """Fall of the cost that the best hypothesis reaches on null logs with probability `Settings.level`."""
     floors: float = 1.0
     horizons: int = 2
-    chosen: float = 0.7
 
 
-@dataclass(frozen=True, kw_only=True)
-class Comparison:
-    """Finalists side by side, on segments that they were not fitted to; all that a decision needs.
-
-    The model without any of them is compared too: it is what they have to beat.
-    """
-
-    hypotheses: Sequence[Hypothesis]
-    """The finalists, best on `train` first."""
-    base: Fit
-    """The model without them, at the main horizon."""
-    fits: Mapping[str, Fit]
-    """The model with each of them, by key, at the main horizon."""
-    before: Mapping[float, np.ndarray]
-    """[segments, bins, components] by horizon: residuals on `select` of the model without them."""
-    after: Mapping[float, Mapping[str, np.ndarray]]
-    """The same with each of them, by horizon and key."""
-    runs: Mapping[float, np.ndarray]
-    """[segments] of `select`, by horizon: index of each segment's run."""
-    run_of_train: np.ndarray
-    """[segments] of `train` at the main horizon."""
-    main: float
-    """The main horizon in s."""
+def squares(at: Floor, candidate: Candidate) -> np.ndarray:
+    """Sums the squares of a candidate's residuals over bins: [segments, components], of `train`, then of `select`."""
+    both = np.concatenate([candidate.fit.residual, candidate.select])
+    return (at.unflatten(both) ** 2).sum(axis=1)
 
 
-@dataclass(frozen=True)
-class Decision:
-    """What became of the best finalist: the chosen hypothesis, its evidence and whether it passed every test."""
-
-    hypothesis: Hypothesis
-    evidence: Evidence
-    thresholds: Thresholds
-    tests: Mapping[str, bool]
-    """Whether it passed, by test; see `passes`."""
-    confusable_with: tuple[str, ...]
-    """Names of other effects that fit as well as the best, or explain nearly as much."""
-
-    @property
-    def accepted(self) -> bool:
-        """True if the hypothesis passed every test, and thus joins the model."""
-        return all(self.tests.values())
+def total_cost(at: Floor, candidate: Candidate, price: float) -> float:
+    """Returns the cost of a candidate on `train` and `select`, with its prior and a price for every effect."""
+    of_segments = squares(at, candidate)
+    return _cost(at, of_segments) + candidate.fit.penalty + price * len(candidate.hypotheses)
 
 
-def decide(comparison: Comparison, least_gain: float, level: float, same: float) -> Decision:
-    """Chooses among the finalists, weighs the evidence for the chosen one and tests it.
-
-    The choice is the simplest hypothesis within one standard error of the best (Breiman's rule): a better fit that is
-    within chance is no reason for another parameter.
+def posterior(problem: Problem, at: Floor, candidates: Sequence[Candidate], price: float, seed: int = 0) -> np.ndarray:
+    """Computes how far every candidate is believed, [candidates], from logs that are resampled.
 
     Args:
-      comparison: the finalists on `select`.
-      least_gain: gain that chance gives a single hypothesis.
-      level: probability of accepting any finalist where nothing is missing.
-      same: share of the best gain from which on another name may as well be right.
+      problem: the runs of the segments.
+      at: the floor at the main horizon.
+      candidates: what is compared, best first; the null should be among them.
+      price: of every effect.
+      seed: of the draws.
     """
-    main, lost = comparison.main, _lost_everywhere(comparison)
-    draws = blocks(np.concatenate([comparison.run_of_train, comparison.runs[main]]))
-    about_best, equal = alike(lost, draws, _ABOUT_BEST), alike(lost, draws, _EQUAL)
-    simplest = [h for h in comparison.hypotheses if h.key in about_best]
-    chosen = min(simplest, key=lambda h: (len(h.directions), comparison.fits[h.key].linear.loss))
-    gains = {key: paired(comparison.before[main], after) for key, after in comparison.after[main].items()}
-    # Each part of a pair must gain what chance gives.
-    least = Thresholds(t=max_t(gains, comparison.runs[main], level), gain=len(chosen.singles) * least_gain)
-    evidence = weigh_evidence(comparison, chosen, equal)
-    confusable = confusable_names(comparison, chosen, equal, same)
-    return Decision(chosen, evidence, least, passes(evidence, least), confusable)
+    all_squares = [squares(at, candidate) for candidate in candidates]
+    times = times_drawn(units_of(problem, at, all_squares[0]), seed=seed)
+    rows = len(all_squares[0]) * len(at.scale["train"])
+    costs = []
+    for candidate, mine in zip(candidates, all_squares, strict=True):
+        mean_squares = times @ np.nan_to_num(mine, nan=1e9, posinf=1e9) / rows
+        costs.append(at.counts.cost(mean_squares, rows) + candidate.fit.penalty + price * len(candidate.hypotheses))
+    weights = np.exp(-0.5 * (np.array(costs) - np.min(costs, axis=0)))
+    return (weights / weights.sum(axis=0)).mean(axis=1)
 
 
-def weigh_evidence(comparison: Comparison, chosen: Hypothesis, equal: Sequence[str]) -> Evidence:
-    """Collects what speaks for the chosen hypothesis against the model without it.
+def units_of(problem: Problem, at: Floor, of_segments: np.ndarray) -> np.ndarray:
+    """Groups the segments of `train` and `select` into units that are drawn together, [segments]."""
+    train, select = (problem.data[split][at.horizon].run for split in ("train", "select"))
+    return units(np.concatenate([train, select]), of_segments, len(np.unique(select)))
 
-    A bagged refit that chooses an equally good hypothesis, or the same name at some of the same places, counts for it:
-    it would be the same answer.
+
+def weigh_evidence(
+    problem: Problem, floor: NoiseFloor, candidate: Candidate, hypothesis: Hypothesis
+) -> tuple[Evidence, Candidate]:
+    """Collects what speaks for one effect of a candidate: takes it out, fits all else again, and compares.
+
+    Args:
+      problem: the runs of the segments.
+      floor: the noise floor.
+      candidate: the model with the effect, with fresh slopes.
+      hypothesis: the effect.
+
+    Returns:
+      The evidence, and the model without the effect.
     """
-    main, fit = comparison.main, comparison.fits[chosen.key]
-    before, after, run = comparison.before[main], comparison.after[main][chosen.key], comparison.runs[main]
-    share = bagged({key: one.linear for key, one in comparison.fits.items()}, comparison.run_of_train)
-    about_best = {
-        horizon: alike({key: losses(one) for key, one in found.items()}, blocks(comparison.runs[horizon]), _ABOUT_BEST)
-        for horizon, found in comparison.after.items()
-    }
-    # The prior directions come first, the hypothesis' own coordinates last.
-    own, (low, high) = fit.own(chosen), chosen.bounds.T
-    errors = standard_errors(fit, comparison.run_of_train)[-len(own) :]
-    return Evidence(
-        gain=comparison.base.linear.loss - fit.linear.loss,
-        t=t_statistic(paired(before, after), run),
-        confirmed=confirmed(before, after, run, comparison.base.weight),
-        floors=_largest_fall(before, after),
-        interval=_interval(chosen, own, errors),
-        inside=bool(((low < own) & (own < high)).all()),
-        horizons=sum(chosen.key in best for best in about_best.values()),
-        chosen=sum(share[h.key] for h in comparison.hypotheses if h.key in equal or _same_answer(h, chosen)),
+    at = floor[problem.main_horizon]
+    ablated = ablate(at, candidate, hypothesis)
+    now, before = squares(at, candidate), squares(at, ablated)
+    held_out = len(problem.data["train"][at.horizon].run)
+    own = candidate.fit.along(hypothesis)
+    unit = units_of(problem, at, now)[:held_out]
+    errors = standard_errors(candidate.fit, unit)[own]
+    values, (low, high) = candidate.fit.coordinates[own], hypothesis.bounds.T
+    # A parameter without a probe of its own means nothing alone.
+    distance = np.where((hypothesis.probes != 0).any(axis=0), np.abs(values) / errors, 0.0)
+    clearest = int(distance.argmax())
+    mean = lambda one: one[held_out:].mean(axis=0) / len(at.scale["train"])  # noqa: E731
+    evidence = Evidence(
+        gain=total_cost(at, ablated, 0.0) - total_cost(at, candidate, 0.0),
+        confirmed=_cost(at, before[held_out:]) - _cost(at, now[held_out:]),
+        floors=float(np.sqrt(max((mean(before) - mean(now)).max(), 0.0))),
+        interval=(
+            float(values[clearest] - 1.96 * errors[clearest]),
+            float(values[clearest] + 1.96 * errors[clearest]),
+        ),
+        inside=bool(((low < values) & (values < high)).all()),
+        horizons=_horizons_better(floor, candidate.fit.vector, ablated.fit.vector),
     )
-
-
-def confusable_names(comparison: Comparison, chosen: Hypothesis, equal: Sequence[str], same: float) -> tuple[str, ...]:
-    """Names the effects, other than the chosen one's, that these logs cannot distinguish from it.
-
-    Args:
-      comparison: the finalists.
-      chosen: the hypothesis whose name is given.
-      equal: keys of those that fit as well as the best.
-      same: share of the best gain on `train` from which on a name may as well be right.
-    """
-    gains = {key: comparison.base.linear.loss - fit.linear.loss for key, fit in comparison.fits.items()}
-    nearly = [key for key, gain in gains.items() if gain > same * max(gains.values())]
-    mine = {part.name for part in chosen.singles}
-    names = [part.name for h in comparison.hypotheses if h.key in (*equal, *nearly) for part in h.singles]
-    return tuple(dict.fromkeys(name for name in names if name not in mine))
+    return evidence, ablated
 
 
 def passes(evidence: Evidence, thresholds: Thresholds) -> dict[str, bool]:
-    """Tests the evidence; a hypothesis is accepted if all tests, which are returned by name, are passed."""
+    """Tests the evidence; an effect stays in the model if all tests, which are returned by name, are passed."""
     low, high = evidence.interval
     return {
-        # What shows in few segments alone has a large standard error however clear it is in those: it is enough if it
-        # gains more where it was not fitted than anything gains on null logs where it was.
-        "significant": evidence.t > thresholds.t or evidence.confirmed > thresholds.gain,
-        # Significant is not enough: with thousands of residuals every mimic of an engine gap is.
-        "beyond_healthy": evidence.gain > thresholds.gain,
+        # With thousands of residuals every mimic of an engine gap is significant; null logs say what chance gains.
+        "beyond_chance": evidence.gain > thresholds.gain,
+        "confirmed": evidence.confirmed > 0.0,
         "floor_unit": evidence.floors >= thresholds.floors,
         # A fit that ran into a bound stands in for another effect.
         "inside_bounds": evidence.inside,
         "clear_of_zero": low > 0 or high < 0,
         # Long segments let a wrong effect compensate, short ones are blind to slow bias: two must agree.
         "horizons": evidence.horizons >= thresholds.horizons,
-        "bagged": evidence.chosen >= thresholds.chosen,
     }
 
 
-def no_longer_pays(without: np.ndarray, now: np.ndarray, run: np.ndarray, weight: float, least_gain: float) -> bool:
-    """Says whether `select` is explained as well without an effect that was accepted earlier.
+def ablate(at: Floor, candidate: Candidate, hypothesis: Hypothesis) -> Candidate:
+    """Takes an effect out of a candidate and fits everything else again."""
+    start = without(candidate.fit, hypothesis, at.prior, at.slopes)
+    evaluate = at.residuals["train"]
+    start = replace(start, residual=evaluate(start.vector[None])[0])
+    (fit,) = refine([start], evaluate, _ABLATION_ROUNDS)
+    others = tuple(other for other in candidate.hypotheses if other is not hypothesis)
+    return Candidate(others, fit, at.residuals["select"](fit.vector[None])[0])
+
+
+def believed(candidates: Sequence[Candidate], probabilities: np.ndarray) -> list[tuple[Hypothesis, float]]:
+    """Lists every effect of the candidates with the probability that it is there, most likely first."""
+    found: dict[str, tuple[Hypothesis, float]] = {}
+    for candidate, probability in zip(candidates, probabilities, strict=True):
+        for hypothesis in candidate.hypotheses:
+            before = found.get(hypothesis.key, (hypothesis, 0.0))[1]
+            found[hypothesis.key] = (hypothesis, before + float(probability))
+    return sorted(found.values(), key=lambda pair: -pair[1])
+
+
+def rivals(
+    at: Floor,
+    candidates: Sequence[Candidate],
+    probabilities: np.ndarray,
+    best: Candidate,
+    hypothesis: Hypothesis,
+    settings: Settings,
+) -> tuple[str, ...]:
+    """Names the effects that may as well be there in the place of one of the best candidate's.
+
+    They stand in models that do without the effect's name and are believed, or explain nearly as much of what the null
+    leaves.
 
     Args:
-      without: [segments, bins, components] residuals of the model without the effect.
-      now: the same of the model as it stands.
-      run: [segments] index of each segment's run.
-      weight: share of the bins that count as independent.
-      least_gain: gain that chance gives.
+      at: the floor at the main horizon.
+      candidates: all models, the null among them.
+      probabilities: [candidates] of `posterior`.
+      best: the model that is reported.
+      hypothesis: one of its effects.
+      settings: shares from which on a name counts.
+
+    Returns:
+      Names, most likely first.
     """
-    t = t_statistic(paired(without, now), run)
-    return t < _PAYS and not confirmed(without, now, run, weight) > least_gain
+    others = {other.key for other in best.hypotheses if other is not hypothesis}
+    nothing = max(total_cost(at, one, 0.0) for one in candidates if not one.hypotheses)
+    most = nothing - total_cost(at, best, 0.0)
+    found: dict[str, float] = {}
+    for candidate, probability in zip(candidates, probabilities, strict=True):
+        names = [h.name for h in candidate.hypotheses]
+        if hypothesis.name in names or len(candidate.hypotheses) > len(best.hypotheses):
+            continue
+        explained = (nothing - total_cost(at, candidate, 0.0)) / max(most, 1e-9)
+        for other in candidate.hypotheses:
+            if other.key not in others and explained > settings.same:
+                found[other.name] = max(found.get(other.name, 0.0), explained)
+            elif other.key not in others and probability > settings.possible:
+                found[other.name] = max(found.get(other.name, 0.0), float(probability))
+    return tuple(sorted(found, key=lambda name: -found[name]))[: settings.rivals]
 
 
-def _lost_everywhere(comparison: Comparison) -> dict[str, np.ndarray]:
-    """What every segment of `train` and `select` counts for at the main horizon, [segments] by key."""
-    shape = comparison.before[comparison.main].shape[1:]
-    return {
-        key: np.concatenate([losses(comparison.fits[key].residual.reshape(-1, *shape)), losses(on_select)])
-        for key, on_select in comparison.after[comparison.main].items()
-    }
+def _cost(at: Floor, of_segments: np.ndarray) -> float:
+    """Cost of sums of squares [segments, components], without a prior."""
+    rows = len(of_segments) * len(at.scale["train"])
+    if not np.isfinite(of_segments).all():
+        return np.inf
+    return float(at.counts.cost(of_segments.sum(axis=0) / rows, rows))
 
 
-def _same_answer(one: Hypothesis, chosen: Hypothesis) -> bool:
-    """Whether a hypothesis has the same name as the chosen one, at some of the same places."""
-    return one.name == chosen.name and bool(set(one.places) & set(chosen.places))
-
-
-def _largest_fall(before: np.ndarray, after: np.ndarray) -> float:
-    """Root of the largest fall of a component's mean square, in floor units."""
-    fall = (before**2).mean(axis=(0, 1)) - (after**2).mean(axis=(0, 1))
-    return float(np.sqrt(max(fall.max(), 0.0)))
-
-
-def _interval(hypothesis: Hypothesis, values: np.ndarray, errors: np.ndarray) -> tuple[float, float]:
-    """95 % interval of the coordinate that tells whether all parts of a hypothesis are there.
-
-    Of several parameters of one part, one must be clear of zero: the clearest counts. A parameter without a probe has
-    no meaning alone and cannot be the one. Of two parts the one that is less clear counts.
-    """
-    clear, start = [], 0
-    for part in hypothesis.singles:
-        mine = slice(start, start := start + len(part.directions))
-        distance = np.where((part.probes != 0).any(axis=0), np.abs(values[mine]) / errors[mine], 0.0)
-        clear.append((distance.max(), mine.start + int(distance.argmax())))
-    _, index = min(clear)
-    return float(values[index] - 1.96 * errors[index]), float(values[index] + 1.96 * errors[index])
+def _horizons_better(floor: NoiseFloor, vector: np.ndarray, other: np.ndarray) -> int:
+    """Number of horizons at which `select` costs less with a vector than with the other one."""
+    better = 0
+    for at in floor.values():
+        now, before = at.residuals["select"](np.stack([vector, other]))
+        costs = [_cost(at, (at.unflatten(one) ** 2).sum(axis=1)) for one in (now, before)]
+        better += costs[0] < costs[1]
+    return better

@@ -1,29 +1,25 @@
 """Gauss-Newton fits of many models at once, with slopes that are learnt from the steps taken.
 
-A fit minimises the loss of `least_squares.Linear`: squared residuals in floor units, plus the prior of every coordinate
-that is free. With residuals r(c), slopes J = dr/dc, weight w and prior deviations s, a step solves
-
-    (w J'J + diag(1/s^2)) u = -(w J'r + c/s^2),   low <= c + u <= high.
-
-A simulation is the expensive part, so slopes are secants that are taken where a round of discovery begins and, for the
-finalists, where they stand (`polish`). In between, Broyden's update learns them from the steps themselves, and one
-iteration costs two simulations. Source: Nocedal and Wright, Numerical Optimization, chapters 10 and 11.
+A fit minimises the cost of `least_squares`: what the residuals say, and the prior of every coordinate that is free. A
+simulation is the expensive part, so slopes are secants that are taken once and, for the finalists, where they stand
+(`polish`). In between, Broyden's update learns them from the steps themselves, and one iteration costs two simulations.
+Source: Nocedal and Wright, Numerical Optimization, chapters 10 and 11.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
-from jaxtune.discovery.least_squares import Linear
+from jaxtune.discovery.least_squares import Counts, Linear
 from jaxtune.discovery.problem import Hypothesis
 from jaxtune.discovery.simulation import Evaluate
 
 _SCALES = (1.0, 0.35)  # shares of the Gauss-Newton step that are tried side by side
 _DAMPING = 1e-3
-_IDLE = 0.5  # fall of the loss that chance gives: about a half for a squared unit residual
+_IDLE = 0.5  # fall of the cost that chance gives: about a half for a squared unit residual
 _PATIENCE = 2  # rounds without more than that
-_PRIOR_ROUNDS = 6  # a tenth off in the parameters, one step would leave so much that it passed for an engine gap
 _SHORTEST = 0.03  # length of a step, in coordinates, below which rounding hides what it could teach
 
 
@@ -59,7 +55,7 @@ class Free:
 
 @dataclass(frozen=True)
 class Fit:
-    """A model at one horizon: where its coordinates stand, and residuals and slopes there.
+    """A model at the main horizon: where its coordinates stand, and residuals and slopes there.
 
     Fits are values: every function that moves one returns another one.
     """
@@ -71,8 +67,8 @@ class Fit:
     """[features]: residuals on `train` in floor units; a feature is a (segment, bin, component)."""
     jacobian: np.ndarray
     """[features, coordinates]: secants, or what Broyden's update made of them."""
-    weight: float
-    """Share of the features that count as independent."""
+    counts: Counts
+    """How many independent numbers the residuals are worth."""
     finite: bool = True
     """False where every step from here broke the simulation."""
 
@@ -81,41 +77,48 @@ class Fit:
         """The model as the vector [axes] that the simulator is given: `coordinates @ directions`."""
         return self.coordinates @ self.free.directions
 
-    def own(self, hypothesis: Hypothesis) -> np.ndarray:
-        """Coordinates [parameters] of the hypothesis that joined last, which are the model's last ones."""
-        return self.coordinates[-len(hypothesis.directions) :]
+    @property
+    def penalty(self) -> float:
+        """What the prior says against the coordinates: |c / s|^2."""
+        return float(((self.coordinates / self.free.sd) ** 2).sum())
+
+    @cached_property
+    def cost(self) -> float:
+        """The cost of the model on `train`, prior included (`least_squares`); infinite where it is not finite."""
+        if not np.isfinite(self.residual).all():
+            return np.inf
+        rows = len(self.residual) // self.counts.components
+        return float(self.counts.cost(self.counts.mean_squares(self.residual), rows)) + self.penalty
 
     def along(self, hypothesis: Hypothesis) -> np.ndarray:
-        """Finds a hypothesis that is part of the model, whenever it joined, by its directions; a mask [coordinates]."""
-        return np.array([any((row == mine).all() for mine in hypothesis.directions) for row in self.free.directions])
+        """Finds a hypothesis that is part of the model by its directions; a mask [coordinates]."""
+        rows = self.free.directions
+        return (
+            np.array([any((row == mine).all() for mine in hypothesis.directions) for row in rows]) & ~self.free.nominal
+        )
 
     @property
     def linear(self) -> Linear:
         """The linear model of the residuals around this point, with the prior: r(c + u) = r + J u."""
-        return Linear(self.residual, self.jacobian, self.coordinates, self.free.sd, self.weight)
+        weight = self.counts.weights(self.residual)
+        return Linear(self.residual, self.jacobian, self.coordinates, self.free.sd, weight)
 
     def moved(self, scale: float) -> np.ndarray:
         """Coordinates after a share `scale` of the damped Gauss-Newton step; they never leave the bounds."""
         step = self.linear.step(_DAMPING, self.free.bounds)
         return np.clip(self.coordinates + scale * step, self.free.bounds[:, 0], self.free.bounds[:, 1])
 
-    @property
-    def at_bounds(self) -> np.ndarray:
-        """Mask [coordinates] of those at a bound, which can make no room for anything else."""
-        low, high = self.free.bounds.T
-        return (self.coordinates <= low) | (self.coordinates >= high)
-
 
 def refine(fits: Sequence[Fit], evaluate: Evaluate, rounds: int) -> list[Fit]:
-    """Moves every fit towards its least loss, all of them in the same batches of simulations.
+    """Moves every fit towards its least cost, all of them in the same batches of simulations.
 
-    A round tries a whole and a short Gauss-Newton step of every fit and keeps the better one, if it lowers the loss.
+    A round tries a whole and a short Gauss-Newton step of every fit and keeps the better one, if it lowers the cost.
     A fit that gained less than chance in two rounds in a row is done. One whose trials are all not finite is returned
     with `finite=False`.
     """
     fits, idle = list(fits), [0] * len(fits)
     for _ in range(rounds):
-        active = [index for index, count in enumerate(idle) if count < _PATIENCE]
+        active = [index for index, count in enumerate(idle) if count < _PATIENCE and fits[index].finite]
         if not active:
             break
         # All trials of all fits go into one batch, since a device simulates many as fast as one.
@@ -123,8 +126,8 @@ def refine(fits: Sequence[Fit], evaluate: Evaluate, rounds: int) -> list[Fit]:
         vectors = [p @ fits[index].free.directions for index, pair in zip(active, trials, strict=True) for p in pair]
         found = evaluate(np.stack(vectors)).reshape(len(active), len(_SCALES), -1)
         for index, points, residuals in zip(active, trials, found, strict=True):
-            before, fits[index] = fits[index].linear.loss, _best_trial(fits[index], points, residuals)
-            idle[index] = idle[index] + 1 if before - fits[index].linear.loss < _IDLE else 0
+            before, fits[index] = fits[index].cost, _best_trial(fits[index], points, residuals)
+            idle[index] = idle[index] + 1 if before - fits[index].cost < _IDLE else 0
     return fits
 
 
@@ -133,100 +136,115 @@ def polish(fits: Sequence[Fit], evaluate: Evaluate, rounds: int) -> list[Fit]:
 
     It costs one simulation for each coordinate. With no rounds it only renews the slopes.
     """
+    return refine(with_slopes(fits, [np.ones(len(fit.coordinates), bool) for fit in fits], evaluate), evaluate, rounds)
+
+
+def with_slopes(fits: Sequence[Fit], which: Sequence[np.ndarray], evaluate: Evaluate) -> list[Fit]:
+    """Takes the slopes of some coordinates, `which` [coordinates] of every fit, as secants where the fits stand."""
     steps = [_secant_step(fit) for fit in fits]
-    found = evaluate_groups(
-        evaluate,
-        [
-            [(fit.coordinates + step) @ fit.free.directions for step in np.diag(size)]
-            for fit, size in zip(fits, steps, strict=True)
-        ],
-    )
-    fresh = [
-        replace(fit, jacobian=np.where(np.isfinite(moved), (moved - fit.residual) / size[:, None], 0.0).T)
-        for fit, size, moved in zip(fits, steps, found, strict=True)
+    groups = [
+        (fit.coordinates + np.diag(step)[mine]) @ fit.free.directions
+        for fit, mine, step in zip(fits, which, steps, strict=True)
     ]
-    return refine(fresh, evaluate, rounds)
+    found = np.split(evaluate(np.concatenate(groups)), np.cumsum([len(group) for group in groups])[:-1])
+    fresh = []
+    for fit, mine, step, moved in zip(fits, which, steps, found, strict=True):
+        jacobian = fit.jacobian.copy()
+        jacobian[:, mine] = np.nan_to_num((moved - fit.residual) / step[mine, None], posinf=0.0, neginf=0.0).T
+        fresh.append(replace(fit, jacobian=jacobian))
+    return fresh
 
 
-def fit_prior(prior: Free, evaluate: Evaluate, slopes: np.ndarray, weight: float) -> Fit:
-    """Fits the prior directions alone to a log, from the nominal model on.
-
-    Args:
-      prior: the directions that are free under every hypothesis.
-      evaluate: residuals of vectors on the log.
-      slopes: [segments, bins, components, directions] at the nominal model, in floor units. They may be another log's
-        of the same motion: a fit corrects them as it goes.
-      weight: share of the features that count as independent.
-    """
-    zero = np.zeros(len(prior.sd))
-    residual = evaluate((zero @ prior.directions)[None])[0]
-    return refine([Fit(prior, zero, residual, slopes.reshape(-1, len(zero)), weight)], evaluate, _PRIOR_ROUNDS)[0]
-
-
-def fit_at(free: Free, coordinates: np.ndarray, weight: float, evaluate: Evaluate) -> Fit:
+def fit_at(free: Free, coordinates: np.ndarray, counts: Counts, evaluate: Evaluate) -> Fit:
     """Makes a fit of which only the coordinates are known: simulates its residuals and takes its slopes.
 
     Args:
       free: what the coordinates are.
       coordinates: [coordinates] where the fit stands.
-      weight: share of the features that count as independent.
+      counts: how many independent numbers residuals are worth.
       evaluate: residuals of vectors.
     """
     residual = evaluate((coordinates @ free.directions)[None])[0]
-    # Polishing with no rounds fills them in.
-    slopes = np.zeros((len(residual), len(coordinates)))
-    return polish([Fit(free, coordinates, residual, slopes, weight)], evaluate, 0)[0]
+    return polish([Fit(free, coordinates, residual, np.zeros((len(residual), len(coordinates))), counts)], evaluate, 0)[
+        0
+    ]
 
 
-def evaluate_groups(evaluate: Evaluate, groups: Sequence[Sequence[np.ndarray]]) -> list[np.ndarray]:
-    """Evaluates the vectors of all groups in one batch; returns residuals [vectors of the group, features] by group."""
-    found = evaluate(np.stack([vector for group in groups for vector in group]))
-    return np.split(found, np.cumsum([len(group) for group in groups])[:-1])
+def begin(
+    base: Fit,
+    hypotheses: Sequence[Sequence[Hypothesis]],
+    points: Sequence[np.ndarray],
+    starts: Sequence[np.ndarray],
+    evaluate: Evaluate,
+) -> list[Fit]:
+    """Adds hypotheses to a model, each group of them to a model of its own, with secants along their coordinates.
+
+    Args:
+      base: the model without them.
+      hypotheses: what is added, a group for every fit.
+      points: [parameters] coordinates of each group, one hypothesis behind the other.
+      starts: [coordinates of the base] for each group: where what was free already begins.
+      evaluate: residuals of vectors.
+
+    Returns:
+      A fit for every group. Its last coordinates are the group's own.
+    """
+    fits = []
+    for group, point, start in zip(hypotheses, points, starts, strict=True):
+        keeps = ~np.any([taken_over(base.free, hypothesis) for hypothesis in group], axis=0)
+        free = base.free.only(keeps)
+        for hypothesis in group:
+            free = free.and_then(own_coordinates(hypothesis))
+        # The Jacobian of the base serves as a first one; own slopes follow below.
+        none = np.zeros((len(base.residual), len(point)))
+        jacobian = np.concatenate([base.jacobian[:, keeps], none], axis=1)
+        coordinates = np.clip(np.concatenate([start[keeps], point]), *free.bounds.T)
+        fits.append(replace(base, free=free, coordinates=coordinates, jacobian=jacobian))
+    found = evaluate(np.stack([fit.vector for fit in fits]))
+    fits = [
+        replace(fit, residual=residual, finite=bool(np.isfinite(residual).all()))
+        for fit, residual in zip(fits, found, strict=True)
+    ]
+    own = [
+        np.arange(len(fit.coordinates)) >= len(fit.coordinates) - len(p) for fit, p in zip(fits, points, strict=True)
+    ]
+    return with_slopes(fits, own, evaluate)
 
 
-def probing_step(hypothesis: Hypothesis, point: np.ndarray) -> np.ndarray:
-    """Says how far to go from a point for a hypothesis' first secants, [parameters], inwards from an upper bound."""
-    size = 0.2 * np.abs(point) + 0.2 * hypothesis.probes.max(axis=0) + 0.02 * (hypothesis.probes == 0).all(axis=0)
-    return np.where(point + size > hypothesis.bounds[:, 1], -size, size)
+def without(fit: Fit, hypothesis: Hypothesis, prior: Free, slopes: np.ndarray) -> Fit:
+    """Takes an effect out of a model; the nominal parameters that it had taken over are free again, at zero.
+
+    Residuals are still those of the model with it.
+
+    Args:
+      fit: the model.
+      hypothesis: part of it.
+      prior: the directions that are free under every hypothesis.
+      slopes: [features, directions] along them.
+    """
+    own = fit.along(hypothesis)
+    kept = fit.free.only(~own)
+    mine = taken_over(prior, hypothesis)
+    return replace(
+        fit,
+        free=prior.only(mine).and_then(kept),
+        coordinates=np.concatenate([np.zeros(mine.sum()), fit.coordinates[~own]]),
+        jacobian=np.concatenate([slopes[:, mine], fit.jacobian[:, ~own]], axis=1),
+    )
 
 
-def best_point(fit: Fit, residuals: np.ndarray) -> int:
-    """Chooses, among residuals [points, features], the point with the least misfit that a step of `fit` would leave."""
-    misfits = []
-    for residual in residuals:
-        linear = replace(fit, residual=residual).linear
-        misfits.append(np.sum((residual + linear.jacobian @ linear.step(_DAMPING)) ** 2))
-    return int(np.argmin(np.where(np.isfinite(misfits), misfits, np.inf)))
+def own_coordinates(hypothesis: Hypothesis) -> Free:
+    """The coordinates that a hypothesis adds to a model."""
+    return Free(hypothesis.directions, hypothesis.prior, hypothesis.bounds, np.zeros(len(hypothesis.prior), bool))
 
 
 def taken_over(free: Free, hypothesis: Hypothesis) -> np.ndarray:
     """Mask [coordinates] of the nominal parameters that a hypothesis takes over, prior and all.
 
     A hypothesis about a link's mass replaces the mass that is free from the start: it has wider bounds and its own
-    prior, and beside it the old coordinate would be the same direction twice.
+    prior, and beside it the old coordinate would be the same direction twice. Only a hypothesis with a single parameter
+    can be a nominal one.
     """
-    return np.any([_taken_by_single(free, part) for part in hypothesis.singles], axis=0)
-
-
-def hand_over(fit: Fit, own: np.ndarray, hypothesis: Hypothesis) -> tuple[Fit, np.ndarray]:
-    """Takes the coordinates `own` [coordinates] out of a fit, on behalf of a hypothesis.
-
-    Returns:
-      The fit without them, and where they stood in the hypothesis' coordinates, [parameters].
-    """
-    stood, start = np.zeros(len(hypothesis.directions)), 0
-    # The first coordinate of a part is the one that a nominal parameter stands for.
-    for part in hypothesis.singles:
-        mine, direction = own & _taken_by_single(fit.free, part), part.directions[0]
-        vector = fit.coordinates[mine] @ fit.free.directions[mine]
-        stood[start] = (vector[direction != 0] / direction[direction != 0]).mean()
-        start += len(part.directions)
-    kept = replace(fit, free=fit.free.only(~own), coordinates=fit.coordinates[~own], jacobian=fit.jacobian[:, ~own])
-    return kept, stood
-
-
-def _taken_by_single(free: Free, hypothesis: Hypothesis) -> np.ndarray:
-    """As `taken_over`, of a hypothesis that is no pair; only one with a single parameter can be a nominal one."""
     if len(hypothesis.directions) > 1:
         return np.zeros(len(free.sd), bool)
     mine = hypothesis.directions[0] != 0
@@ -250,7 +268,7 @@ def _best_trial(fit: Fit, points: Sequence[np.ndarray], residuals: np.ndarray) -
             continue
         learnt = _broyden(learnt, point, residual)
         moved = replace(fit, coordinates=point, residual=residual)
-        if moved.linear.loss < (best or fit).linear.loss:
+        if moved.cost < (best or fit).cost:
             best = moved
     if learnt is fit and not np.isfinite(residuals).all():
         return replace(fit, finite=False)

@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 
 from jaxtune.discovery.fit import Fit
-from jaxtune.discovery.noise_floor import Floor, NoiseFloor
+from jaxtune.discovery.noise_floor import Floor
 from jaxtune.discovery.problem import Problem
-from jaxtune.discovery.resample import blocks
+from jaxtune.discovery.resample import times_drawn, units
 from jaxtune.discovery.state import State
 
 _PUSH = 0.05  # coordinate of the torque that the slopes are secants of
@@ -16,31 +16,30 @@ _LASSO_ROUNDS = 300
 _LEAST_SEGMENTS = 3  # in which a regime must occur to be reported
 
 
-def localise(problem: Problem, floor: NoiseFloor, state: State) -> State:
+def localise(problem: Problem, at: Floor, state: State, fit: Fit) -> State:
     """Finds the cells above the floor, the first time, and the joints that need a torque of their own, every time.
 
-    The first says to a person where the model is wrong. The second tells the screen at which joints to look: a joint
-    that no torque could help lacks nothing.
+    Both say to a person where the model is wrong.
 
     Args:
       problem: the simulator and the segments.
-      floor: the noise floor; its null logs give the penalty, if that is not known.
-      state: where the model stands, fitted at the main horizon.
+      at: the floor at the main horizon; its null logs give the penalty, if that is not known.
+      state: what is known so far.
+      fit: where the model stands.
 
     Returns:
       The state with `where`, `needs_torque` and `penalty`.
     """
-    at, fit = floor[problem.main_horizon], state.fits[problem.main_horizon]
     residual = at.unflatten(fit.residual)
     if problem.push:
-        slopes = torque_slopes(problem, at, fit.vector)
-        penalty = state.penalty or null_penalty(at.null_fits, slopes)
+        slopes = torque_slopes(problem, at, fit)
+        penalty = state.penalty or null_penalty(at.null_residuals, slopes)
         need = free_torque(residual.reshape(len(residual), -1), slopes, penalty)
         needs_torque = dict(zip(problem.push, need.tolist(), strict=True))
         state = replace(state, penalty=penalty, needs_torque=needs_torque)
     if state.where:
         return state
-    segments = problem.data["train"][problem.main_horizon]
+    segments = problem.data["train"][at.horizon]
     # The regime of a bin is that of its first row.
     regimes = segments.regimes[:, :: problem.bin_rows][:, : residual.shape[1]]
     return replace(state, where=tuple(cells(residual, regimes, problem.regimes, problem.cells, segments.run)))
@@ -68,7 +67,8 @@ def cells(
       A dictionary for every cell: `joint`, `signal`, `regime`, `excess_floor_units` with its 95 % interval `low` and
       `high`, and `bins`, how many there were.
     """
-    draws = blocks(run, 200)
+    energy = (residual**2).mean(axis=1)
+    times = times_drawn(units(run, energy, 0), 200)
     joints = [joint for signal, joint in components if signal == "q"]
     found = []
     for index, (signal, joint) in enumerate(components):
@@ -80,7 +80,7 @@ def cells(
             if (count > 0).sum() < _LEAST_SEGMENTS:
                 continue
             energy = (residual[..., index] ** 2 * there).sum(axis=1)
-            resampled = energy[draws].sum(axis=1) / np.maximum(count[draws].sum(axis=1), 1.0)
+            resampled = times @ energy / np.maximum(times @ count, 1.0)
             low, high = (excess(bound) for bound in np.quantile(resampled, (0.025, 0.975)))
             found.append(
                 {
@@ -101,16 +101,16 @@ def excess(energy: float) -> float:
     return float(np.sqrt(max(energy - 1.0, 0.0)))
 
 
-def torque_slopes(problem: Problem, at: Floor, vector: np.ndarray) -> np.ndarray:
-    """Takes secants along a constant torque at every joint of `problem.push`, from a model [axes].
+def torque_slopes(problem: Problem, at: Floor, fit: Fit) -> np.ndarray:
+    """Takes secants along a constant torque at every joint of `problem.push`, from a model.
 
     Returns:
       [segments, features of a segment, joints] in floor units.
     """
     directions = np.zeros((len(problem.push), problem.axes))
     directions[np.arange(len(directions)), list(problem.push.values())] = _PUSH
-    slopes = at.secants(vector, directions) / at.scale["train"][..., None]
-    return slopes.reshape(len(slopes), -1, len(directions))
+    slopes = (at.residuals["train"](fit.vector + directions) - fit.residual).T
+    return at.unflatten(slopes).reshape(-1, at.scale["train"].size, len(directions))
 
 
 def free_torque(residual: np.ndarray, slopes: np.ndarray, penalty: float) -> np.ndarray:
@@ -144,14 +144,14 @@ def free_torque(residual: np.ndarray, slopes: np.ndarray, penalty: float) -> np.
     return np.sqrt((torque**2).sum(axis=0))
 
 
-def null_penalty(null_fits: Sequence[Fit], slopes: np.ndarray) -> float:
+def null_penalty(null_residuals: np.ndarray, slopes: np.ndarray) -> float:
     """Finds the smallest penalty under which no joint of any null log needs a torque.
 
     Args:
-      null_fits: the prior directions fitted to every null log.
+      null_residuals: [logs, features] what fits of the prior directions leave of every null log.
       slopes: [segments, features, joints] of a constant torque at each joint.
     """
-    return max(least_penalty(log.residual.reshape(len(slopes), -1), slopes) for log in null_fits)
+    return max(least_penalty(log.reshape(len(slopes), -1), slopes) for log in null_residuals)
 
 
 def least_penalty(residual: np.ndarray, slopes: np.ndarray) -> float:

@@ -11,15 +11,18 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
+import jax
 import numpy as np
 
-from jaxtune.discovery.fit import Fit, Free, fit_prior
-from jaxtune.discovery.least_squares import Linear
-from jaxtune.discovery.problem import Problem
-from jaxtune.discovery.simulation import Evaluate, flat_residuals, residuals, secants
+from jaxtune.discovery.fit import Free
+from jaxtune.discovery.least_squares import Counts, Linear
+from jaxtune.discovery.problem import Problem, Segments
+from jaxtune.discovery.simulation import Evaluate, flat_residuals, paired_residuals, residuals
 
-_FURTHEST = 9.0  # prior deviations: with a spread of a tenth, further down a positive parameter would be negative
-_LATEST = 2.0  # timing directions are half a controller period, and nothing is later than a whole one
+FURTHEST = 3.0
+"""Prior standard deviations that a nominal parameter may move. One that stops there is a finding, not a nuisance."""
+
+_STEPS = 3  # of the fits to null logs; a tenth off in the parameters, one step would leave an engine gap
 _LEAST_SHARE = 0.25  # of a component's mean floor: else the first rows of a segment would count without end
 
 Say = Callable[[str], None]
@@ -38,29 +41,24 @@ class Floor:
     scale: Mapping[str, np.ndarray]
     """[bins, components] by split: the rms residual where nothing is missing. Splits differ, since the same model is
     further off in some postures than in others."""
-    weight: float
-    """Share of the bins that count as independent; neighbours in time go together."""
+    counts: Counts
+    """How many independent numbers residuals are worth."""
     residuals: Mapping[str, Evaluate]
     """By split: simulates vectors [n, axes] and returns residuals [n, features] in floor units."""
-    secants: Callable[[np.ndarray, np.ndarray], np.ndarray]
-    """`secants(vector [axes], directions [k, axes])`: differences of the residuals on `train`, [segments, bins,
-    components, k], in the signals' units."""
+    on_some: Callable[[np.ndarray], Evaluate]
+    """The same of `train` on some of its segments, by their indices."""
     prior: Free
     """The prior directions, which are free under every hypothesis."""
-    null_fits: tuple[Fit, ...] = ()
-    """The prior directions fitted to `train` of every null log; empty where the floor came from a `Calibration`."""
+    null_residuals: np.ndarray
+    """[logs, features]: what fits of the prior directions leave of the null logs' `train`, in floor units."""
 
     @cached_property
     def slopes(self) -> np.ndarray:
-        """Secants along the prior directions from the nominal model, in floor units.
-
-        They are simulated at the first use: with a calibration, most horizons never need them.
-
-        Returns:
-          [segments, bins, components, directions]
-        """
-        nominal = np.zeros(self.prior.directions.shape[1])
-        return self.secants(nominal, self.prior.directions) / self.scale["train"][..., None]
+        """Secants along the prior directions from the nominal model on `train`, [features, directions], simulated at
+        the first use."""
+        nominal = np.zeros((1, self.prior.directions.shape[1]))
+        found = self.residuals["train"](np.concatenate([nominal, self.prior.directions]))
+        return (found[1:] - found[:1]).T
 
     def unflatten(self, flat: np.ndarray) -> np.ndarray:
         """Reshapes flat residuals [features, ...], which fits work on, to [segments, bins, components, ...]."""
@@ -71,53 +69,6 @@ NoiseFloor = Mapping[float, Floor]
 """A floor for every horizon in s."""
 
 
-@dataclass(frozen=True)
-class Calibration:
-    """What simulated null logs taught, for other logs of the same robot, the same motion and the same noise.
-
-    To measure it takes as long as a discovery. A benchmark with many logs of one robot measures it once with
-    `workflow.calibrate` and hands it to every `workflow.discover`, whose problems then need no null logs.
-    """
-
-    floors: dict[float, tuple[Mapping[str, np.ndarray], float]]
-    """Floor [bins, components] by split, and the independent share, by horizon."""
-    gain: float
-    """Gain (fall of the loss) that the best hypothesis exceeds on null logs with probability `Settings.level`."""
-    penalty: float
-    """Smallest weight of the group lasso (`localise.free_torque`) at which no joint of a null log gets a torque."""
-
-
-def measure(problem: Problem, calibration: Calibration | None, say: Say) -> NoiseFloor:
-    """Measures the noise floor at every horizon, or takes it from a calibration.
-
-    Args:
-      problem: its null logs are simulated and fitted, unless there is a calibration.
-      calibration: floors that are known already.
-      say: receives a line of text about progress.
-    """
-    floor = {}
-    for horizon in problem.horizons:
-        say(f"noise floor at {horizon:g} s")
-        floor[horizon] = measure_at(problem, horizon, calibration.floors[horizon] if calibration else None)
-    return floor
-
-
-def measure_at(problem: Problem, horizon: float, known: tuple[Mapping[str, np.ndarray], float] | None = None) -> Floor:
-    """Measures the noise floor at one horizon from the problem's null logs, unless its scale and weight are known."""
-    prior = prior_directions(problem)
-    scale, weight, null_fits = (*known, ()) if known else _from_null_logs(problem, horizon, prior)
-    segments = {split: data[horizon] for split, data in problem.data.items()}
-    return Floor(
-        horizon=horizon,
-        scale=scale,
-        weight=weight,
-        residuals={split: partial(flat_residuals, problem, segments[split], scale[split]) for split in segments},
-        secants=partial(secants, problem, segments["train"]),
-        prior=prior,
-        null_fits=null_fits,
-    )
-
-
 def prior_directions(problem: Problem) -> Free:
     """Lists what is free under every hypothesis: the nominal parameters, and the controller's timing.
 
@@ -126,87 +77,150 @@ def prior_directions(problem: Problem) -> Free:
     """
     # Entries of the prior that are zero are axes of effects, which the nominal model has not.
     directions = np.concatenate([np.diag(problem.prior)[problem.prior > 0], problem.timing])
+    bounds = np.concatenate(
+        [np.tile([-FURTHEST, FURTHEST], (np.count_nonzero(problem.prior), 1)), problem.timing_bounds]
+    )
     count = len(directions)
-    bounds = np.tile([-_FURTHEST, _FURTHEST], (count, 1))
-    # A controller does not act before it is time.
-    bounds[count - len(problem.timing) :] = [0.0, _LATEST]
     return Free(directions, np.ones(count), bounds, np.ones(count, bool))
 
 
-def prior_slopes(problem: Problem, horizon: float) -> np.ndarray:
-    """Takes secants of the measured log's residuals along the prior directions, at the nominal model on `train`.
+def measure(problem: Problem, say: Say) -> NoiseFloor:
+    """Measures the noise floor at every horizon from the problem's null logs.
 
-    Returns:
-      [segments, bins, components, directions], in the units of the signals.
+    The null logs are fitted at the main horizon. Other horizons and splits get their floors from what these fits leave
+    there, where nothing was fitted, as in the measured log.
+
+    Args:
+      problem: its null logs are simulated and fitted.
+      say: receives a line of text about progress.
     """
-    directions = prior_directions(problem).directions
-    return secants(problem, problem.data["train"][horizon], np.zeros(problem.axes), directions)
+    prior, main = prior_directions(problem), problem.main_horizon
+    say(f"noise floor at {main:g} s")
+    train = _merged(problem, "train", main)
+    fits, unit = _fit_null_logs(problem, prior, train)
+    found = {}
+    for horizon in problem.horizons:
+        say(f"noise floor at {horizon:g} s")
+        left = {split: _simulated(problem, split, horizon, fits) for split in problem.data}
+        scale = {split: _rms_floor(values) for split, values in left.items()}
+        in_units = left["train"] / scale["train"]
+        segments = {split: data[horizon] for split, data in problem.data.items()}
+        found[horizon] = Floor(
+            horizon=horizon,
+            scale=scale,
+            counts=Counts(
+                components=unit.shape[-1], independent=independent_share(in_units.reshape(-1, *in_units.shape[2:]))
+            ),
+            residuals={
+                split: partial(flat_residuals, problem, segments[split], scale[split]) for split in problem.data
+            },
+            on_some=partial(_on_some, problem, segments["train"], scale["train"]),
+            prior=prior,
+            null_residuals=in_units.reshape(len(fits), -1),
+        )
+    return found
 
 
-def left_by_prior(residual: np.ndarray, slopes: np.ndarray, weight: float) -> np.ndarray:
-    """Residuals [...] that one linear step along the prior directions leaves, by slopes [..., directions].
-
-    A quick estimate of what a fit would leave; it costs no simulation.
-    """
-    count = slopes.shape[-1]
-    linear = Linear(residual.ravel(), slopes.reshape(-1, count), np.zeros(count), np.ones(count), weight)
-    return residual + slopes @ linear.step()
-
-
-def _from_null_logs(
-    problem: Problem, horizon: float, prior: Free
-) -> tuple[dict[str, np.ndarray], float, tuple[Fit, ...]]:
-    """Floor by split, independent share, and the fits to the null logs.
-
-    The unit in which a fit weighs residuals is the floor that is looked for. So two rounds with linearised fits find a
-    first floor, then full fits in its units find the one that counts. The other splits get theirs from what these fits
-    leave there, where nothing was fitted, as in the measured log.
-    """
-    simulate, slopes = partial(residuals, problem), prior_slopes(problem, horizon)
-    train = [log["train"][horizon] for log in problem.null_logs]
-    raw = [simulate(np.zeros(problem.axes), log)[0] for log in train]
-    unit, weight = np.sqrt((np.concatenate(raw) ** 2).mean(axis=0)), 1.0
-    # The first unit holds what the nominal parameters are off, which the second no longer does.
-    for _ in range(2):
-        left = np.stack([left_by_prior(log / unit, slopes / unit[..., None], weight) for log in raw])
-        unit, weight = _rms_floor(unit, left), _independent_share(left)
-    evaluate = [partial(flat_residuals, problem, log, unit) for log in train]
-    fits = [fit_prior(prior, residuals_of, slopes / unit[..., None], weight) for residuals_of in evaluate]
-    left = np.stack([fit.residual.reshape(raw[0].shape) for fit in fits])
-    scale, weight = {"train": _rms_floor(unit, left)}, _independent_share(left)
-    # Nothing is fitted there: the fit to `train` is taken as it is.
-    for split in problem.data.keys() - scale.keys():
-        logs = zip(fits, problem.null_logs, strict=True)
-        there = [simulate(fit.vector, log[split][horizon])[0] for fit, log in logs]
-        scale[split] = _rms_floor(np.ones_like(unit), np.stack(there))
-    return scale, weight, tuple(_in_units(fit, (unit / scale["train"]).ravel(), weight) for fit in fits)
-
-
-def _rms_floor(unit: np.ndarray, left: np.ndarray) -> np.ndarray:
-    """The floor [bins, components] from what fits left of null logs, [logs, segments, bins, components] in a unit."""
-    fresh = unit * np.sqrt((_every_segment(left) ** 2).mean(axis=0))
-    return np.maximum(fresh, _LEAST_SHARE * fresh.mean(axis=0))
-
-
-def _independent_share(left: np.ndarray) -> float:
-    """Independent bins of a segment as a share of all its bins.
+def independent_share(residual: np.ndarray) -> float:
+    """Estimates independent bins of a segment as a share of all its bins, from residuals [segments, bins, components].
 
     The mean of n independent bins has 1/n of their variance: n is found from how the means of segments scatter.
     """
-    residual = _every_segment(left)
     whole = (residual**2).mean(axis=(0, 1))
     of_means = (residual.mean(axis=1) ** 2).mean(axis=0)
-    return float(
-        np.clip((whole / np.maximum(of_means, 1e-12)).mean() / residual.shape[1], 1.0 / residual.shape[1], 1.0)
+    least = 1.0 / residual.shape[1]
+    return float(np.clip((whole / np.maximum(of_means, 1e-12)).mean() * least, least, 1.0))
+
+
+def with_systematic_share(floor: NoiseFloor, at: Floor, residual: np.ndarray) -> NoiseFloor:
+    """Sets how much independent evidence a misfit holds, from what the null leaves of the measured log.
+
+    What a wrong model leaves goes together for longer than noise does, so that the same number of rows says less.
+
+    Args:
+      floor: of all horizons.
+      at: the one at which the residual was simulated; the others get the same number of segments' worth.
+      residual: [features] on `train`.
+    """
+    share = independent_share(at.unflatten(residual))
+    bins = len(at.scale["train"])
+    return {
+        horizon: replace(
+            one,
+            counts=replace(one.counts, systematic=min(share * bins / len(one.scale["train"]), one.counts.independent)),
+        )
+        for horizon, one in floor.items()
+    }
+
+
+def _fit_null_logs(problem: Problem, prior: Free, train: Segments) -> tuple[np.ndarray, np.ndarray]:
+    """Fits the prior directions to every null log, all side by side; returns vectors [logs, axes] and the unit.
+
+    The unit in which a fit weighs residuals is the floor that is looked for, so both are found in turn.
+    """
+    logs, main = len(problem.null_logs), problem.main_horizon
+    measured = problem.data["train"][main]
+    nominal = np.zeros((1, problem.axes))
+    found = residuals(problem, np.concatenate([nominal, prior.directions]), measured)
+    slopes = np.moveaxis(found[1:] - found[:1], 0, -1)
+    which = np.repeat(np.arange(logs), len(train.run) // logs)
+    coordinates, share = np.zeros((logs, len(prior.sd))), 1.0
+    for number in range(_STEPS):
+        raw = paired_residuals(problem, coordinates @ prior.directions, train, which, np.arange(len(which)))
+        raw = raw.reshape(logs, -1, *raw.shape[1:])
+        unit = np.sqrt((raw**2).mean(axis=(0, 1)))
+        # The first unit holds what the nominal parameters are off, which the second no longer does.
+        for _ in range(2 if number == 0 else 1):
+            steps = [
+                _step(prior, point, log / unit, slopes / unit[..., None], share)
+                for point, log in zip(coordinates, raw, strict=True)
+            ]
+            left = np.stack([log + slopes @ step for log, step in zip(raw, steps, strict=True)])
+            unit = np.maximum(np.sqrt((left**2).mean(axis=(0, 1))), 1e-9)
+            share = independent_share((left / unit).reshape(-1, *unit.shape))
+        coordinates = np.clip(coordinates + np.stack(steps), *prior.bounds.T)
+    return coordinates @ prior.directions, unit
+
+
+def _step(prior: Free, point: np.ndarray, residual: np.ndarray, slopes: np.ndarray, share: float) -> np.ndarray:
+    """The Gauss-Newton step [coordinates] from a point, with residuals [...] and slopes [..., coordinates]."""
+    weight = np.full(residual.size, share)
+    return Linear(residual.ravel(), slopes.reshape(residual.size, -1), point, prior.sd, weight).step(1e-3, prior.bounds)
+
+
+def _simulated(problem: Problem, split: str, horizon: float, fits: np.ndarray) -> np.ndarray:
+    """Residuals [logs, segments, bins, components] of every null log's own model [logs, axes]."""
+    segments = _merged(problem, split, horizon)
+    which = np.repeat(np.arange(len(fits)), len(segments.run) // len(fits))
+    found = paired_residuals(problem, fits, segments, which, np.arange(len(which)))
+    return found.reshape(len(fits), -1, *found.shape[1:])
+
+
+def _merged(problem: Problem, split: str, horizon: float) -> Segments:
+    """The segments of all null logs behind each other; every log has as many."""
+    logs = [log[split][horizon] for log in problem.null_logs]
+    return replace(
+        logs[0],
+        inputs=jax.tree.map(lambda *leaves: np.concatenate(leaves), *(log.inputs for log in logs)),
+        signals={name: np.concatenate([log.signals[name] for log in logs]) for name in logs[0].signals},
+        run=np.concatenate([log.run for log in logs]),
+        regimes=np.concatenate([log.regimes for log in logs]),
     )
 
 
-def _every_segment(left: np.ndarray) -> np.ndarray:
-    """The segments of all logs in one row, [logs * segments, bins, components]."""
-    return left.reshape(-1, *left.shape[2:])
+def _rms_floor(left: np.ndarray) -> np.ndarray:
+    """The floor [bins, components] from what fits left of null logs, [logs, segments, bins, components]."""
+    fresh = np.sqrt((left**2).mean(axis=(0, 1)))
+    return np.maximum(fresh, _LEAST_SHARE * fresh.mean(axis=0))
 
 
-def _in_units(fit: Fit, change: np.ndarray, weight: float) -> Fit:
-    """A fit whose residuals are multiplied by `change` [bins * components], the old floor over the new one."""
-    residual = (fit.residual.reshape(-1, len(change)) * change).ravel()
-    return replace(fit, residual=residual, weight=weight)
+def _on_some(problem: Problem, segments: Segments, scale: np.ndarray, chosen: np.ndarray) -> Evaluate:
+    """Makes the function from vectors to residuals on the chosen segments."""
+    some = replace(
+        segments,
+        inputs=jax.tree.map(lambda leaf: leaf[chosen], segments.inputs),
+        signals={name: values[chosen] for name, values in segments.signals.items()},
+        run=segments.run[chosen],
+        regimes=segments.regimes[chosen],
+    )
+    return partial(flat_residuals, problem, some, scale)

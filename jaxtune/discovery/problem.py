@@ -11,10 +11,12 @@ from typing import Any
 import jax
 import numpy as np
 
-Simulate = Callable[[jax.Array, Any], Mapping[str, jax.Array]]
-"""`simulate(values [axes], inputs) -> {signal: [rows, components]}`, for one segment.
+Simulate = Callable[[Any, jax.Array, Any, jax.Array], Mapping[str, jax.Array]]
+"""`simulate(system, values [axes], inputs, steps) -> {signal: [rows, components]}`, for one segment.
 
-It must be hashable: programs are compiled once per length of segments, and simulators that are equal share them.
+It must be hashable: programs are compiled once, and simulators that are equal share them. The `system` is an argument,
+so robots that differ in numbers alone, such as masses, share programs as well. The number of `steps` is one too, and
+inputs are padded to the longest segment; rows after the last step may hold anything.
 """
 
 
@@ -36,7 +38,8 @@ class Hypothesis:
     """[parameters, axes]: how far each axis moves per unit of each coordinate. It is one at the first place; at the
     others it converts between the scales of the places, so that the physical size is the same everywhere."""
     probes: np.ndarray
-    """[probes, parameters]: coordinates at which the screen takes secants; the smallest of interest comes first."""
+    """[probes, parameters]: coordinates at which the screen simulates it, the smallest of interest among them. An effect
+    with several sizes, such as x, y and z, has a probe for each of them alone."""
     bounds: np.ndarray
     """[parameters, 2]: least and largest coordinate."""
     prior: np.ndarray
@@ -93,6 +96,8 @@ class Segments:
     """[segments, ...] on every leaf: what the simulator is given (first state, targets, ...)."""
     signals: Mapping[str, np.ndarray]
     """[segments, rows, components] by name: what was measured."""
+    steps: int
+    """Steps of the simulation to the last row."""
     run: np.ndarray
     """[segments]: index of the run that the segment was cut from."""
     regimes: np.ndarray
@@ -108,6 +113,8 @@ class Problem:
     """
 
     simulate: Simulate
+    system: Any
+    """Numbers of the nominal robot, the first argument of `simulate`."""
     axes: int
     """Length of the vector of coordinates."""
     hypotheses: Sequence[Hypothesis]
@@ -115,7 +122,9 @@ class Problem:
     """[axes]: standard deviation of the nominal parameters, which are free under every hypothesis; zero elsewhere."""
     timing: np.ndarray
     """[directions, axes]: one standard deviation along other unknowns that are free from the start: the delay with
-    which the controller reads its sensors and applies its commands."""
+    which the controller reads its sensors and applies its commands, and how targets go on between rows."""
+    timing_bounds: np.ndarray
+    """[directions, 2]: least and largest coordinate along each."""
     data: Mapping[str, Mapping[float, Segments]]
     """Measured segments by split and horizon (their length in s)."""
     null_logs: Sequence[Mapping[str, Mapping[float, Segments]]]
@@ -128,12 +137,14 @@ class Problem:
     """Names of the regimes."""
     components: Mapping[str, tuple[str, ...]]
     """Names of the components of every signal, such as the joints."""
+    trees: np.ndarray
+    """[joints]: number of the kinematic tree that each joint is in; joints of different trees do not move each other."""
     values: Callable[[np.ndarray], np.ndarray] = lambda vectors: vectors
     """Turns coordinates [n, axes] into what the simulator is given, [n, axes]."""
     push: Mapping[str, int] = field(default_factory=dict)
     """Axis of a constant torque by joint, with which `localise` asks where a torque is missing; empty to skip that."""
-    residual: Mapping[str, Hypothesis] = field(default_factory=dict)
-    """A learned torque by joint that names nothing; it joins the model where no hypothesis explains the logs."""
+    residual: Hypothesis | None = None
+    """A learned torque at all joints that names nothing; it bounds what is explainable, and is the fallback."""
 
     @property
     def horizons(self) -> tuple[float, ...]:

@@ -1,22 +1,35 @@
 """The verdict, from open segments, and the proof, on sealed ones (steps 9 and 10)."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from jaxtune.discovery.compete import Start, fit_beside
-from jaxtune.discovery.evaluate import ablate, position_gap, rms
-from jaxtune.discovery.fit import Fit
+from jaxtune.discovery.decide import (
+    Candidate,
+    Thresholds,
+    believed,
+    passes,
+    posterior,
+    rivals,
+    squares,
+    total_cost,
+    units_of,
+    weigh_evidence,
+)
+from jaxtune.discovery.evaluate import position_gap, rms
+from jaxtune.discovery.fit import Fit, begin, polish, refine
 from jaxtune.discovery.noise_floor import Floor, NoiseFloor, Say
-from jaxtune.discovery.problem import Problem
+from jaxtune.discovery.problem import Hypothesis, Problem
 from jaxtune.discovery.resample import standard_errors
-from jaxtune.discovery.result import Result, Settings
-from jaxtune.discovery.screen import looks_like, secant_columns
+from jaxtune.discovery.result import AcceptedTerm, Result, Settings
 from jaxtune.discovery.state import State
 
 _PERFECT = 1.0  # floor units
+_WORSE, _WORSE_FLOORS = 1.1, 0.2  # on sealed: what withdraws a model
+_SUSPECTS = 8
+_BOUND = 1e-6  # of the width of the bounds: how near to one a coordinate is at it
 
 
 @dataclass(frozen=True)
@@ -24,68 +37,136 @@ class Conclusion:
     """The verdict and what it stands on, before any sealed segment was looked at; the fields are those of `Result`."""
 
     verdict: str
+    best: Candidate
+    terms: tuple[AcceptedTerm, ...]
+    ablated: Mapping[str, np.ndarray]
+    """The model [axes] without each of the terms, by key."""
     errors: np.ndarray
+    suspects: tuple[tuple[Hypothesis, float], ...]
+    explained_share: float
+    models: Mapping[str, np.ndarray]
+    """Vectors [axes] that may become the corrected model, by what they are; the chosen one is first."""
     changed: Mapping[int, float]
-    changed_alike: Mapping[int, tuple[str, ...]]
-    residual: Fit | None
+    dropped: tuple[str, ...]
+    rejected: Mapping[str, Any]
+    details: Mapping[str, Any]
 
 
 def conclude(settings: Settings, problem: Problem, floor: NoiseFloor, state: State, say: Say) -> Conclusion:
     """Reaches the verdict from `train` and `select` together.
 
-    From `select` alone it would depend on how the floor of a few postures compares with that of all. Where the model
-    does not explain the logs, no parameter is called changed: parameters of a wrong model mean nothing.
-
     Args:
-      settings: what counts as explained and as changed.
+      settings: what counts as explained.
       problem: the hypotheses, and the torque that stands in where none fits.
       floor: the noise floor.
-      state: after the last step, fitted at the main horizon.
+      state: after the last step.
       say: receives a line of text about progress.
     """
-    at, fit = floor[problem.main_horizon], state.fits[problem.main_horizon]
-    errors = standard_errors(fit, problem.data["train"][at.horizon].run)
-    null, after = (position_gap(problem, rms(at, one.vector[None])[0]) for one in (state.null, fit))
-    if not _explains(settings, bool(state.terms), null, after):
-        learned = _with_learned_torque(settings, problem, at, state)
-        return Conclusion("unnamed", errors, changed={}, changed_alike={}, residual=learned)
-    changed = _changed_parameters(settings, problem, fit, errors)
-    alike = _mistaken_for(settings, problem, at, state, tuple(changed), say)
-    # A term about a nominal parameter is a change, however large: the model has the parameter.
-    if any(not problem.is_nominal(term.hypothesis) for term in state.terms):
+    at = floor[problem.main_horizon]
+    say("evidence")
+    best, terms, ablated, failed = _proved(settings, problem, floor, state)
+    candidates = sorted(
+        {one.key: one for one in (best, *state.candidates)}.values(), key=lambda one: total_cost(at, one, state.price)
+    )
+    probabilities = posterior(problem, at, candidates, state.price)
+    terms = tuple(
+        replace(term, confusable_with=rivals(at, candidates, probabilities, best, term.hypothesis, settings))
+        for term in terms
+    )
+    say("learned torque")
+    learned = learn(settings, problem, at, best)
+    models = _by_select(at, state, best, learned)
+    null, after, bound = (_open_gap(problem, at, one) for one in (state.null, best, learned))
+    explains = _explains(settings, bool(terms), null, after)
+    changed = _at_bounds(problem, best.fit) if explains else {}
+    if not explains:
+        verdict = "unnamed"
+    elif any(not problem.is_nominal(term.hypothesis) for term in terms):
+        # A term about a nominal parameter is a change, however large: the model has the parameter.
         verdict = "named"
     else:
-        verdict = "parameter_change" if changed or state.terms else "no_missing_effect"
-    return Conclusion(verdict, errors, changed, alike, residual=None)
+        verdict = "parameter_change" if changed or terms else "no_missing_effect"
+    unit = units_of(problem, at, squares(at, best))[: len(problem.data["train"][at.horizon].run)]
+    return Conclusion(
+        verdict=verdict,
+        best=best,
+        terms=terms,
+        ablated=ablated,
+        errors=standard_errors(best.fit, unit),
+        suspects=tuple(believed(candidates, probabilities)[:_SUSPECTS]),
+        explained_share=explained(null, after, min(bound, after)),
+        models=models if verdict == "unnamed" else _effects_first(models),
+        changed=changed,
+        dropped=tuple(key for key, _ in failed),
+        rejected=failed[0][1] if failed else {},
+        details={
+            one.key: {"cost": total_cost(at, one, state.price), "probability": float(probability)}
+            for one, probability in zip(candidates, probabilities, strict=True)
+        },
+    )
+
+
+def explained(null: float, after: float, bound: float) -> float:
+    """The share of the explainable gap that is explained: (null^2 - after^2) / (null^2 - bound^2), from 0 to 1.
+
+    Args:
+      null: gap of the model without effects, in floor units.
+      after: gap of the model with them.
+      bound: gap of the model with a learned torque too; what that leaves, no effect of a joint explains either.
+    """
+    room = null**2 - max(bound, _PERFECT) ** 2
+    return float(np.clip((null**2 - max(after, _PERFECT) ** 2) / room, 0.0, 1.0)) if room > 1e-6 else 1.0
+
+
+def learn(settings: Settings, problem: Problem, at: Floor, best: Candidate) -> Candidate:
+    """Fits a learned torque at all joints beside a model: a bound of what is explainable, and a fallback without name.
+
+    Args:
+      settings: rounds of the fit.
+      problem: has the learned torque, or None.
+      at: the floor at the main horizon.
+      best: the model.
+
+    Returns:
+      The model with the torque, or the model itself where there is none.
+    """
+    if problem.residual is None:
+        return best
+    evaluate, point = at.residuals["train"], np.zeros(len(problem.residual.directions))
+    (begun,) = begin(best.fit, [(problem.residual,)], [point], [best.fit.coordinates], evaluate)
+    (fit,) = refine([begun], evaluate, 2 * settings.rounds)
+    return Candidate(best.hypotheses, fit, at.residuals["select"](fit.vector[None])[0])
 
 
 def prove(settings: Settings, problem: Problem, floor: NoiseFloor, state: State, conclusion: Conclusion) -> Result:
     """Simulates the sealed segments, once: the nominal model, the null, the answer, its ablations and its placebos.
 
     An effect is proved if the gap falls on runs that nothing was fitted to, if it opens again without the effect, and
-    if another place or another effect with the same number of rounds does not close it.
+    if another place or another effect does not close it. A model that is worse there than the better of the nominal
+    model and the null is withdrawn: whatever was believed, the user gets the better one.
 
     Args:
-      settings: rounds of the placebos' fits.
+      settings: not used yet beyond what `conclude` did.
       problem: the hypotheses, among which are the placebos.
       floor: the noise floor.
-      state: the model, its terms and the null.
-      conclusion: the verdict, with the learned torque where there is one.
+      state: the models that were fitted, and the null.
+      conclusion: the verdict and the model.
 
     Returns:
       All that was found.
     """
-    at, fit = floor[problem.main_horizon], state.fits[problem.main_horizon]
-    named = {
-        "before": np.zeros(problem.axes),
-        "null": state.null.vector,
-        "after": (conclusion.residual or fit).vector,
-    }
-    others = _placebos(settings, problem, at, state)
-    without = {f"without {term.hypothesis.key}": ablate(at, fit, term.hypothesis).vector for term in state.terms}
-    others = without | others
-    found = rms(at, np.stack([*named.values(), *others.values()]), ("sealed",))
-    of_model = dict(zip([*named, *others], found, strict=True))
+    at = floor[problem.main_horizon]
+    (model_is, model), *_ = conclusion.models.items()
+    named = {"before": np.zeros(problem.axes), "null": state.null.fit.vector, "after": model}
+    others = {f"without {key}": vector for key, vector in conclusion.ablated.items()} | _placebos(state, conclusion)
+    found = at.residuals["sealed"](np.stack([*named.values(), *others.values()]))
+    of_model = dict(zip([*named, *others], (rms(at, one) for one in found), strict=True))
+    gap = {name: position_gap(problem, of_model[name]) for name in named}
+    better = min(gap["before"], gap["null"])
+    withdrawn = gap["after"] > _WORSE * better and gap["after"] > better + _WORSE_FLOORS
+    if withdrawn:
+        model_is = "nominal" if gap["before"] <= gap["null"] else "null"
+        model = conclusion.models[model_is]
     proof = {
         "cells": [
             {"signal": signal, "joint": part} | {name: float(of_model[name][index]) for name in named}
@@ -94,8 +175,77 @@ def prove(settings: Settings, problem: Problem, floor: NoiseFloor, state: State,
         "no_cell_worse": bool((of_model["after"] <= of_model["null"] + 1.0).all()),
         "others": {name: position_gap(problem, of_model[name]) for name in others},
     }
-    gap = {name: position_gap(problem, of_model[name]) for name in named}
-    return _result(fit, state, conclusion, gap, proof)
+    return Result(
+        verdict=conclusion.verdict,
+        terms=conclusion.terms,
+        fit=conclusion.best.fit,
+        errors=conclusion.errors,
+        null=state.null.fit,
+        model=model,
+        model_is=model_is,
+        suspects=conclusion.suspects,
+        explained_share=conclusion.explained_share,
+        withdrawn=bool(withdrawn),
+        where=state.where,
+        needs_torque=state.needs_torque,
+        # What was accepted was shown, whatever the screen had thought of it at the smallest size.
+        not_testable=tuple(n for n in state.not_testable if n not in {t.hypothesis.name for t in conclusion.terms}),
+        not_finite=state.not_finite,
+        dropped=conclusion.dropped,
+        rejected=conclusion.rejected,
+        changed=conclusion.changed,
+        gap=gap,
+        proof=proof,
+        details=conclusion.details,
+    )
+
+
+def _proved(
+    settings: Settings, problem: Problem, floor: NoiseFloor, state: State
+) -> tuple[Candidate, tuple[AcceptedTerm, ...], dict[str, np.ndarray], list[tuple[str, dict]]]:
+    """The cheapest model without the effects that do not pass, which are taken out one by one, the weakest first."""
+    at, failed = floor[problem.main_horizon], []
+    (fit,) = polish([state.best.fit], at.residuals["train"], 0)
+    best, thresholds = replace(state.best, fit=fit), Thresholds(gain=state.price)
+    while True:
+        weighed = {h.key: (h, *weigh_evidence(problem, floor, best, h)) for h in best.hypotheses}
+        tests = {key: passes(evidence, thresholds) for key, (_, evidence, _) in weighed.items()}
+        wrong = [key for key, passed in tests.items() if not all(passed.values())]
+        if not wrong:
+            break
+        weakest = min(wrong, key=lambda key: weighed[key][1].gain)
+        failed.append((weakest, {"hypothesis": weakest, "tests": tests[weakest], "evidence": weighed[weakest][1]}))
+        best = weighed[weakest][2]
+        (fit,) = polish([best.fit], at.residuals["train"], settings.rounds)
+        best = replace(best, fit=fit, select=at.residuals["select"](fit.vector[None])[0])
+    if not best.hypotheses:
+        best = state.null
+        (fit,) = polish([best.fit], at.residuals["train"], 0)
+        best = replace(best, fit=fit)
+    # What explains most is named first.
+    ranked = sorted(weighed.values(), key=lambda row: -row[1].gain)
+    terms = tuple(AcceptedTerm(h, evidence, thresholds, ()) for h, evidence, _ in ranked)
+    return best, terms, {h.key: ablated.fit.vector for h, _, ablated in ranked}, failed
+
+
+def _by_select(at: Floor, state: State, best: Candidate, learned: Candidate) -> dict[str, np.ndarray]:
+    """Models by what they are, the one that is best on `select` first."""
+    fits = {"null": state.null, "effects": best, "learned": learned}
+    models = {"nominal": np.zeros_like(best.fit.vector)} | {name: one.fit.vector for name, one in fits.items()}
+    costs = {name: _gap_on_select(at, one.select) for name, one in fits.items()}
+    costs["nominal"] = _gap_on_select(at, at.residuals["select"](models["nominal"][None])[0])
+    return {name: models[name] for name in sorted(models, key=lambda name: costs[name])}
+
+
+def _gap_on_select(at: Floor, residual: np.ndarray) -> float:
+    """Rms of the worst component on `select`; infinite where the model breaks."""
+    found = float(rms(at, residual).max())
+    return found if np.isfinite(found) else np.inf
+
+
+def _effects_first(models: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Puts the model with the named effects first: a name is worth nothing if the model that is saved has not it."""
+    return {"effects": models["effects"], **models}
 
 
 def _explains(settings: Settings, named: bool, null: float, after: float) -> bool:
@@ -109,77 +259,39 @@ def _explains(settings: Settings, named: bool, null: float, after: float) -> boo
     return not unexplained
 
 
-def _changed_parameters(settings: Settings, problem: Problem, fit: Fit, errors: np.ndarray) -> dict[int, float]:
-    """Nominal axes further from the prior's centre than `settings.changed` deviations and than chance, and how far."""
-    prior = problem.prior
-    deviations = np.divide(fit.vector, prior, out=np.zeros_like(fit.vector), where=prior > 0)
-    error = np.sqrt((errors[:, None] ** 2 * fit.free.directions**2).sum(axis=0))
-    moved = (np.abs(deviations) > settings.changed) & (np.abs(fit.vector) > 1.96 * error)
-    return {int(axis): float(deviations[axis]) for axis in np.flatnonzero(moved)}
+def _open_gap(problem: Problem, at: Floor, candidate: Candidate) -> float:
+    """Gap of the worst position on `train` and `select`."""
+    return position_gap(problem, rms(at, np.concatenate([candidate.fit.residual, candidate.select])))
 
 
-def _mistaken_for(
-    settings: Settings, problem: Problem, at: Floor, state: State, axes: Sequence[int], say: Say
-) -> dict[int, tuple[str, ...]]:
-    """Names of the effects that look like the change of each of these nominal axes."""
-    # The screen's secants may be gone, and to take them anew is as long as a screen.
-    if not axes:
-        return {}
-    fit = state.fits[at.horizon]
-    columns = state.columns or secant_columns(at, fit, problem.hypotheses, say)
-    return {axis: looks_like(fit, columns, axis, problem.hypotheses, settings.same) for axis in axes}
-
-
-def _with_learned_torque(settings: Settings, problem: Problem, at: Floor, state: State) -> Fit | None:
-    """The model with a bounded torque at the joint that needs it most, so that there is a better simulator at least."""
-    need, stand_in = state.needs_torque, problem.residual
-    if not stand_in:
-        return None
-    worst = [cell["joint"] for cell in state.where if cell["joint"] in stand_in]
-    joint = max(need, key=need.get) if any(need.values()) else next(iter(worst or stand_in))
-    start = Start(stand_in[joint], [np.zeros(len(stand_in[joint].directions))])
-    return fit_beside(state.fits[at.horizon], [start], at.residuals["train"], settings.rounds)[0]
-
-
-def _placebos(settings: Settings, problem: Problem, at: Floor, state: State) -> dict[str, np.ndarray]:
-    """The first effect at a wrong place, and a wrong effect at its place: the best of each kind, beside the null."""
-    if not state.terms:
-        return {}
-    truth, hypotheses = state.terms[0].hypothesis, problem.hypotheses
-    kinds = {
-        "wrong place": [h for h in hypotheses if h.name == truth.name and not set(h.places) & set(truth.places)],
-        "wrong effect": [h for h in hypotheses if h.places == truth.places and h.family != truth.family],
-    }
-    found, rounds = {}, 2 * settings.rounds  # as many as an accepted one had
-    for label, options in kinds.items():
-        if options:
-            wrong = max(options, key=lambda h: state.promise.get(h.key, 0.0))
-            (fit,) = fit_beside(state.null, [Start(wrong, list(wrong.probes))], at.residuals["train"], rounds)
-            found[f"{label}: {wrong.key}"] = fit.vector
+def _at_bounds(problem: Problem, fit: Fit) -> dict[int, float]:
+    """Nominal axes that went as far as they may, and how far that is in prior standard deviations."""
+    low, high = fit.free.bounds.T
+    edge = np.minimum(fit.coordinates - low, high - fit.coordinates) < _BOUND * (high - low)
+    found = {}
+    for row, coordinate in zip(fit.free.directions[edge], fit.coordinates[edge], strict=True):
+        for axis in np.flatnonzero(row):
+            if problem.prior[axis] > 0 and problem.prior[axis] == row[axis]:
+                found[int(axis)] = float(coordinate)
     return found
 
 
-def _result(
-    fit: Fit, state: State, conclusion: Conclusion, gap: Mapping[str, float], proof: Mapping[str, Any]
-) -> Result:
-    """Puts together what the steps, the verdict and the proof have found."""
-    # What was accepted was shown, whatever the screen had thought of it at the smallest size.
-    named = {term.hypothesis.name for term in state.terms}
-    return Result(
-        verdict=conclusion.verdict,
-        terms=state.terms,
-        fit=fit,
-        errors=conclusion.errors,
-        null=state.null,
-        where=state.where,
-        needs_torque=state.needs_torque,
-        not_testable=tuple(name for name in state.not_testable if name not in named),
-        not_finite=state.not_finite,
-        dropped=state.dropped,
-        rejected=state.rejected,
-        changed=conclusion.changed,
-        changed_alike=conclusion.changed_alike,
-        residual=conclusion.residual,
-        gap=gap,
-        proof=proof,
-    )
+def _placebos(state: State, conclusion: Conclusion) -> dict[str, np.ndarray]:
+    """The first effect at a wrong place, and a wrong effect at its place: the best of each kind that was fitted."""
+    if not conclusion.terms:
+        return {}
+    truth = conclusion.terms[0].hypothesis
+    singles = sorted((one for one in state.candidates if len(one.hypotheses) == 1), key=lambda one: one.fit.cost)
+    kinds: dict[str, Sequence[Candidate]] = {
+        "wrong place": [
+            one
+            for one in singles
+            if one.hypotheses[0].name == truth.name and not set(one.hypotheses[0].places) & set(truth.places)
+        ],
+        "wrong effect": [
+            one
+            for one in singles
+            if one.hypotheses[0].places == truth.places and one.hypotheses[0].family != truth.family
+        ],
+    }
+    return {f"{label}: {found[0].key}": found[0].fit.vector for label, found in kinds.items() if found}

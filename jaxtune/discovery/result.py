@@ -1,30 +1,27 @@
 """How much a discovery tries, and what it finds."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-
-from jaxtune.discovery.fit import Fit
-from jaxtune.discovery.state import AcceptedTerm
 
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
     """How much a discovery tries, and how much evidence it asks for.
 
-    The defaults are those that the blind benchmark was measured with. More hypotheses on the shortlist cost time; the
-    other numbers trade missed effects against invented ones.
+    More hypotheses on the shortlist cost time; the other numbers trade missed effects against invented ones.
     """
 
-    shortlist: int = 8
-    """Hypotheses that are fitted beside the best of each family."""
-    finalists: int = 4
-    """How many of those are fitted with fresh slopes, at every horizon, and compared."""
-    paired: int = 4
-    """How many of the best are tried two by two where none passes alone. Pairs are tried only while nothing was
-    accepted and the model is above the floor."""
+    shortlist: int = 12
+    """Hypotheses that are fitted, beside the best of each family."""
+    firsts: int = 12
+    """How many of the best hypotheses are screened with every other one as a pair."""
+    pairs: int = 8
+    """How many of the best pairs are fitted."""
+    finalists: int = 6
+    """How many of those are fitted on with fresh slopes."""
     most: int = 4
     """Largest number of effects that are accepted."""
     level: float = 0.05
@@ -35,12 +32,14 @@ class Settings:
     at_floor: float = 1.5
     """Gap in floor units that counts as none. No further effect is looked for once every signal is below it."""
     promising: float = 0.3
-    """Share of the smallest accepted gain that the screen must see in a hypothesis before it is fitted."""
-    same: float = 0.8
+    """Share of the price of an effect that the screen must see in a hypothesis before it is fitted."""
+    same: float = 0.9
     """Share of the best explanation from which on another name may as well be right, since effects have more functional
     forms than the one in the library."""
-    changed: float = 3.0
-    """Prior standard deviations beyond which a nominal parameter is reported as changed."""
+    possible: float = 0.05
+    """Probability from which on another name may as well be right."""
+    rivals: int = 3
+    """Largest number of names that are reported beside one."""
     rounds: int = 4
     """Rounds of a fit."""
 
@@ -48,23 +47,47 @@ class Settings:
 DEFAULTS = Settings()
 
 
+@dataclass(frozen=True)
+class AcceptedTerm:
+    """An effect of the model that is reported, with the evidence that let it pass."""
+
+    hypothesis: Any
+    """A `problem.Hypothesis`."""
+    evidence: Any
+    """A `decide.Evidence`."""
+    thresholds: Any
+    """The `decide.Thresholds` that it passed."""
+    confusable_with: tuple[str, ...]
+    """Names of other effects that these logs cannot distinguish from it, or that explain nearly as much."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Result:
-    """What a discovery found, for reports.
-
-    The corrected model is `residual` where there is one, else `fit`; its `vector` is what the simulator is given.
-    """
+    """What a discovery found, for reports."""
 
     verdict: str
     """`named` (an effect is missing), `parameter_change` (nominal parameters alone are off), `no_missing_effect` (the
     model is at the floor) or `unnamed` (something is missing that no hypothesis explains)."""
     terms: tuple[AcceptedTerm, ...]
-    fit: Fit
-    """The model with all accepted effects, at the main horizon."""
+    fit: Any
+    """The `fit.Fit` with all accepted effects, at the main horizon."""
     errors: np.ndarray
     """[coordinates] standard errors of `fit`."""
-    null: Fit
-    """The model with none, its nominal parameters fitted."""
+    null: Any
+    """The `fit.Fit` with none, its nominal parameters fitted."""
+    model: np.ndarray
+    """[axes]: the corrected model, as the simulator is given it. It is chosen on `select`, and what `gap` calls
+    `after`."""
+    model_is: str
+    """What the corrected model is: `nominal`, `null`, `effects`, or `learned` (effects and a learned torque)."""
+    suspects: tuple[tuple[Any, float], ...]
+    """Hypotheses with the probability that each is part of the truth, most likely first, whatever the verdict."""
+    explained_share: float
+    """Share of the explainable gap that the reported effects explain, on `train` and `select`; see
+    `prove.explained`."""
+    withdrawn: bool
+    """True if the corrected model was worse on `sealed` than the better of the nominal model and the null; then `model`
+    is that one."""
     where: tuple[Mapping[str, Any], ...]
     """Cells above the floor before anything was accepted, largest first; see `localise.cells`."""
     needs_torque: Mapping[str, float]
@@ -72,19 +95,17 @@ class Result:
     not_testable: tuple[str, ...]
     """Names of effects that these logs could not show. They are not absent: other motions could show them."""
     not_finite: tuple[str, ...]
-    """Keys of hypotheses that broke the simulation."""
+    """Keys of models that broke the simulation."""
     dropped: tuple[str, ...]
-    """Keys of hypotheses that were accepted and no longer paid beside later ones."""
+    """Keys of effects of the cheapest model that did not pass, and so are not reported."""
     rejected: Mapping[str, Any]
-    """The best hypothesis that was not accepted, with its tests and evidence."""
+    """The first of these, with its tests and evidence."""
     changed: Mapping[int, float]
-    """Nominal axes that moved too far to be the same parameter, with the distance in prior standard deviations."""
-    changed_alike: Mapping[int, tuple[str, ...]]
-    """Names of effects that these logs cannot distinguish from such a change, by axis."""
-    residual: Fit | None
-    """The model with a learned torque at one joint, where something is missing that has no name."""
+    """Nominal axes that went as far as they may, with the distance in prior standard deviations."""
     gap: Mapping[str, float]
     """Rms of the worst position on the sealed segments, in floor units: `before`, `null` and `after`."""
     proof: Mapping[str, Any]
     """`cells` (rms of every component), `no_cell_worse` (no component is more than a floor unit above the null's), and
     `others`: the gap of ablations and placebos."""
+    details: Mapping[str, Any] = field(default_factory=dict)
+    """Models that were compared, by key: cost, probability."""

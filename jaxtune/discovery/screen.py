@@ -1,282 +1,265 @@
-"""Which hypotheses deserve a fit (step 5): a score test of every effect at every place.
+"""Which effects deserve a fit (step 5): every effect at every place and size, answered by the nominal parameters.
 
-A fit of the whole library would cost thousands of simulations; a secant for every (axis, size) costs one. The columns
-of a hypothesis at several places are sums of those at each. From them the test says by how much the loss would fall
-with the hypothesis in the model, after the free coordinates have explained what they can: these are projected out.
-Source: Rao's score test, in its Gauss-Newton form.
+A fit of the whole library would cost thousands of simulations. The screen simulates each effect at each single place at
+a few sizes, while the nominal parameters stand where they are believed to be, on a part of the segments. Limits, delays
+and play have no slope at zero, and their best size is found among these. Between sizes residuals are interpolated, and
+effects at several places are sums of those at each. `profile` then says what every hypothesis would cost, at every size,
+if the nominal parameters answered it within their bounds and their prior. So all hypotheses are compared by what counts
+in the end, and a pair costs no more simulations than its parts.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
-from jaxtune.discovery.fit import Fit, taken_over
-from jaxtune.discovery.least_squares import Linear, complement
-from jaxtune.discovery.noise_floor import Floor, NoiseFloor, Say
-from jaxtune.discovery.problem import Hypothesis, Problem
-from jaxtune.discovery.result import Settings
-from jaxtune.discovery.state import Columns, State
+from jaxtune.discovery.fit import Fit
+from jaxtune.discovery.least_squares import complement
+from jaxtune.discovery.noise_floor import Floor, Say
+from jaxtune.discovery.problem import Hypothesis, Problem, are_distinct
+from jaxtune.discovery.profile import Profile
 
+_SEGMENTS = 40  # that are simulated: half of them spread over all, half with the largest residuals
+_BATCH = 32  # simulations between two reports of progress
+_BETWEEN = (0.0, 0.25, 0.5, 0.75)  # of the way from a size to the next, where costs are computed
 _VISIBLE = 4.0  # standard deviations
-_OUT_OF_SIZE = 3.0  # a secant speaks for sizes up to this multiple of its own
-_BATCH = 32  # columns between two reports of progress
+_PARTNERS = 4  # of a hypothesis that are kept
+
+Curves = Mapping[int, tuple[np.ndarray, np.ndarray]]
+"""By axis: sizes [nodes], rising and with zero, and how they change the residuals, [nodes, features]."""
 
 
 @dataclass(frozen=True)
-class Score:
-    """What a score test says of a hypothesis: its gain, where its fit starts, and whether these logs could show it."""
+class Lead:
+    """One or two hypotheses that may explain the logs, with the point where their fit begins."""
 
-    gain: float
-    """By how much the loss would fall, if residuals were linear."""
-    coordinates: np.ndarray
-    """[parameters] at which it falls most; the fit starts there."""
-    visible: float
-    """How many standard deviations the smallest size of interest would move the residuals."""
-
-    @property
-    def testable(self) -> bool:
-        """True if these logs could show the effect at the smallest size of interest, above noise."""
-        return self.visible >= _VISIBLE
+    hypotheses: tuple[Hypothesis, ...]
+    point: np.ndarray
+    """[parameters] of the hypotheses, one behind the other."""
+    start: np.ndarray
+    """[coordinates] at which what is free in the model answers them."""
+    cost: float
+    """What the model with them would cost on the screened segments."""
 
 
-def screen(
-    settings: Settings, problem: Problem, floor: NoiseFloor, state: State, say: Say
-) -> tuple[State, dict[str, Score]]:
-    """Tests all hypotheses that were not accepted yet, from where the model stands.
+@dataclass(frozen=True)
+class Screen:
+    """What the screen of a model found."""
 
-    The first screen also settles what holds for all rounds: which effects are not testable, what each hypothesis
-    promises, and what chance gains, unless a calibration has said so.
-
-    Args:
-      settings: the level of the threshold.
-      problem: the hypotheses and the simulator.
-      floor: the noise floor and the fits to null logs.
-      state: where the model stands, fitted at the main horizon.
-      say: receives a line of text about progress.
-
-    Returns:
-      The state with the secants, and a score by hypothesis' key.
-    """
-    base = state.fits[problem.main_horizon]
-    hypotheses = _untried(problem, state)
-    columns = secant_columns(floor[problem.main_horizon], base, hypotheses, say)
-    state = replace(state, columns=columns)
-    if state.screened:
-        (found,) = scores(base, columns, hypotheses, [base])
-        return state, found
-    null_fits = () if state.least_gain else floor[problem.main_horizon].null_fits
-    found, *of_null_logs = scores(base, columns, hypotheses, [base, *null_fits])
-    testable = {h.name for h in hypotheses if found[h.key].testable}
-    names = dict.fromkeys(h.name for h in hypotheses)
-    state = replace(
-        state,
-        promise={key: score.gain for key, score in found.items()},
-        not_testable=tuple(name for name in names if name not in testable),
-        least_gain=state.least_gain or chance_gain(of_null_logs, settings.level),
-    )
-    say(f"these logs cannot show: {', '.join(state.not_testable) or 'nothing is beyond them'}")
-    return state, found
+    leads: tuple[Lead, ...]
+    """The best lead of every hypothesis, best first."""
+    pairs: tuple[Lead, ...]
+    """The best pairs, best first; empty unless they were asked for."""
+    cost: float
+    """What the model costs as it is, on the screened segments."""
+    testable: frozenset[str]
+    """Names of effects that these logs could show at the smallest size of interest."""
+    chance: np.ndarray
+    """[logs]: fall of the cost that the best hypothesis reaches on each null log."""
 
 
-def secant_columns(at: Floor, fit: Fit, hypotheses: Sequence[Hypothesis], say: Say) -> Columns:
-    """Takes the secants of the residuals that the hypotheses are made of, one simulation for each.
+def screen(problem: Problem, at: Floor, base: Fit, hypotheses: Sequence[Hypothesis], *, pairs: int, say: Say) -> Screen:
+    """Screens hypotheses beside a model.
 
     Args:
+      problem: the simulator.
       at: the floor at the main horizon.
-      fit: where the model stands there.
-      hypotheses: what is asked about.
+      base: the model, fitted or nominal, with slopes of all that is free in it.
+      hypotheses: what may join it.
+      pairs: how many of the best hypotheses are tried with every other one.
+      say: receives a line of text about progress.
+    """
+    chosen = spread_segments(at, base)
+    some = on_segments(at, base, chosen)
+    curves = simulate_curves(problem, at, some, chosen, hypotheses, say)
+    profile = Profile(some)
+    (cost,), _ = profile.costs(np.zeros((1, len(some.residual)), np.float32))
+    firsts = sorted((_best(some, profile, h, curves) for h in hypotheses), key=lambda lead: lead.cost)
+    couples = [pair for lead in firsts[:pairs] for pair in _pairs_with(some, lead, hypotheses, curves)]
+    null_residuals = at.unflatten(at.null_residuals.T)[chosen].reshape(len(some.residual), -1).T
+    testable, chance = _seen(some, hypotheses, curves, null_residuals)
+    return Screen(tuple(firsts), _best_pairs(couples), float(cost), testable, chance)
+
+
+def spread_segments(at: Floor, base: Fit) -> np.ndarray:
+    """Chooses segments of `train`, rising: half of them evenly spread, half of them where the model is worst."""
+    energy = (at.unflatten(base.residual) ** 2).sum(axis=(1, 2))
+    half = min(_SEGMENTS, len(energy)) // 2
+    even = np.linspace(0, len(energy) - 1, half).round().astype(int)
+    worst = [index for index in np.argsort(-energy) if index not in set(even.tolist())]
+    return np.sort(np.concatenate([even, worst[: min(_SEGMENTS, len(energy)) - half]]).astype(int))
+
+
+def on_segments(at: Floor, fit: Fit, chosen: np.ndarray) -> Fit:
+    """Restricts residuals and slopes of a fit to some segments of `train`."""
+    residual = at.unflatten(fit.residual)[chosen].ravel()
+    jacobian = at.unflatten(fit.jacobian)[chosen].reshape(len(residual), -1)
+    return replace(fit, residual=residual, jacobian=jacobian)
+
+
+def simulate_curves(
+    problem: Problem, at: Floor, some: Fit, chosen: np.ndarray, hypotheses: Sequence[Hypothesis], say: Say
+) -> Curves:
+    """Simulates every axis of the hypotheses alone, at a few sizes.
+
+    Joints of different kinematic trees do not move each other, since the base is fixed. So an axis of each tree is
+    simulated at a time.
+
+    Args:
+      problem: the simulator.
+      at: the floor at the main horizon.
+      some: the model, on the chosen segments.
+      chosen: indices of the segments of `train`.
+      hypotheses: whose axes are simulated.
       say: receives a line of text about progress.
 
     Returns:
-      [features] by (axis, size), per unit of the coordinate; zero where a simulation is not finite.
+      Curves; zero where a simulation is not finite.
     """
-    asked = probes(hypotheses)
-    steps = np.zeros((len(asked), len(fit.vector)))
-    for row, (axis, size) in enumerate(asked):
-        steps[row, axis] = size
-    columns = {}
-    for start in range(0, len(asked), _BATCH):
-        say(f"screen {start}/{len(asked)}")
-        found = at.residuals["train"](fit.vector + steps[start : start + _BATCH])
-        for key, moved in zip(asked[start : start + _BATCH], found, strict=True):
-            columns[key] = np.nan_to_num((moved - fit.residual) / key[1], posinf=0.0, neginf=0.0)
-    return columns
+    evaluate, sizes = at.on_some(chosen), _sizes(hypotheses)
+    trees = _trees(problem, hypotheses)
+    parts = np.array([_part_tree(problem, part) for _, part in problem.cells])
+    queues: dict[int | None, list[tuple[int, float]]] = {}
+    for axis, values in sizes.items():
+        queues.setdefault(trees.get(axis), []).extend((axis, size) for size in values)
+    alone = [((None, key),) for key in queues.pop(None, [])]
+    longest = max((len(queue) for queue in queues.values()), default=0)
+    packed = [tuple((tree, queue[i]) for tree, queue in queues.items() if i < len(queue)) for i in range(longest)]
+    found: dict[tuple[int, float], np.ndarray] = {}
+    every = [*alone, *packed]
+    for start in range(0, len(every), _BATCH):
+        say(f"screen {start}/{len(every)}")
+        batch = every[start : start + _BATCH]
+        vectors = np.tile(some.vector, (len(batch), 1))
+        for row, keys in enumerate(batch):
+            for _, (axis, size) in keys:
+                vectors[row, axis] += size
+        moved = np.nan_to_num(evaluate(vectors) - some.residual, posinf=0.0, neginf=0.0).astype(np.float32)
+        for keys, change in zip(batch, moved, strict=True):
+            for tree, key in keys:
+                mine = np.ones(len(parts)) if tree is None else parts == tree
+                found[key] = (change.reshape(-1, len(parts)) * mine.astype(np.float32)).ravel()
+    none = np.zeros(len(some.residual), np.float32)
+    return {
+        axis: (
+            np.array(sorted([0.0, *values])),
+            np.stack([found.get((axis, size), none) for size in sorted([0.0, *values])]),
+        )
+        for axis, values in sizes.items()
+    }
 
 
-def scores(
-    fit: Fit, columns: Columns, hypotheses: Sequence[Hypothesis], points: Sequence[Fit]
-) -> list[dict[str, Score]]:
-    """Scores every hypothesis at every point.
-
-    Slopes are those of `fit` for all points, so that a null log costs no simulation: its residuals alone count.
-
-    Args:
-      fit: where the columns were taken, with the slopes of the free coordinates.
-      columns: secants by (axis, size).
-      hypotheses: what is scored.
-      points: fits of the same coordinates to the same or to other logs.
-
-    Returns:
-      For every point, a score by hypothesis' key.
-    """
-    taken = [taken_over(fit.free, hypothesis) for hypothesis in hypotheses]
-    # What is at its bound cannot make room for anything.
-    masks = [[point.at_bounds, *(point.at_bounds | own for own in taken)] for point in points]
-    # Many hypotheses share what they take over, mostly nothing; a projection is the dearest part.
-    distinct = {mask.tobytes(): mask for row in masks for mask in row}
-    projections = {key: complement(_prior_and_slopes(fit, mask)[1]) for key, mask in distinct.items()}
-    found = []
-    for point, (none, *own) in zip(points, masks, strict=True):
-        least = np.sum(projections[none.tobytes()](_prior_and_slopes(point, none)[0]) ** 2)
-        scored = {}
-        for hypothesis, mask in zip(hypotheses, own, strict=True):
-            project = projections[mask.tobytes()]
-            value = project(_prior_and_slopes(point, mask)[0])
-            scored[hypothesis.key] = _score(hypothesis, columns, project, value, least, fit.weight)
-        found.append(scored)
+def change_of(hypothesis: Hypothesis, points: np.ndarray, curves: Curves) -> np.ndarray:
+    """Interpolates how a hypothesis changes the residuals at points [n, parameters]; returns [n, features]."""
+    found = 0.0
+    coordinates = points @ hypothesis.directions
+    # Shape parameters have no curve: they mean nothing without a size.
+    for axis in (int(one) for one in np.flatnonzero((hypothesis.directions != 0).any(axis=0)) if int(one) in curves):
+        sizes, values = curves[axis]
+        at = np.clip(coordinates[:, axis], sizes[0], sizes[-1])
+        left = np.clip(np.searchsorted(sizes, at, side="right") - 1, 0, len(sizes) - 2)
+        share = ((at - sizes[left]) / (sizes[left + 1] - sizes[left])).astype(np.float32)[:, None]
+        found = found + (1.0 - share) * values[left] + share * values[left + 1]
     return found
 
 
-def chance_gain(of_null_logs: Sequence[Mapping[str, Score]], level: float) -> float:
-    """Returns the gain that the best hypothesis exceeds with probability `level` where nothing is missing.
+def _best(some: Fit, profile: Profile, hypothesis: Hypothesis, curves: Curves) -> Lead:
+    """The point at which a hypothesis costs least beside a model, `some` with its profile."""
+    points = _points(some, hypothesis, curves)
+    costs, starts = profile.costs(change_of(hypothesis, points, curves))
+    costs = costs + ((points / hypothesis.prior) ** 2).sum(axis=1)
+    best = int(np.argmin(costs))
+    return Lead((hypothesis,), points[best], starts[best], float(costs[best]))
 
-    It is the quantile 1 - level, over null logs, of the largest gain over all hypotheses: the threshold holds for the
-    whole library at once.
-    """
-    best = [max(score.gain for score in scores.values()) for scores in of_null_logs]
-    return float(np.quantile(best, 1.0 - level, method="higher"))
+
+def _points(some: Fit, hypothesis: Hypothesis, curves: Curves) -> np.ndarray:
+    """Points [n, parameters] at which a hypothesis is answered: between its sizes, or where its slopes lead to."""
+    probes = hypothesis.probes
+    several = np.count_nonzero((probes != 0).any(axis=0)) > 1
+    if several:
+        slopes = change_of(hypothesis, probes, curves) / np.abs(probes).max(axis=1)[:, None]
+        _, at = Profile(some, slopes.T).costs(np.zeros((1, len(some.residual)), np.float32))
+        points = at[:, len(some.coordinates) :]
+        wanted = np.zeros((1, probes.shape[1]))
+        wanted[:, : points.shape[1]] = points
+        return np.clip(wanted, *hypothesis.bounds.T)
+    sizes = np.array(sorted([0.0, *probes[:, 0]]))
+    between = [a + share * (b - a) for a, b in pairwise(sizes) for share in _BETWEEN]
+    points = np.zeros((len(between), probes.shape[1]))
+    points[:, 0] = between
+    return points[points[:, 0] != 0]
 
 
-def looks_like(
-    fit: Fit, columns: Columns, axis: int, hypotheses: Sequence[Hypothesis], share: float
-) -> tuple[str, ...]:
-    """Names the hypotheses that these logs cannot distinguish from the change of a nominal parameter.
+def _pairs_with(some: Fit, lead: Lead, hypotheses: Sequence[Hypothesis], curves: Curves) -> list[Lead]:
+    """The best partners of a lead, whose size may still change a little."""
+    (first,) = lead.hypotheses
+    change = change_of(first, lead.point[None], curves)[0]
+    further = change_of(first, 1.1 * lead.point[None], curves)[0] - change
+    moved = replace(some, residual=some.residual + change)
+    profile = Profile(moved, further[:, None] if further.any() else None)
+    found = []
+    for other in hypotheses:
+        if not are_distinct(first, other):
+            continue
+        best = _best(some, profile, other, curves)
+        point, start = np.concatenate([lead.point, best.point]), best.start[: len(some.coordinates)]
+        found.append(Lead((first, other), point, start, best.cost + ((lead.point / first.prior) ** 2).sum()))
+    return sorted(found, key=lambda pair: pair.cost)[:_PARTNERS]
 
-    A hypothesis looks like the change if it explains a share of what the change does to the residuals. What the other
-    free coordinates explain is projected out of both first.
 
-    Args:
-      fit: the model, whose axis `axis` has changed.
-      columns: secants where the model stands; a hypothesis without its columns is skipped.
-      axis: index of the nominal parameter.
-      hypotheses: what it may be mistaken for.
-      share: of the squared change that must be explained.
+def _best_pairs(pairs: Sequence[Lead]) -> tuple[Lead, ...]:
+    """Every pair once, best first."""
+    best: dict[frozenset[str], Lead] = {}
+    for pair in sorted(pairs, key=lambda pair: pair.cost):
+        best.setdefault(frozenset(h.key for h in pair.hypotheses), pair)
+    return tuple(best.values())
 
-    Returns:
-      Names, best first.
-    """
-    change = fit.vector[axis]
-    own = (fit.free.directions[:, axis] != 0) & fit.free.nominal
-    if not own.any():
-        return ()
-    _, others = _prior_and_slopes(fit, own)
-    project = complement(others)
-    root, rest = np.sqrt(fit.weight), np.zeros(int((~own).sum()))
-    seen = lambda column: project(np.concatenate([root * column, rest]))  # noqa: E731
-    wanted = np.sign(change) * seen(fit.jacobian[:, own][:, 0])
+
+def _seen(
+    some: Fit, hypotheses: Sequence[Hypothesis], curves: Curves, null_residuals: np.ndarray
+) -> tuple[frozenset[str], np.ndarray]:
+    """Names of the effects that these logs could show, and the largest gain [logs] that each null log gives any."""
+    root, prior = np.sqrt(some.counts.independent), np.diag(1.0 / some.free.sd)
+    project = complement(np.concatenate([root * some.jacobian, prior]))
+    padded = lambda rows: np.pad(root * rows, ((0, 0), (0, len(prior)))).T  # noqa: E731
+    logs, seen, chance = project(padded(null_residuals)), set(), np.zeros(len(null_residuals))
+    for hypothesis in hypotheses:
+        mine = project(padded(change_of(hypothesis, hypothesis.probes, curves)))
+        length = np.sqrt((mine**2).sum(axis=0))
+        sizes = np.abs(hypothesis.probes).max(axis=1)
+        if length[np.argmin(sizes)] >= _VISIBLE:
+            seen.add(hypothesis.name)
+        falls = mine.T @ logs / np.maximum(length, 1e-9)[:, None]
+        chance = np.maximum(chance, (np.minimum(falls, 0.0) ** 2).max(axis=0))
+    return frozenset(seen), chance
+
+
+def _sizes(hypotheses: Sequence[Hypothesis]) -> dict[int, list[float]]:
+    """The sizes at which every axis is simulated: those of the hypothesis at its place alone, if there is one."""
+    found: dict[int, set[float]] = {}
+    for hypothesis in sorted(hypotheses, key=lambda h: len(h.places)):
+        mine: dict[int, set[float]] = {}
+        for row in hypothesis.probes @ hypothesis.directions:
+            for axis in np.flatnonzero(row):
+                mine.setdefault(int(axis), set()).add(float(row[axis]))
+        for axis, sizes in mine.items():
+            found.setdefault(axis, sizes)
+    return {axis: sorted(sizes) for axis, sizes in found.items()}
+
+
+def _trees(problem: Problem, hypotheses: Sequence[Hypothesis]) -> dict[int, int]:
+    """The kinematic tree of every axis whose effect stays within one; others are left out."""
     found = {}
     for hypothesis in hypotheses:
-        for _, group in groups(hypothesis):
-            if not all(key in columns for keys in group for key in keys):
-                continue
-            mine = np.stack([seen(_column(columns, keys)) for keys in group], axis=1)
-            # What can only be added does not explain what was taken away.
-            if hypothesis.bounds[0, 0] >= 0 and mine[:, 0] @ wanted < 0:
-                continue
-            left = complement(mine)(wanted)
-            explained = 1.0 - np.sum(left**2) / max(np.sum(wanted**2), 1e-12)
-            found[hypothesis.name] = max(found.get(hypothesis.name, 0.0), float(explained))
-    return tuple(sorted((name for name in found if found[name] >= share), key=lambda name: -found[name]))
+        trees = {int(problem.trees[joint]) for joint in hypothesis.joints}
+        if len(hypothesis.places) == 1 and len(trees) == 1:
+            for axis in np.flatnonzero((hypothesis.directions != 0).any(axis=0)):
+                found[int(axis)] = next(iter(trees))
+    return found
 
 
-def groups(hypothesis: Hypothesis) -> Iterator[tuple[np.ndarray, list[dict[tuple[int, float], float]]]]:
-    """Lists what the screen asks about a hypothesis: for every size, the columns that it is a sum of.
-
-    Parameters that can be probed alone are asked about together, as one group of k directions.
-
-    Yields:
-      Sizes [k], and for each of the k directions the share of every (axis, size).
-    """
-    free = [index for index in range(len(hypothesis.directions)) if (hypothesis.probes[:, index] != 0).any()]
-    together = len(free) > 1
-    rows = [hypothesis.probes.max(axis=0)] if together else hypothesis.probes
-    for probe in rows:
-        yield (
-            np.array([probe[index] for index in free]),
-            [
-                {
-                    (int(axis), float(probe[index])): float(hypothesis.directions[index, axis])
-                    for axis in np.flatnonzero(hypothesis.directions[index])
-                }
-                for index in free
-            ],
-        )
-
-
-def probes(hypotheses: Sequence[Hypothesis]) -> list[tuple[int, float]]:
-    """Lists all (axis, size) whose secants the hypotheses need, each once, in order; places share many of them."""
-    return sorted(
-        {key for hypothesis in hypotheses for _, group in groups(hypothesis) for keys in group for key in keys}
-    )
-
-
-def _score(
-    hypothesis: Hypothesis,
-    columns: Columns,
-    project: Callable[[np.ndarray], np.ndarray],
-    value: np.ndarray,
-    least: float,
-    weight: float,
-) -> Score:
-    """The best score over the sizes at which a hypothesis is looked for.
-
-    Args:
-      hypothesis: what is scored.
-      columns: secants by (axis, size).
-      project: projects out what the free coordinates explain that the hypothesis does not take over.
-      value: projected residuals, with the prior's rows.
-      least: what the free coordinates leave of the loss without the hypothesis.
-      weight: share of the features that count as independent.
-    """
-    best = Score(0.0, np.zeros(len(hypothesis.directions)), 0.0)
-    visible = 0.0
-    low, high = hypothesis.bounds.T
-    for sizes, group in groups(hypothesis):
-        column = np.stack([_column(columns, keys) for keys in group], axis=1)
-        # The prior's rows do not depend on the hypothesis.
-        padding = np.zeros((len(value) - len(column), column.shape[1]))
-        slope = project(np.concatenate([np.sqrt(weight) * column, padding]))
-        # Of the smallest size of interest, which comes first.
-        visible = visible or float(np.abs(sizes * np.sqrt((slope**2).sum(axis=0))).max())
-        normal = slope.T @ slope
-        # The free coordinates explain all that this effect does.
-        if np.trace(normal) < 1e-12:
-            continue
-        found = -np.linalg.solve(normal + 1e-9 * np.trace(normal) * np.eye(len(normal)), slope.T @ value)
-        full = np.zeros(len(hypothesis.directions))
-        full[: len(found)] = found
-        one_sided = len(hypothesis.probes) > 1 and low[0] >= 0
-        full = np.clip(full, low, np.minimum(high, _OUT_OF_SIZE * sizes.max()) if one_sided else high)
-        gain = float(least - np.sum((value + slope @ full[: len(found)]) ** 2))
-        if gain > best.gain:
-            best = Score(gain, full, 0.0)
-    return Score(best.gain, best.coordinates, visible)
-
-
-def _column(columns: Columns, shares: Mapping[tuple[int, float], float]) -> np.ndarray:
-    """The secant [features] along a direction: a sum of columns by their shares."""
-    return sum(share * columns[key] for key, share in shares.items())
-
-
-def _untried(problem: Problem, state: State) -> list[Hypothesis]:
-    """Lists the hypotheses that were neither accepted nor dropped so far: what a step may still look at."""
-    taken = {term.hypothesis.key for term in state.terms} | set(state.dropped)
-    return [hypothesis for hypothesis in problem.hypotheses if hypothesis.key not in taken]
-
-
-def _prior_and_slopes(fit: Fit, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Value [n] and slopes [n, coordinates] of what a fit's loss squares, without the coordinates `own`."""
-    linear = fit.linear
-    kept = Linear(linear.residual, linear.jacobian[:, ~own], linear.offset[~own], linear.sd[~own], linear.weight)
-    return kept.rows()
+def _part_tree(problem: Problem, part: str) -> int:
+    """The kinematic tree of a component of a signal; -1 for one that belongs to no joint."""
+    joints = problem.components["q"]
+    return int(problem.trees[joints.index(part)]) if part in joints else -1

@@ -12,18 +12,14 @@ from jax.sharding import Mesh, PartitionSpec
 from jaxtune.discovery.problem import Problem, Segments, Simulate
 
 _WIDTH = 64  # simulations that a device runs side by side
-_CHUNKS = 32  # how many such chunks one call of the compiled program takes at most
+_CHUNKS = 16  # how many such chunks one call of the compiled program takes at most
 
 Evaluate = Callable[[np.ndarray], np.ndarray]
 """`evaluate(vectors [n, axes]) -> residuals [n, features]`, in floor units. Features: (segment, bin, component)."""
 
 
 def residuals(problem: Problem, vectors: np.ndarray, segments: Segments, width: int = _WIDTH) -> np.ndarray:
-    """Simulates vectors on segments and subtracts from what was measured, in means over `problem.bin_rows` rows.
-
-    Every (vector, segment) is a simulation of its own. They run side by side, `width` at a time on every device, in a
-    loop whose length is an argument of the compiled program. So there is one compilation for every length of segments,
-    whatever their number and that of the vectors.
+    """Simulates every vector on every segment and subtracts from what was measured, in means over `bin_rows` rows.
 
     Args:
       problem: the simulator and how its signals are binned.
@@ -34,27 +30,53 @@ def residuals(problem: Problem, vectors: np.ndarray, segments: Segments, width: 
     Returns:
       Residuals [n, segments, bins, components of all signals]; not finite where the simulation is not.
     """
+    vectors = np.atleast_2d(vectors)
+    each, piece = (grid.ravel() for grid in np.indices((len(vectors), len(segments.run))))
+    found = paired_residuals(problem, vectors, segments, each, piece, width)
+    return found.reshape(len(vectors), len(segments.run), *found.shape[1:])
+
+
+def paired_residuals(
+    problem: Problem,
+    vectors: np.ndarray,
+    segments: Segments,
+    which: np.ndarray,
+    piece: np.ndarray,
+    width: int = _WIDTH,
+) -> np.ndarray:
+    """Simulates chosen pairs of a vector and a segment; `residuals` takes all pairs.
+
+    Every pair is a simulation of its own. They run side by side, `width` at a time on every device, in a loop whose
+    length is an argument of the compiled program. So there is one compilation for all segments, whatever their length
+    and number, the number of the vectors, and the numbers of the robot.
+
+    Args:
+      problem: the simulator and how its signals are binned.
+      vectors: [n, axes] coordinates.
+      segments: what was measured.
+      which: [pairs] index of each pair's vector.
+      piece: [pairs] index of each pair's segment.
+      width: simulations side by side on one device.
+
+    Returns:
+      [pairs, bins, components of all signals]; not finite where the simulation is not.
+    """
     width *= len(jax.devices())
-    vectors = np.asarray(problem.values(np.atleast_2d(vectors)), np.float32)
-    measured = np.stack([binned(piece, problem.bin_rows) for piece in _pieces(segments.signals)])
-    # Smaller splits are filled up to the largest one's size: another shape would be another compilation.
-    filled = np.arange(_largest_split(problem, segments)) % len(measured)
-    inputs = jax.tree.map(lambda leaf: jnp.asarray(leaf[filled]), segments.inputs)
-    each, piece = (grid.ravel() for grid in np.indices((len(vectors), len(measured))))
-    shape, found = (_CHUNKS, width), []
-    once = _CHUNKS * width
-    for start in range(0, len(each), once):
-        count = min(once, len(each) - start)
-        mine = (start + np.arange(once) % count).reshape(shape)
-        used, which = np.unique(each[mine], return_inverse=True)
-        some = vectors[used[np.arange(once) % len(used)]]
+    values = np.asarray(problem.values(vectors), np.float32)
+    measured = binned(segments.signals, problem.bin_rows)
+    longest = problem.data["train"][problem.horizons[-1]].inputs
+    once, found = _CHUNKS * width, []
+    for start in range(0, len(which), once):
+        count = min(once, len(which) - start)
+        # A last call is filled up with pairs that are not simulated: another shape would be another compilation.
+        mine = start + np.arange(once) % count
         chunks = -(-count // width)
-        out = _simulate_chunks(
-            problem.simulate, problem.bin_rows, chunks, some, which.reshape(shape), piece[mine], inputs
-        )
-        found.append(np.asarray(out).reshape(once, *measured.shape[1:])[:count])
-    predicted = np.concatenate(found).reshape(len(vectors), *measured.shape)
-    return measured[None] - predicted
+        some = jax.tree.map(lambda leaf, like, mine=mine: _padded(leaf[piece[mine]], like), segments.inputs, longest)
+        work = jax.tree.map(lambda leaf: leaf.reshape(_CHUNKS, width, *leaf.shape[1:]), (values[which[mine]], some))
+        predicted = _simulate_chunks(problem.simulate, problem.bin_rows, problem.system, chunks, segments.steps, *work)
+        flat = np.asarray(predicted).reshape(once, *predicted.shape[2:])
+        found.append(flat[:count, : measured.shape[1]])
+    return measured[piece] - np.concatenate(found)
 
 
 def flat_residuals(problem: Problem, segments: Segments, scale: np.ndarray, vectors: np.ndarray) -> np.ndarray:
@@ -72,63 +94,45 @@ def flat_residuals(problem: Problem, segments: Segments, scale: np.ndarray, vect
     return (residuals(problem, vectors, segments) / scale).reshape(len(vectors), -1)
 
 
-def secants(problem: Problem, segments: Segments, vector: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Takes secants of the residuals, one simulation for each; delays, limits and backlash have no derivative at zero.
-
-    Args:
-      problem: the simulator.
-      segments: what was measured.
-      vector: [axes] where the secants begin.
-      directions: [k, axes] how far they go.
-
-    Returns:
-      Differences r(vector + direction) - r(vector), [segments, bins, components, k].
-    """
-    found = residuals(problem, np.concatenate([vector[None], vector + directions]), segments)
-    return np.moveaxis(found[1:] - found[:1], 0, -1)
-
-
 def binned(signals: Mapping[str, Any], rows: int):
-    """Averages signals [rows, components] over every `rows` rows and puts them side by side, in the order of names.
+    """Averages signals [..., rows, components] over every `rows` rows and puts them side by side, in order of names.
 
-    Works on NumPy and JAX arrays alike. Returns [bins, components of all signals].
+    Works on NumPy and JAX arrays alike. Returns [..., bins, components of all signals].
     """
-    parts = [signal.reshape(-1, rows, signal.shape[-1]).mean(axis=1) for _, signal in sorted(signals.items())]
+    parts = [
+        signal.reshape(*signal.shape[:-2], -1, rows, signal.shape[-1]).mean(axis=-2)
+        for _, signal in sorted(signals.items())
+    ]
     return (jnp if isinstance(parts[0], jax.Array) else np).concatenate(parts, axis=-1)
 
 
 @partial(jax.jit, static_argnums=(0, 1))
-def _simulate_chunks(simulate: Simulate, bin_rows: int, count, values, which, piece, inputs):
-    """Runs the first `count` chunks: `which` and `piece` [chunks, width] choose from values [n, axes] and inputs."""
+def _simulate_chunks(simulate: Simulate, bin_rows: int, system, count, steps, values, inputs):
+    """Runs the first `count` chunks of values [chunks, width, axes] and inputs [chunks, width, ...]."""
 
-    def one(mine, segment):
-        return binned(simulate(mine, segment), bin_rows)
+    def one(system, mine, segment, steps):
+        return binned(simulate(system, mine, segment, steps), bin_rows)
 
-    def all_of(count, values, which, piece, inputs):
-        shape = jax.eval_shape(one, values[0], jax.tree.map(lambda leaf: leaf[0], inputs))
+    def all_of(system, count, steps, values, inputs):
+        take = lambda index: jax.tree.map(lambda leaf: leaf[index], (values, inputs))  # noqa: E731
+        many = jax.vmap(one, in_axes=(None, 0, 0, None))
+        shape = jax.eval_shape(many, system, *take(0), steps)
 
         def work(index, found):
-            mine = jax.tree.map(lambda leaf: leaf[piece[index]], inputs)
-            return found.at[index].set(jax.vmap(one)(values[which[index]], mine))
+            return found.at[index].set(many(system, *take(index), steps))
 
-        return jax.lax.fori_loop(0, count, work, jnp.zeros((*which.shape, *shape.shape), shape.dtype))
+        return jax.lax.fori_loop(0, count, work, jnp.zeros((len(values), *shape.shape), shape.dtype))
 
     # Nothing is exchanged: devices share the width, and each loops by itself.
     mesh, across = Mesh(np.array(jax.devices()), ("width",)), PartitionSpec(None, "width")
-    specs = (PartitionSpec(), PartitionSpec(), across, across, PartitionSpec())
+    specs = (PartitionSpec(), PartitionSpec(), PartitionSpec(), across, across)
     return jax.shard_map(all_of, mesh=mesh, in_specs=specs, out_specs=across, check_vma=False)(
-        count, values, which, piece, inputs
+        system, count, steps, values, inputs
     )
 
 
-def _largest_split(problem: Problem, segments: Segments) -> int:
-    """Number of segments in the largest split of the same length."""
-    rows = next(iter(segments.signals.values())).shape[1]
-    splits = [one for split in problem.data.values() for one in split.values()]
-    same = [len(one.run) for one in splits if next(iter(one.signals.values())).shape[1] == rows]
-    return max([len(segments.run), *same])
-
-
-def _pieces(signals: Mapping[str, np.ndarray]) -> list[dict[str, np.ndarray]]:
-    """The signals of every segment, {name: [rows, components]}."""
-    return [dict(zip(signals, values, strict=True)) for values in zip(*signals.values(), strict=True)]
+def _padded(leaf: np.ndarray, like: np.ndarray) -> np.ndarray:
+    """Repeats the last entry of a leaf [n, ...] along its second dimension until it is as long as that of `like`."""
+    if leaf.ndim < 2 or leaf.shape[1] == like.shape[1]:
+        return leaf
+    return np.pad(leaf, [(0, 0), (0, like.shape[1] - leaf.shape[1]), *[(0, 0)] * (leaf.ndim - 2)], mode="edge")

@@ -1,93 +1,126 @@
-"""One step of forward selection: look for one more effect, and add it to the model if it passes.
+"""One step of the search: fit what the screen proposes beside the best model so far, and look which costs least.
 
-    refit -> localise -> screen -> shortlist -> compete -> accept (alone, else in pairs) -> drop
+    slopes -> localise -> screen -> fit -> polish -> compare
 
-Each arrow is a pure function from a state to the next. The screen is taken anew in every step, since an effect may show
-only once another one is in the model.
+The first step starts from the nominal model, not from the null: nominal parameters that were fitted alone have moved to
+imitate what is missing, and a search from there would have to lead them back. It tries pairs as well, since the gap of
+one effect may hide another.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from jaxtune.discovery.accept import accept, drop_unpaid
-from jaxtune.discovery.compete import compete, starts_of_pairs, starts_of_singles
-from jaxtune.discovery.decide import Decision
-from jaxtune.discovery.evaluate import refit, refit_others, worst
+import numpy as np
+
+from jaxtune.discovery.decide import Candidate, total_cost
+from jaxtune.discovery.evaluate import worst
+from jaxtune.discovery.fit import Fit, begin, polish, refine
 from jaxtune.discovery.localise import localise
-from jaxtune.discovery.noise_floor import NoiseFloor, Say
-from jaxtune.discovery.problem import Problem
+from jaxtune.discovery.noise_floor import Floor, NoiseFloor, Say
+from jaxtune.discovery.problem import Problem, are_distinct
 from jaxtune.discovery.result import Settings
-from jaxtune.discovery.screen import screen
-from jaxtune.discovery.shortlist import candidates
+from jaxtune.discovery.screen import Lead, Screen, screen
 from jaxtune.discovery.state import State
+
+_MOST_PLACES = 3  # of one name among the leads that are fitted: they tell where; more would crowd out other names
 
 
 @dataclass(frozen=True)
 class Info:
-    """What a step decided: nothing that the next step needs, but what a progress bar or a report shows."""
+    """What a step found: nothing that the next step needs, but what a progress bar or a report shows."""
 
-    decisions: tuple[Decision, ...] = ()
-    """About the best single hypothesis and, where that failed, about the best pair."""
-    dropped: tuple[str, ...] = ()
-    """Keys of earlier effects that were taken out, since they no longer paid."""
-
-    @property
-    def accepted(self) -> bool:
-        """True if the model has an effect that it had not before the step; the driver saves then."""
-        return any(decision.accepted for decision in self.decisions)
+    fitted: tuple[tuple[str, float], ...] = ()
+    """Models that were fitted, by key, with their cost; least first."""
+    improved: bool = False
+    """True if one of them costs less than the best model before."""
 
     def lines(self) -> list[str]:
-        """Says in a line each what was decided and with which evidence, and what was dropped."""
-        lines = []
-        for decision in self.decisions:
-            failed = [name for name, passed in decision.tests.items() if not passed]
-            verdict = f"rejected, fails {', '.join(failed)}" if failed else "accepted"
-            lines.append(f"{decision.hypothesis.key} {verdict}: {decision.evidence} {decision.thresholds}")
-        return lines + [f"{key} dropped: it no longer pays" for key in self.dropped]
+        """Says in a line each which models cost least."""
+        return [f"{cost:.1f} {key}" for key, cost in self.fitted[:5]]
 
 
 def step(
     settings: Settings, problem: Problem, floor: NoiseFloor, state: State, say: Say = lambda text: None
 ) -> tuple[State, Info]:
-    """Looks for one more effect; the state is finished where the model is at the floor or nothing passes.
+    """Looks for a model that costs less; the state is finished where there is none, or where nothing is left.
 
-    The function is pure but for what it says. In the finished state the model is fitted with fresh slopes, whatever
-    ended the search.
+    The function is pure but for what it says.
 
     Args:
-      settings: how much is tried, and how much evidence is asked for.
+      settings: how much is tried.
       problem: the simulator, the hypotheses and the segments.
       floor: the noise floor.
       state: from `state.begin`, from the last step, or loaded.
       say: receives a line of text about progress.
 
     Returns:
-      The next state, and what was decided.
+      The next state, and what was tried.
     """
-    main = problem.main_horizon
-    base = refit(floor[main], state.fits[main], 2 * settings.rounds)
-    at_floor = worst(floor[main], base.vector) <= settings.at_floor
-    # Before any acceptance the model is the null.
-    state = state.with_model({**state.fits, main: base}, null=state.null if state.terms else base)
-    # The first look is taken in any case: it says what these logs could show.
-    if len(state.terms) >= settings.most or (state.screened and at_floor):
+    at, best = floor[problem.main_horizon], state.best
+    if state.screened and (len(best.hypotheses) >= settings.most or worst(at, best) <= settings.at_floor):
         return replace(state, finished=True), Info()
-    state = localise(problem, floor, state)
-    state, scores = screen(settings, problem, floor, state, say)
-    chosen = candidates(settings, problem, state, scores)
-    if not chosen:
-        return replace(state, finished=True), Info()
-    say(f"fit {len(chosen)}")
-    before = replace(state, fits=refit_others(floor, state.fits, main, 2 * settings.rounds))
-    singles = starts_of_singles(chosen, scores)
-    contest = compete(settings, problem, floor, before.fits, singles)
-    state, decisions = accept(settings, problem, floor, before, contest)
-    if not state.terms and not at_floor:
-        pairs = starts_of_pairs(settings, problem, contest)
-        say(f"fit {len(pairs)} pairs")
-        contest = compete(settings, problem, floor, before.fits, pairs)
-        state, of_pairs = accept(settings, problem, floor, state, contest)
-        decisions += of_pairs
-    if not any(decision.accepted for decision in decisions):
-        return replace(state, finished=True), Info(decisions)
-    state = drop_unpaid(problem, floor, state)
-    return state, Info(decisions, dropped=state.dropped[len(before.dropped) :])
+    (fit,) = polish([best.fit], at.residuals["train"], 0 if state.screened else settings.rounds)
+    state = state.replaced(best, replace(best, fit=fit))
+    base = fit if state.screened else state.nominal
+    state = localise(problem, at, state, fit)
+    free = [
+        h
+        for h in problem.hypotheses
+        if all(h.key != other.key and are_distinct(h, other) for other in state.best.hypotheses)
+    ]
+    found = screen(problem, at, base, free, pairs=0 if state.screened else settings.firsts, say=say)
+    state = state.with_screen(settings, problem, found)
+    leads = shortlist(settings, found, state.price)
+    say(f"fit {len(leads)}")
+    fitted = fit_leads(settings, at, base, state.best.hypotheses, leads)
+    state = state.with_candidates(fitted)
+    cost = {one.key: total_cost(at, one, state.price) for one in (*fitted, best)}
+    least = min(state.candidates, key=lambda one: total_cost(at, one, state.price))
+    improved = least.key != best.key
+    ranked = tuple(sorted(((one.key, cost[one.key]) for one in fitted), key=lambda pair: pair[1]))
+    return replace(state, best=least, finished=not improved), Info(ranked, improved)
+
+
+def shortlist(settings: Settings, found: Screen, price: float) -> list[Lead]:
+    """Takes the best leads and the best of each family, at most three places of one name, and the best pairs."""
+    chosen: list[Lead] = []
+    families, names = set(), {}
+    # A fit finds more than the screen does, but not many times as much.
+    for lead in (one for one in found.leads if found.cost - one.cost > settings.promising * price):
+        (hypothesis,) = lead.hypotheses
+        if names.get(hypothesis.name, 0) >= _MOST_PLACES:
+            continue
+        if len(chosen) < settings.shortlist or hypothesis.family not in families:
+            chosen.append(lead)
+            families.add(hypothesis.family)
+            names[hypothesis.name] = names.get(hypothesis.name, 0) + 1
+    least = found.leads[0].cost if found.leads else found.cost
+    pairs = [pair for pair in found.pairs if least - pair.cost > settings.promising * price]
+    return chosen + pairs[: settings.pairs]
+
+
+def fit_leads(settings: Settings, at: Floor, base: Fit, present: Sequence, leads: Sequence[Lead]) -> list[Candidate]:
+    """Fits leads beside a model on `train`, the best of them with fresh slopes, and simulates them on `select`.
+
+    Args:
+      settings: rounds, and how many are finalists.
+      at: the floor at the main horizon.
+      base: the model without them.
+      present: the effects that the model has.
+      leads: what joins it.
+    """
+    if not leads:
+        return []
+    evaluate = at.residuals["train"]
+    begun = begin(base, *zip(*((lead.hypotheses, lead.point, lead.start) for lead in leads), strict=True), evaluate)
+    fits = refine(begun, evaluate, settings.rounds)
+    order = [index for index in np.argsort([fit.cost for fit in fits]) if np.isfinite(fits[index].cost)]
+    finalists = order[: settings.finalists]
+    polished = polish([fits[index] for index in finalists], evaluate, settings.rounds) if finalists else []
+    for index, fit in zip(finalists, polished, strict=True):
+        fits[index] = fit
+    select = at.residuals["select"](np.stack([fits[index].vector for index in order])) if order else []
+    return [
+        Candidate((*present, *leads[index].hypotheses), fits[index], residual)
+        for index, residual in zip(order, select, strict=True)
+    ]

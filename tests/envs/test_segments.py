@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from envs import segments
+from envs import readings, segments
 from envs.effects.memory import LONGEST_S
 from envs.logs import Controller, Run
 
@@ -18,7 +18,7 @@ def times(seconds=1.0, rate_hz=200.0):
     return np.arange(round(seconds * rate_hz) + 1) / rate_hz
 
 
-def run(time, name="run_000", kind="pd", gains=PD, **signals):
+def run(time, name="run_000", kind="pd", gains=PD, known=None, **signals):
     """A run of two joints, still at zero where nothing else is said."""
     still = {"q": np.zeros((len(time), 2)), "target": np.zeros((len(time), 2))}
     signals = {name: values for name, values in (still | signals).items() if values is not None}
@@ -29,6 +29,7 @@ def run(time, name="run_000", kind="pd", gains=PD, **signals):
         controller=Controller(kind=kind, rate_hz=200.0, gains=gains),
         time=time,
         signals=signals,
+        known=known or {},
     )
 
 
@@ -78,6 +79,22 @@ def test_a_good_velocity_counts_for_more_than_positions():
     np.testing.assert_allclose((got[:, 1] - velocity[10:-10]).std(), 0.01 / 5**0.5, rtol=0.1)
 
 
+@pytest.mark.parametrize("rate_hz", [50.0, 100.0])
+def test_slow_rows_are_smoothed_without_a_bias_larger_than_the_noise(rate_hz):
+    rng = np.random.default_rng(5)
+    time, pace, quantum = times(10.0, rate_hz), 2 * np.pi * 2.0, 2 * np.pi / 4096
+    phase = pace * time[:, None] + [0.0, 1.0]
+    exact = np.stack([0.3 * np.sin(phase), 0.3 * pace * np.cos(phase)], axis=1)
+    errors = []
+    for _ in range(2):
+        rounded = np.round((exact[:, 0] + 0.3 * quantum * rng.standard_normal((len(time), 2))) / quantum) * quantum
+        errors.append((segments.smoothed(run(time, q=rounded)) - exact)[5:-5])
+    # What is the same in both is bias, what differs is noise.
+    noise = (errors[0] - errors[1]).std(axis=0) / 2**0.5
+    bias = np.sqrt(np.maximum((errors[0] * errors[1]).mean(axis=0), 0.0))
+    assert (bias < noise).all()
+
+
 # Noise and rounding.
 
 
@@ -90,9 +107,10 @@ def test_noise_is_what_changes_from_row_to_row():
 
 
 def test_noise_of_a_smooth_signal_is_none_and_not_zero():
-    position, _ = parabola(times())
-    assert 0 < segments.noise(position) < 1e-5
-    assert segments.noise(np.zeros((50, 2))) > 0
+    # Not a parabola: at even times its values are multiples of one number, as if they were rounded.
+    position = np.sin(times()[:, None] * [3.0, 4.0])
+    assert ((segments.noise(position) > 0) & (segments.noise(position) < 1e-5)).all()
+    assert (segments.noise(np.zeros((50, 2))) > 0).all()
 
 
 @pytest.mark.parametrize("quantum", [2 * np.pi / 2**14, 2 * np.pi / 4096, 0.005, 0.25])
@@ -101,14 +119,13 @@ def test_a_quantum_is_found(quantum):
     rounded = np.round(position / quantum) * quantum
     np.testing.assert_allclose(segments.quantum_of(rounded), quantum, rtol=1e-5)
     # At least the noise of rounding, a uniform distribution's.
-    assert segments.noise(rounded) >= quantum / 12**0.5 * (1 - 1e-5)
+    assert (segments.noise(rounded) >= quantum / 12**0.5 * (1 - 1e-5)).all()
 
 
 def test_what_was_not_rounded_has_no_quantum():
     rng = np.random.default_rng(4)
-    assert segments.quantum_of(rng.standard_normal((500, 2))) == 0.0
-    assert segments.quantum_of(parabola(times())[0].astype(np.float32)) == 0.0
-    assert segments.quantum_of(np.ones((500, 2))) == 0.0
+    for values in (rng.standard_normal((500, 2)), np.sin(times()[:, None] * [3.0, 4.0]), np.ones((500, 2))):
+        np.testing.assert_array_equal(segments.quantum_of(values), [0.0, 0.0])
 
 
 @pytest.mark.parametrize("late_s", [0.0, 0.007, 0.02])
@@ -118,6 +135,87 @@ def test_a_late_velocity_is_found(late_s):
     position = 0.3 * np.sin(pace * time[:, None])
     velocity = 0.3 * pace * np.cos(pace * (time[:, None] - late_s))
     np.testing.assert_allclose(segments.velocity_lag(run(time, q=position, dq=velocity)), late_s, atol=0.0011)
+
+
+def slow_bus(every=3, rate_hz=200.0):
+    """Rounded sines of which the bus hands every third row's over; the second joint stands still half of the time."""
+    time, quantum = times(4.0, rate_hz), 2 * np.pi / 4096
+    phase = 2 * np.pi * time[:, None]
+    exact = 0.5 * np.sin(phase)
+    exact = np.concatenate([exact, np.where(phase < 4 * np.pi, exact, 0.0)], axis=1)
+    held = np.arange(len(time)) // every * every
+    return time, exact, (np.round(exact / quantum) * quantum)[held]
+
+
+def test_repeated_readings_are_stale_where_the_joint_moves():
+    time, exact, read = slow_bus()
+    stale = readings.stale(run(time, q=read), "q")
+    fast = np.abs(np.gradient(exact, time, axis=0)) > 1.0
+    repeats = np.arange(len(time)) % 3 > 0
+    assert stale[repeats][fast[repeats]].mean() > 0.95
+    assert not stale[~repeats].any()
+    # From 2 s on the second joint stands still.
+    assert not stale[405:, 1].any()
+    # Without a slow bus there are none, although slow joints repeat themselves.
+    own = run(time, q=slow_bus(every=1)[2])
+    assert not readings.stale(own, "q").any()
+
+
+@pytest.mark.parametrize("rows", [2, 3, 5, 10])
+def test_a_joint_that_stops_and_goes_on_is_not_stale(rows):
+    # At 50 Hz, 0.1 rad from row to row, then some rows at rest, and so on.
+    moves = np.tile(np.append(np.full(6, 0.1), np.zeros(rows - 1)), 10)
+    position = np.cumsum(moves)[:, None] * [1.0, -1.0]
+    mine = run(times(10.0, 50.0)[: len(moves)], q=position, known={"q": {"quantum": np.array([0.0015, 0.0015])}})
+    assert not readings.stale(mine, "q").any()
+
+
+def test_stale_readings_bias_nothing():
+    time, exact, read = slow_bus()
+    mine = run(time, q=read)
+    assert np.abs(read - exact).max() > 0.02
+    np.testing.assert_allclose(readings.aligned(mine, "q")[6:395], exact[6:395], atol=0.004)
+    np.testing.assert_allclose(segments.smoothed(mine)[6:395, 0], exact[6:395], atol=0.004)
+    # Their jumps do not pass for noise.
+    assert (readings.noise_of(mine, "q") < 0.002).all()
+    assert (segments.noise(read)[0] > 0.005).all()
+
+
+def test_known_noise_counts_and_what_is_not_known_is_estimated_over_all_runs():
+    time = times(4.0)
+    moving = 0.3 * np.sin(5.0 * time)[:, None] * [1.0, 1.0] + 0.01 * np.random.default_rng(6).standard_normal((801, 2))
+    known = {"q": {"noise_sd": np.array([np.nan, 0.07])}}
+    runs = [run(time, q=np.round(moving / 0.005) * 0.005, known=known), run(time, "run_001", known=known)]
+    estimate = readings.noise(runs[0].signals["q"])
+    np.testing.assert_allclose(estimate, 0.0101, rtol=0.1)
+    for one in readings.with_noise(runs, runs):
+        np.testing.assert_allclose(readings.noise_of(one, "q"), [estimate[0], 0.07], rtol=1e-6)
+        np.testing.assert_allclose(readings.rounding_of(one, "q"), 0.005, rtol=1e-6)
+
+
+@pytest.mark.parametrize("offset_s", [0.004, -0.006])
+def test_readings_of_another_time_are_brought_to_their_rows(offset_s):
+    time = times(2.0, 50.0)
+    late = np.array([offset_s, 0.0])
+    exact = 0.3 * np.sin(8.0 * time[:, None])
+    read = 0.3 * np.sin(8.0 * (time[:, None] + late))
+    mine = run(time, q=read, dq=None, known={"q": {"offset_s": np.array([offset_s, np.nan])}})
+    np.testing.assert_allclose(readings.aligned(mine, "q")[2:-2], exact[2:-2] + 0 * late, atol=1e-3)
+    np.testing.assert_allclose(segments.smoothed(mine)[3:-3, 0], exact[3:-3] + 0 * late, atol=1e-3)
+    # The column that was on time is as it was recorded.
+    np.testing.assert_array_equal(readings.aligned(mine, "q")[:, 1], read[:, 1])
+    cut = segments.cut([mine], 0.4, DT)
+    np.testing.assert_allclose(cut.signals["q"], readings.aligned(mine, "q")[cut.row], rtol=1e-6)
+
+
+def test_a_filters_delay_is_taken_from_its_readings():
+    time = times(2.0)
+    corner = 2 * np.pi * 20.0
+    slow = 2 * np.pi * 1.0
+    exact, lag = np.sin(slow * time)[:, None] * [1.0, 1.0], np.arctan(slow / corner) / slow
+    filtered = np.sin(slow * (time - lag))[:, None] * [1.0, 1.0]
+    mine = run(time, q=filtered, known={"q": {"filter_hz": np.array([20.0, 20.0])}})
+    np.testing.assert_allclose(readings.aligned(mine, "q")[4:-4], exact[4:-4], atol=2e-3)
 
 
 # Cutting.
@@ -149,7 +247,7 @@ def test_pieces_follow_on_each_other_and_have_a_history(moving):
     _, steps = one.sample.shape
     assert BEFORE + 151 <= steps <= BEFORE + 152
     assert one.measured.shape == (6, BEFORE + 1 + AHEAD, 2, 2)
-    for name in ("target", "feed", "stiffness", "damping", "limit", "emf"):
+    for name in ("target", "between", "feed", "stiffness", "damping", "limit", "emf"):
         assert getattr(one, name).shape == (6, steps, 2), name
     assert one.row_step.shape == one.row_share.shape == (6, 30)
 
@@ -196,6 +294,25 @@ def test_a_target_is_held_until_the_next_row(moving):
     expected = np.minimum(first[:, None] + steps // 5, len(moving.time) - 1)
     np.testing.assert_array_equal(target[..., 0], expected)
     np.testing.assert_array_equal(target[..., 1], -expected)
+
+
+def between(moving, rows):
+    own = replace(moving, controller=replace(moving.controller, between_rows=rows))
+    one = segments.cut([own], 0.15, DT).segments
+    return np.asarray(one.target), np.asarray(one.between)
+
+
+def test_targets_between_rows_are_held_or_lines_or_unknown(moving):
+    held, none = between(moving, "hold")
+    line, nothing = between(moving, "linear")
+    either, apart = between(moving, "unknown")
+    np.testing.assert_array_equal(none, 0.0)
+    np.testing.assert_array_equal(nothing, 0.0)
+    np.testing.assert_array_equal(either, held)
+    np.testing.assert_allclose(either + apart, line, atol=1e-4)
+    # Targets are the number of the row, and a row is five steps.
+    first = np.arange(line.shape[1]) / 5.0
+    np.testing.assert_allclose(line[0, :150, 0] - line[0, 0, 0], first[:150], atol=1e-3)
 
 
 def test_a_controller_looks_at_its_rate(moving):

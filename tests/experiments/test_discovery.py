@@ -134,6 +134,32 @@ def test_places_are_each_alone_pairs_and_all():
     assert place_sets(("hinge",)) == [("hinge",)]
 
 
+@pytest.mark.parametrize(
+    ("names", "pairs"),
+    [
+        (("L_hip", "L_knee", "R_hip", "R_knee"), [("L_hip", "R_hip"), ("L_knee", "R_knee")]),
+        (("wrist_r", "wrist_l", "neck"), [("wrist_l", "wrist_r")]),
+        (("leftKnee", "rightKnee", "neck"), [("leftKnee", "rightKnee")]),
+        (("Left_Knee", "Right_Knee", "neck"), [("Left_Knee", "Right_Knee")]),
+        (("front_hip", "rear_hip", "neck"), [("front_hip", "rear_hip")]),
+        (("roll", "pull", "elbow_flex"), []),
+    ],
+)
+def test_sides_are_words_of_a_name(names, pairs):
+    assert place_sets(names) == [*((name,) for name in names), *pairs, names]
+
+
+@pytest.mark.parametrize(
+    "legs",
+    [("FL", "FR", "RL", "RR"), ("LF", "RF", "LH", "RH"), ("front_left", "front_right", "rear_left", "rear_right")],
+)
+def test_legs_are_paired_and_their_joints_grouped_by_kind(legs):
+    names = tuple(f"{leg}_{kind}_joint" for leg in legs for kind in ("hip", "calf"))
+    hips, calves = names[::2], names[1::2]
+    pairs = [one[start : start + 2] for start in (0, 2) for one in (hips, calves)]
+    assert place_sets(names) == [*((name,) for name in names), *pairs, hips, calves, names]
+
+
 def test_a_size_at_two_places_is_the_same_physical_size(spec, plain):
     from envs.rig import Rig
 

@@ -1,0 +1,46 @@
+"""What every log leaves uncertain beside the model's own parameters; these rows are fitted, and never named as missing.
+
+A controller's damping gain is rarely known to a percent, and few logs say how their targets went on between two rows.
+Discovery fits both under every hypothesis, or it would call them a delay or a friction.
+"""
+
+import jax.numpy as jnp
+
+from jaxtune.types import Effect, Parameter
+
+
+def _damping_gain(values, speed, now, memory):
+    """speed' = ratio speed, as the controller damps it; `values` hold the logarithm of the ratio."""
+    del now
+    return speed * jnp.exp(values["ratio"]), memory
+
+
+def _target_between_rows(values, target, now, memory):
+    """target' = target + share (linear - held): targets that move on in a straight line to the next row."""
+    return target + values["share"] * now.between, memory
+
+
+ROWS = (
+    Effect(
+        name="damping_gain",
+        family="actuator",
+        on="joint",
+        enters="speed",
+        parameters=(Parameter(name="ratio", form="ratio", bounds=(-1.0, 1.0), prior=0.1),),
+        sizes=(0.05,),
+        act=_damping_gain,
+        sentence="The controller's damping gain is not the one that was set.",
+        excited_by="chirps at two controller gains",
+    ),
+    Effect(
+        name="target_between_rows",
+        family="actuator",
+        on="robot",
+        enters="command",
+        parameters=(Parameter(name="share", bounds=(0.0, 1.0), prior=0.5),),
+        sizes=(0.2,),
+        act=_target_between_rows,
+        sentence="Targets move on between two rows of the log.",
+        excited_by="a log at a higher rate",
+    ),
+)

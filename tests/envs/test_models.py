@@ -1,0 +1,122 @@
+"""Models of robots: from several files into one, and nothing switched off unnoticed."""
+
+import mujoco
+import numpy as np
+import pytest
+from PIL import Image
+
+from envs import models
+
+BOX = """v -1 -1 -1
+v 1 -1 -1
+v 1 1 -1
+v -1 1 -1
+v -1 -1 1
+v 1 -1 1
+v 1 1 1
+v -1 1 1
+f 1 3 2
+f 1 4 3
+f 5 6 7
+f 5 7 8
+f 1 2 6
+f 1 6 5
+f 2 3 7
+f 2 7 6
+f 3 4 8
+f 3 8 7
+f 4 1 5
+f 4 5 8
+"""
+LEG = """<mujocoinclude>
+  <body name="leg" pos="0 0 -0.2">
+    <joint name="knee" axis="0 1 0" damping="0.1" frictionloss="0.2"/>
+    <geom type="mesh" mesh="box" pos="0 0 -0.1" mass="0.7" material="grey"/>
+    <geom type="sphere" size="0.02" pos="0 0 -0.2" mass="0.1"/>
+  </body>
+</mujocoinclude>"""
+ROBOT = """<mujoco>
+  <compiler meshdir="assets" {compiler}/>
+  <option>{option}</option>
+  <asset>
+    <mesh name="box" file="box.obj" scale="0.02 0.03 0.1"/>
+    <texture name="skin" type="2d" file="skin.png"/>
+    <texture name="sky" type="skybox" builtin="gradient" rgb1="0 0 0" rgb2="1 1 1" width="8" height="8"/>
+    <material name="grey" rgba="0.5 0.5 0.5 1" texture="skin"/>
+  </asset>
+  <worldbody>
+    <geom type="mesh" mesh="box"/>
+    <body name="thigh">
+      <inertial mass="1" pos="0 0 -0.1" diaginertia="0.01 0.02 0.03"/>
+      <joint name="hip" axis="0 1 0"/>
+      <geom type="mesh" mesh="box" contype="0" conaffinity="0"/>
+      <body name="motor" pos="0.1 0 0">
+        <inertial mass="9" pos="0 0 0" diaginertia="0.09 0.09 0.09"/>
+        <geom size="0.03"/>
+      </body>
+      <include file="parts/leg.xml"/>
+    </body>
+  </worldbody>
+  <actuator><position joint="hip" kp="3"/></actuator>
+</mujoco>"""
+
+
+@pytest.fixture
+def robot(tmp_path):
+    def put(option="", compiler=""):
+        for folder in ("assets", "parts"):
+            (tmp_path / folder).mkdir(exist_ok=True)
+        (tmp_path / "assets" / "box.obj").write_text(BOX)
+        Image.new("RGB", (4, 4)).save(tmp_path / "skin.png")
+        (tmp_path / "parts" / "leg.xml").write_text(LEG)
+        path = tmp_path / "robot.xml"
+        path.write_text(ROBOT.format(option=option, compiler=compiler))
+        return path
+
+    return put
+
+
+@pytest.mark.parametrize("compiler", ["", 'inertiafromgeom="true"', 'discardvisual="true"', 'balanceinertia="true"'])
+def test_one_file_moves_as_many_did(robot, tmp_path, compiler):
+    path = robot(compiler=compiler)
+    exact = mujoco.MjModel.from_xml_path(str(path))
+    spec = models.spec(str(path))
+    spec.compile()
+    saved = tmp_path / "elsewhere" / "saved.xml"
+    saved.parent.mkdir()
+    saved.write_text(spec.to_xml())
+    model = mujoco.MjModel.from_xml_path(str(saved))
+    assert (model.nmesh, model.ntex) == (0, min(exact.ntex, 1))
+    for field in ("body_mass", "body_inertia", "body_ipos", "dof_damping", "dof_frictionloss"):
+        np.testing.assert_allclose(getattr(model, field), getattr(exact, field), rtol=1e-4, atol=1e-7, err_msg=field)
+    found = []
+    for one in (exact, model):
+        one.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+        data = mujoco.MjData(one)
+        data.qpos[:] = [0.5, -0.4]
+        mujoco.mj_step(one, data, 300)
+        found.append(data.qpos.copy())
+    np.testing.assert_allclose(*found, atol=1e-4)
+
+
+def test_a_mesh_that_is_missing_is_named(robot):
+    path = robot()
+    (path.parent / "assets" / "box.obj").unlink()
+    with pytest.raises(ValueError, match=r"robot: .*robot\.xml: .*box\.obj"):
+        models.spec(str(path))
+
+
+@pytest.mark.parametrize("name", ["constraint", "frictionloss", "limit", "damper", "gravity"])
+def test_flags_that_switch_physics_off_are_named_or_cleared(robot, name):
+    spec = models.spec(str(robot(option=f'<flag {name}="disable" contact="disable"/>')))
+    with pytest.raises(ValueError, match=rf"got {name} disabled, .*--clear-flags"):
+        models.check_flags(spec)
+    assert models.check_flags(spec, clear=True) == (name,)
+    assert models.check_flags(spec) == ()
+    # What does no harm stays.
+    assert models.suspended(spec).opt.disableflags == mujoco.mjtDisableBit.mjDSBL_CONTACT
+
+
+def test_built_in_robots_have_nothing_switched_off():
+    for name in models.BUILT_IN:
+        assert models.check_flags(models.spec(name)) == ()

@@ -1,0 +1,126 @@
+"""Null logs: what a sensor of the measured log would have read of a robot that lacks nothing."""
+
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+import pytest
+
+from envs import readings
+from envs.logs import Controller, Log, Run
+from envs.models import suspended
+from envs.null_logs import replay, simulate_null_log
+from envs.smoothing import smoothed
+from tests.rigs import ARM, ARM_JOINTS
+
+GAINS = {"kp": np.array([40.0, 20.0]), "kd": np.array([2.0, 0.8]), "torque_limit_nm": np.array([15.0, 15.0])}
+SERVO = {name: np.array([value, value]) for name, value in {"gain": 5.0, "kt": 0.5, "resistance_ohm": 0.5}.items()}
+
+
+@pytest.fixture(scope="module")
+def spec():
+    return mujoco.MjSpec.from_string(ARM)
+
+
+def measured(rate_hz=100.0, between="hold", known=None, **signals):
+    time = np.arange(round(2.0 * rate_hz)) / rate_hz
+    target = 0.4 * np.sin(2 * np.pi * time)[:, None] * [1.0, -1.0]
+    zero = np.zeros_like(target)
+    return Run(
+        name="run_000",
+        condition="a",
+        split=None,
+        controller=Controller(kind="pd", rate_hz=500.0, gains=GAINS, between_rows=between),
+        time=time,
+        signals={"q": zero, "target": target, **signals},
+        known=known or {},
+    )
+
+
+def log_of(run):
+    rate = 1.0 / np.median(np.diff(run.time))
+    return Log(robot="", base="fixed", rate_hz=rate, joints=ARM_JOINTS, policy=None, runs=(run,))
+
+
+def played(run, spec, linear=False):
+    model = suspended(spec)
+    model.opt.timestep = 0.0005
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION
+    return replay(run, model, ARM_JOINTS, linear, np.random.default_rng(0)).signals
+
+
+def test_held_targets_come_half_a_row_later_than_lines(spec):
+    run = measured(rate_hz=20.0)
+    held, line = (played(run, spec, linear)["q"] for linear in (False, True))
+    # A staircase is late by half a row in the mean.
+    shifts = np.arange(0.0, 0.06, 0.005)
+    apart = [np.abs(np.interp(run.time - late, run.time, line[:, 0]) - held[:, 0])[4:].mean() for late in shifts]
+    assert shifts[np.argmin(apart)] == pytest.approx(0.025, abs=0.006)
+
+
+def test_unknown_targets_between_rows_are_drawn_for_every_null_log(spec):
+    known = {"q": {"noise_sd": np.zeros(2)}}
+    found = {}
+    for between in ("hold", "linear", "unknown"):
+        log = log_of(measured(20.0, between, known))
+        found[between] = [simulate_null_log(log, spec, seed).runs[0].signals["q"] for seed in range(6)]
+    kinds = [
+        "hold" if np.abs(unknown - held).max() < np.abs(unknown - line).max() else "linear"
+        for held, line, unknown in zip(*found.values(), strict=True)
+    ]
+    assert set(kinds) == {"hold", "linear"}
+
+
+def test_every_column_has_its_own_noise_rounding_and_time(spec):
+    exact = played(measured(), spec)["q"]
+    known = {
+        "q": {
+            "noise_sd": np.array([0.02, 0.0]),
+            "quantum": np.array([0.0, 0.01]),
+            "offset_s": np.array([0.0, 0.02]),
+        }
+    }
+    run = measured(known=known)
+    read = played(run, spec)["q"]
+    assert (read[:, 0] - exact[:, 0]).std() == pytest.approx(0.02, rel=0.15)
+    np.testing.assert_allclose(read[:, 1] / 0.01, np.round(read[:, 1] / 0.01), atol=1e-6)
+    # Read two rows later than its time stamp says.
+    np.testing.assert_allclose(read[:-2, 1], exact[2:, 1], atol=0.0051 + 1e-6)
+    again = replace(run, signals={**run.signals, "q": read})
+    np.testing.assert_allclose(smoothed(again)[4:-4, 0, 1], exact[4:-4, 1], atol=0.006)
+
+
+def test_what_a_slow_bus_repeated_is_repeated(spec):
+    time = measured().time
+    repeated = 0.5 * np.sin(2 * np.pi * time)[:, None] * [1.0, 1.0]
+    repeated = repeated[np.arange(len(time)) // 2 * 2]
+    run = measured(q=repeated)
+    wanted = readings.stale(run, "q")
+    assert 0.4 < wanted.mean() < 0.5
+    read = played(run, spec)["q"]
+    assert (np.diff(read, axis=0)[wanted[1:]] == 0).all()
+    assert (np.diff(read, axis=0)[~wanted[1:]] != 0).all()
+
+
+def test_measured_torque_is_what_moves_the_joint(spec):
+    blank = np.zeros_like(measured().signals["target"])
+    exact = {name: {"noise_sd": np.zeros(2)} for name in ("q", "dq", "tau", "abs_tau")}
+    run = measured(known=exact, dq=blank, tau=blank, abs_tau=blank, volts=np.full(200, 8.0))
+    servo = Controller(kind="servo", rate_hz=500.0, gains=SERVO)
+    for mine in (run, replace(run, controller=servo)):
+        read = played(mine, spec, linear=True)
+        law, speed = mine.impedance(), read["dq"]
+        wanted = law.torque(read["target"], read["q"], speed) - law.back_emf * speed
+        # But for what changes between two looks of the controller.
+        assert np.median(np.abs(read["tau"] - wanted)) < 0.1 * np.abs(wanted).std()
+        np.testing.assert_allclose(read["abs_tau"], np.abs(read["tau"]), atol=1e-4)
+        assert (read["abs_tau"] >= 0).all()
+
+
+def test_torques_that_were_sent_stay_what_they_are(spec):
+    sent = 0.1 * np.ones((200, 2))
+    run = measured(tau=sent)
+    run = replace(run, signals={name: run.signals[name] for name in ("q", "tau")})
+    read = played(run, spec)
+    np.testing.assert_array_equal(read["tau"], sent)
+    assert np.abs(read["q"]).max() > 0.01
