@@ -34,6 +34,8 @@ class Args:
     """Random seed of the null logs."""
     trust_log: bool = False
     """Go on although the log doctor suspects an error of the log that would make the answer wrong."""
+    clear_flags: bool = False
+    """Clear flags of the model that switch physics off; without this option such a model is refused."""
 
 
 def main(args: Args) -> None:
@@ -45,7 +47,7 @@ def main(args: Args) -> None:
     checkpoint.set_up_compiler(checkpoint.a_device_a_core())
     _check(args)
     # Says what is wrong with the logs before the folder is made and anything is compiled.
-    log, _ = read_logs(args.logs)
+    log, _ = read_logs(args.logs, args.clear_flags)
     for note in gate.check(log, args.horizons, trust=args.trust_log):
         console.print(f"note: {note}", highlight=False, markup=False, soft_wrap=True)
     identity = {"logs": [str(path) for path in args.logs], "horizons": args.horizons, "healthy": args.healthy}
@@ -58,6 +60,7 @@ def main(args: Args) -> None:
             horizons=args.horizons,
             null_logs=args.healthy,
             seed=args.seed,
+            clear_flags=args.clear_flags,
             say=lambda text: progress.update(task, description=text[:100]),
         )
     report.show(console, answer.question, answer.summary, answer.free)
