@@ -12,7 +12,7 @@ from experiments.common import checkpoint
 from experiments.common.cli import bars, console, run
 from experiments.discovery import gate, report
 from experiments.discovery.investigate import investigate
-from experiments.discovery.setup import HORIZONS_S, read_logs
+from experiments.discovery.setup import read_logs
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,9 +24,9 @@ class Args:
     too."""
     out: Path = Path("runs/discover")
     """Folder of the results. The same command with the same folder continues after the last accepted effect."""
-    horizons: tuple[float, ...] = HORIZONS_S
+    horizons: tuple[float, ...] | None = None
     """Three increasing lengths in s. Runs are cut into segments of each length, which are simulated from their measured
-    first state."""
+    first state. Lengths that fit the rate of the rows if not given."""
     healthy: int = 20
     """Number of null logs: simulated logs in which no effect is missing. They set the noise floor and the
     thresholds."""
@@ -34,6 +34,8 @@ class Args:
     """Random seed of the null logs."""
     trust_log: bool = False
     """Go on although the log doctor suspects an error of the log that would make the answer wrong."""
+    clear_flags: bool = False
+    """Clear flags of the model that switch physics off; without this option such a model is refused."""
 
 
 def main(args: Args) -> None:
@@ -45,7 +47,7 @@ def main(args: Args) -> None:
     checkpoint.set_up_compiler(checkpoint.a_device_a_core())
     _check(args)
     # Says what is wrong with the logs before the folder is made and anything is compiled.
-    log, _ = read_logs(args.logs)
+    log, _ = read_logs(args.logs, args.clear_flags)
     for note in gate.check(log, args.horizons, trust=args.trust_log):
         console.print(f"note: {note}", highlight=False, markup=False, soft_wrap=True)
     identity = {"logs": [str(path) for path in args.logs], "horizons": args.horizons, "healthy": args.healthy}
@@ -58,6 +60,7 @@ def main(args: Args) -> None:
             horizons=args.horizons,
             null_logs=args.healthy,
             seed=args.seed,
+            clear_flags=args.clear_flags,
             say=lambda text: progress.update(task, description=text[:100]),
         )
     report.show(console, answer.question, answer.summary, answer.free)
@@ -65,8 +68,9 @@ def main(args: Args) -> None:
 
 
 def _check(args: Args) -> None:
-    if len(args.horizons) != 3 or sorted(set(args.horizons)) != list(args.horizons) or args.horizons[0] <= 0:
-        raise ValueError(f"horizons: got {args.horizons}, expected three increasing lengths in s, all above zero")
+    lengths = args.horizons
+    if lengths is not None and (len(lengths) != 3 or sorted(set(lengths)) != list(lengths) or lengths[0] <= 0):
+        raise ValueError(f"horizons: got {lengths}, expected three increasing lengths in s, all above zero")
     if args.healthy < 2:
         raise ValueError(f"healthy: got {args.healthy}, expected 2 or more")
 

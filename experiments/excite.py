@@ -4,6 +4,7 @@ The result is a log without measurements. Play its targets on the robot, suspend
 columns; `experiments.discover` then reads the log. The motion is described in `experiments.discovery.excitation`.
 """
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,7 +15,8 @@ from envs import models
 from envs.logs import Controller, Log, Run, write
 from experiments.common.cli import console, run
 from experiments.discovery.excitation import MOTIONS, excitation, scaled
-from experiments.discovery.standalone import standalone
+
+_OTHER_FILES = re.compile(r"<include\b|\bfile\s*=")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,7 +64,7 @@ def main(args: Args) -> None:
         raise ValueError(f"robot: got '{args.robot}' with joints {joints}, expected hinges or slides that have names")
     built_in = args.robot in models.BUILT_IN
     # Before anything is written, because it may fail.
-    model = None if built_in else standalone(Path(args.robot))
+    model = None if built_in else _one_file(Path(args.robot), spec)
     everywhere = np.ones(len(joints))
     gains = {"kp": args.kp, "kd": args.kd, "torque_limit_nm": args.torque_limit_nm}
     controller = Controller(
@@ -105,6 +107,19 @@ def _check(args: Args) -> None:
         raise ValueError(f"motion: got '{args.motion}', expected one of {', '.join(MOTIONS)}")
     if args.out.exists() and any(args.out.iterdir()):
         raise ValueError(f"out: got {args.out}, expected a new or empty folder")
+
+
+def _one_file(path: Path, spec: mujoco.MjSpec) -> str:
+    """Returns a model as the text of one MJCF; as it was written, where it refers to no other file."""
+    text = path.read_text(encoding="utf-8")
+    # A comment may speak of files.
+    if not _OTHER_FILES.search(re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL)):
+        return text
+    try:
+        # Writing compiles, so a copy is written.
+        return spec.copy().to_xml()
+    except ValueError as error:
+        raise ValueError(f"robot: {path} without its meshes: {error}") from error
 
 
 if __name__ == "__main__":

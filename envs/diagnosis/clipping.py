@@ -10,7 +10,7 @@ import numpy as np
 
 from envs.diagnosis.finding import Finding
 from envs.logs import Run
-from envs.segments import quantum_of
+from envs.readings import quantum_of
 
 _LEAST_SHARE = 0.01  # of the rows, which lie at the end
 _LEAST_ROWS = 8
@@ -58,7 +58,7 @@ def clipped_alike(runs: Sequence[Run], joints: Sequence[str]) -> dict[str, list[
 
 def _ends(column: np.ndarray, least_stays: int) -> Iterator[tuple[float, float]]:
     """Yields the largest or smallest value of a column [rows] if it is cut off there, and the share of rows there."""
-    quantum = quantum_of(column[:, None])
+    quantum = float(quantum_of(column))
     steps = np.abs(np.diff(column))
     if not (steps > 0).any() or np.ptp(column) <= 20 * quantum:
         return

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from envs.logs import Run
-from envs.segments import smoothed
+from envs.smoothing import smoothed
 
 _MOST = 2.0  # disagreement of two signals that have opposite signs
 _ROWS = 250  # at which inverse dynamics are evaluated, at most
@@ -105,7 +105,7 @@ class Disagreement:
         keys = [(time, column.tobytes()) for column in columns]
         new = {key: column for key, column in zip(keys, columns, strict=True) if key not in self._smoothed}
         if new:
-            states = smoothed(replace(run, signals={"q": np.stack(list(new.values()), axis=1)}))
+            states = smoothed(replace(run, signals={"q": np.stack(list(new.values()), axis=1)}, known={}))
             self._smoothed |= dict(zip(new, np.moveaxis(states, 2, 0), strict=True))
         states = np.stack([self._smoothed[key] for key in keys], axis=2)
         return states[:, 0], states[:, 1]

@@ -14,7 +14,7 @@ import numpy as np
 from envs.diagnosis.disagreement import Disagreement, relative_difference
 from envs.diagnosis.finding import MEASURED, Finding
 from envs.logs import Run
-from envs.segments import quantum_of
+from envs.readings import quantum_of
 
 # A repair is believed if the disagreement falls by more than both of these.
 _BETTER = 0.25  # in units of one joint's whole signal

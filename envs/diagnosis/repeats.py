@@ -5,7 +5,7 @@ repeated where one of these says so:
 
 - other rows: a joint moves on in the same direction before and after the stay;
 - speed: the readings, though constant, include a velocity that would have moved the joint far;
-- noise: in the rows around the stay readings change from row to row and back, as they do at rest too.
+- noise: in the rows around the stay readings of two joints change from row to row and back, as they do at rest too.
 
 Targets that go far say nothing: a weak servo sticks for seconds while its target moves on.
 """
@@ -14,11 +14,12 @@ import numpy as np
 
 from envs.diagnosis.finding import MEASURED
 from envs.logs import Run
-from envs.segments import quantum_of
+from envs.readings import quantum_of
 
 _SUDDEN_S = 0.008  # in which no robot stops, and starts again as fast
 _NEAR = 25  # rows before and after a stay, from which noise is estimated
-_LEAST_QUANTA = 3.0  # of motion that must have been seen
+_LEAST_QUANTA = 3.0  # of motion before and after a stay, for its speed to be known
+_MISSED_QUANTA = 1.75  # of motion that must have been seen during the stay
 _CHANCE = 0.3  # stays that noise may bring about in a run, at most
 _FAR = 0.3  # of the joint's own range of motion
 
@@ -30,14 +31,17 @@ def repeated(run: Run) -> np.ndarray:
     same = (np.diff(values, axis=0) == 0).all(axis=1)
     joints = run.signals["q"].shape[1]
     edges = np.flatnonzero(np.diff(same, prepend=False, append=False))
-    quanta = np.array([quantum_of(column[:, None]) for column in values.T])
-    for first, last in zip(edges[::2], edges[1::2], strict=True):
-        # Rows from `first` to `last` are equal, both included.
-        if not (
-            _passes(run, first, last, quanta[:joints])
-            or _driven(run, first, last)
-            or _noisy(values, first, last, quanta)
-        ):
+    quanta = quantum_of(values)
+    # Rows from first to last are equal, both included.
+    stays = list(zip(edges[::2], edges[1::2], strict=True))
+    # Readings of one joint are not independent.
+    parts = np.concatenate([np.arange(one[0].size) + 1000 * (one.shape[1:] != (joints,)) for one in measured])
+    chance = np.array([_chance(values, first, last, quanta, parts) for first, last in stays])
+    expected = len(same) * chance
+    # Beyond chance by itself, or as one of many more than noise brings about.
+    noisy = (chance < 1) & ((expected < _CHANCE) | ((chance < 1).sum() > 3.0 * expected + 1.0))
+    for (first, last), beyond in zip(stays, noisy, strict=True):
+        if not (beyond or _passes(run, first, last, quanta[:joints]) or _driven(run, first, last)):
             same[first:last] = False
     return same
 
@@ -52,7 +56,10 @@ def _passes(run: Run, first: int, last: int, quanta: np.ndarray) -> bool:
     leaving, gone = np.diff(position[[last, last + width, last + 2 * width]], axis=0)
     # Of a constant deceleration to rest, the last piece is a third of the one before.
     sudden = (near * far > 0.6 * far**2) & (leaving * gone > 0.6 * gone**2) & (near * leaving > 0)
-    return bool((sudden & (np.minimum(np.abs(near), np.abs(leaving)) > _LEAST_QUANTA * quanta)).any())
+    pace = np.minimum(np.abs(near), np.abs(leaving))
+    # Rounding alone makes a slow joint stay.
+    missed = pace * (last - first) / width
+    return bool((sudden & (pace > _LEAST_QUANTA * quanta) & (missed > _MISSED_QUANTA * quanta)).any())
 
 
 def _driven(run: Run, first: int, last: int) -> bool:
@@ -62,13 +69,13 @@ def _driven(run: Run, first: int, last: int) -> bool:
     return bool((speed * (run.time[last] - run.time[first]) > far).any())
 
 
-def _noisy(values: np.ndarray, first: int, last: int, quanta: np.ndarray) -> bool:
-    """Whether two readings scatter in all rows around a stay, so that it is by no chance that all of them stay."""
+def _chance(values: np.ndarray, first: int, last: int, quanta: np.ndarray, parts: np.ndarray) -> float:
+    """Computes how probable a stay is by chance if readings of two joints scatter in all rows around it; else one."""
     sides = [values[max(0, first - _NEAR) : first + 1], values[last : last + 1 + _NEAR]]
     rows = [side[np.append(True, (np.diff(side, axis=0) != 0).any(axis=1))] for side in sides]
     # Of neighbours that stand still as well, too few rows differ.
     if any(len(side) < max(_NEAR // 2, 0.4 * count) for side, count in zip(rows, map(len, sides), strict=True)):
-        return False
+        return 1.0
     third = [np.diff(side, n=3, axis=0) for side in rows]
     sd = np.min([1.4826 * np.median(np.abs(each), axis=0) / np.sqrt(20.0) for each in third], axis=0)
     # Of white noise three in four third differences have the other sign than the one before; of motion hardly any.
@@ -77,7 +84,7 @@ def _noisy(values: np.ndarray, first: int, last: int, quanta: np.ndarray) -> boo
     noise = (turns > 0.5) & (sd > np.maximum(0.8 * quanta, 1e-9))
     # Two readings of noise are equal with this probability.
     same = np.maximum(quanta[noise] / (sd[noise] * np.sqrt(4 * np.pi)), 0.25 / _NEAR)
-    return bool(noise.sum() >= 2 and np.prod(same) ** (last - first) * len(values) < _CHANCE)
+    return float(np.prod(same) ** (last - first)) if len(set(parts[noise])) >= 2 else 1.0
 
 
 def slope(time: np.ndarray, values: np.ndarray) -> np.ndarray:

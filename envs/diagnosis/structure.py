@@ -7,7 +7,7 @@ import numpy as np
 from envs.diagnosis.finding import Finding
 from envs.diagnosis.repeats import repeated, slope
 from envs.logs import Run
-from envs.segments import noise, quantum_of
+from envs.readings import noise, quantum_of
 
 _LEAST_RATE_HZ = 100.0
 _LEAST_HOLE = 1.6  # usual steps of the clock

@@ -11,6 +11,9 @@ import numpy as np
 from envs import segments
 from envs.diagnosis import diagnose_log, shared_findings
 from envs.logs import Log, Run, splits
+from envs.readings import quantum_of
+from envs.smoothing import smoothed
+from experiments.discovery.cutting import fitting_horizons
 from experiments.discovery.setup import without_sealed
 
 _LEAST_SEGMENTS = 3  # of the longest horizon in every split
@@ -19,12 +22,12 @@ _REST_QUANTA = 3.0
 _SATURATED = 0.95  # of the rows in which motors are on
 
 
-def check(log: Log, horizons: Sequence[float], trust: bool = False) -> list[str]:
+def check(log: Log, horizons: Sequence[float] | None = None, trust: bool = False) -> list[str]:
     """Checks that a log can answer, without its sealed runs, whose time stamps alone are looked at.
 
     Args:
       log: of all runs, its base fixed.
-      horizons: lengths of the segments in s.
+      horizons: lengths of the segments in s; None takes those that fit the rows.
       trust: whether what the doctor suspects is a note too.
 
     Returns:
@@ -33,7 +36,7 @@ def check(log: Log, horizons: Sequence[float], trust: bool = False) -> list[str]
     Raises:
       ValueError: nothing can be learnt from the log, or it is misleading and not trusted.
     """
-    _check_length(log, max(horizons))
+    _check_length(log, max(fitting_horizons(log, horizons)))
     log = without_sealed(log)
     _check_driven(log)
     _check_motion(log)
@@ -89,7 +92,7 @@ def _check_motion(log: Log) -> None:
         for name, column in zip(log.joints, run.signals["q"].T, strict=True):
             rows = min(len(column), max(1, round(0.1 / np.median(np.diff(run.time)))))
             mean = np.convolve(column, np.full(rows, 1.0 / rows), "valid")
-            least = max(_REST, _REST_QUANTA * segments.quantum_of(column[:, None]))
+            least = max(_REST, _REST_QUANTA * quantum_of(column))
             wander[run.name, name] = np.ptp(mean) / least
     (where, joint), most = max(wander.items(), key=lambda each: each[1])
     if most <= 1.0:
@@ -110,11 +113,15 @@ def _check_saturation(log: Log) -> None:
         )
 
 
+def _supplied(run: Run) -> bool:
+    return run.controller.kind != "servo" or "volts" in run.signals or "volts" in run.controller.gains
+
+
 def _saturated(run: Run) -> np.ndarray | None:
     """Counts rows with motors on, and those of them at the controller's limit, [2, joints]."""
-    if "target" not in run.signals or (run.controller.kind == "servo" and "volts" not in run.signals):
+    if "target" not in run.signals or not _supplied(run):
         return None
-    law, speed = run.impedance(), segments.smoothed(run)[:, 1]
+    law, speed = run.impedance(), smoothed(run)[:, 1]
     on = law.limit > 0
     torque = np.abs(law.torque(run.signals["target"], run.signals["q"], speed))
     return np.stack([on.sum(axis=0), (on & (torque >= 0.999 * law.limit)).sum(axis=0)])

@@ -37,6 +37,7 @@ def investigate(
     horizons: Sequence[float] = HORIZONS_S,
     null_logs: int = 20,
     seed: int = 0,
+    clear_flags: bool = False,
     say: Say = lambda text: None,
 ) -> Answer:
     """Reads logs, discovers what their model lacks, and writes summary, details and the corrected model.
@@ -49,6 +50,7 @@ def investigate(
       horizons: three increasing lengths of segments in s.
       null_logs: number of simulated null logs.
       seed: of the null logs.
+      clear_flags: whether flags of the model that switch physics off are cleared; else they are refused.
       say: receives a line of text about progress.
 
     Returns:
@@ -58,7 +60,7 @@ def investigate(
       ValueError: a log cannot be used.
     """
     began, saved = time.monotonic(), out / "state.json"
-    log, spec = read_logs(logs)
+    log, spec = read_logs(logs, clear_flags)
     question = build_question(log, spec, horizons, null_logs, seed)
     out.mkdir(parents=True, exist_ok=True)
     result = workflow.discover(

@@ -28,7 +28,6 @@ LEG = """<mujoco model="leg">
       </body>
     </body>
   </worldbody>
-  {}
 </mujoco>"""
 ASSETS = """<mujoco><asset>
   <mesh name="shape" file="shape.obj"/><material name="grey" rgba=".5 .5 .5 1"/>
@@ -41,11 +40,11 @@ def spec():
     return models.spec(str(ARM))
 
 
-def leg(folder, compiler="", extra=""):
+def leg(folder, compiler=""):
     (folder / "shapes").mkdir()
     (folder / "shapes" / "shape.obj").write_text(WEDGE)
     (folder / "assets.xml").write_text(ASSETS)
-    (folder / "leg.xml").write_text(LEG.format(compiler, extra))
+    (folder / "leg.xml").write_text(LEG.format(compiler))
     return folder / "leg.xml"
 
 
@@ -132,13 +131,6 @@ def test_a_model_of_several_files_becomes_one_with_the_same_masses(tmp_path, com
         torques.append(data.qfrc_inverse.copy())
     np.testing.assert_allclose(*torques, rtol=1e-4)
     assert read(tmp_path / "log", measured=False).joints == ("hip", "knee")
-
-
-def test_what_needs_a_mesh_is_said_by_name(tmp_path):
-    path = leg(tmp_path, extra='<contact><pair geom1="shell" geom2="shell"/></contact>')
-    with pytest.raises(ValueError, match="robot: "):
-        excite.main(excite.Args(out=tmp_path / "log", robot=str(path), runs=4, seconds=1.0))
-    assert not (tmp_path / "log").exists()
 
 
 @pytest.mark.parametrize(

@@ -196,3 +196,17 @@ def test_the_command_refuses_with_the_doctors_sentence_before_it_makes_a_folder(
     with pytest.raises(ValueError, match=r"set `units: \{angle: deg\}` in meta.yaml"):
         discover.main(discover.Args(logs=(folder,), out=tmp_path / "out", horizons=HORIZONS))
     assert not (tmp_path / "out").exists()
+
+
+def test_flags_that_switch_physics_off_are_refused_unless_they_are_cleared(tmp_path, good):
+    folder = tmp_path / "log"
+    write(replace(signals(good, q=np.degrees, dq=np.degrees), robot="arm.xml"), folder)
+    option = '<option timestep="0.001" gravity="0 0 -9.81"'
+    text = ARM.read_text()
+    assert option in text
+    (folder / "arm.xml").write_text(text.replace(f"{option}/>", f'{option}><flag constraint="disable"/></option>'))
+    with pytest.raises(ValueError, match="got constraint disabled"):
+        discover.main(discover.Args(logs=(folder,), out=tmp_path / "out", horizons=HORIZONS))
+    # Cleared, it is the doctor that refuses.
+    with pytest.raises(ValueError, match="degrees for radians"):
+        discover.main(discover.Args(logs=(folder,), out=tmp_path / "out", horizons=HORIZONS, clear_flags=True))
