@@ -166,7 +166,8 @@ def play(pairs: Sequence[tuple[_Robot, Run]], joints: Sequence[str]) -> list[_Mo
 
 
 def _first_state(model: mujoco.MjModel, run: Run, qpos: np.ndarray, dof: np.ndarray) -> np.ndarray:
-    """The state of a model at a run's first row; smoothed, so that noise there does not become an error of the start."""
+    """The state of a model at a run's first row; smoothed, so that noise there does not become an error of the
+    start."""
     data = mujoco.MjData(model)
     data.qpos[qpos], data.qvel[dof] = smoothed(run)[0]
     state = np.empty(mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS))

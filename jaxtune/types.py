@@ -90,9 +90,9 @@ Scale = Literal[
 """Quantity that one unit of a discovery coordinate stands for.
 
 Except for `one`, its size depends on the robot and on how it moved in the log; `envs.scales` measures it. Per joint:
-`torque` is the rms torque (Nm), `speed` the rms speed (rad/s), `slow` a tenth of it, `damping` torque / speed, `quadratic` torque / speed^2,
-`stiffness` torque / 0.02 rad, `motor` the largest torque limit / speed, `inertia` the diagonal of the joint-space
-inertia (kg m^2). Per body: `mass` (kg), and `drag`, mass * 9.81 (N s/m).
+`torque` is the rms torque (Nm), `speed` the rms speed (rad/s), `slow` a tenth of it, `damping` torque / speed,
+`quadratic` torque / speed^2, `stiffness` torque / 0.02 rad, `motor` the largest torque limit / speed, `inertia` the
+diagonal of the joint-space inertia (kg m^2). Per body: `mass` (kg), and `drag`, mass * 9.81 (N s/m).
 """
 
 

@@ -16,8 +16,8 @@ _SIGN_RAD_S = 0.1  # speed over which friction turns round
 def _learned_torque(values, torque, now, memory):
     """torque' = torque + sum of gains times features of the joint and of its short history.
 
-    Features: 1, sin q, cos q, tanh(dq / 0.1), dq, dq |dq|, the torque itself, and how torque and speed differ from their
-    means over the last 30 ms.
+    Features: 1, sin q, cos q, tanh(dq / 0.1), dq, dq |dq|, the torque itself, and how torque and speed differ from
+    their means over the last 30 ms.
     """
     past_torque, past_speed = memory
     seconds = jnp.full_like(torque, _HISTORY_S)

@@ -35,9 +35,9 @@ def summarise(question: Question, result: Result) -> dict:
     singles = {h.key: h for h in question.problem.hypotheses if len(h.places) == 1 and len(h.directions) == 1}
     for number in result.changed:
         axis = question.rig.axes[number]
-        if not any(change["name"] == axis.effect and axis.place in change["places"] for change in changes):
-            if (hypothesis := singles.get(f"{axis.effect}@{axis.place}")) is not None:
-                changes.append(_effect(question.rig, hypothesis, result.fit, result.errors, ()))
+        known = any(change["name"] == axis.effect and axis.place in change["places"] for change in changes)
+        if not known and (hypothesis := singles.get(f"{axis.effect}@{axis.place}")) is not None:
+            changes.append(_effect(question.rig, hypothesis, result.fit, result.errors, ()))
     not_there = [name for name in LIBRARY if name not in question.rig.effects]
     return {
         "verdict": result.verdict,

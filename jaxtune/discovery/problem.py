@@ -38,8 +38,8 @@ class Hypothesis:
     """[parameters, axes]: how far each axis moves per unit of each coordinate. It is one at the first place; at the
     others it converts between the scales of the places, so that the physical size is the same everywhere."""
     probes: np.ndarray
-    """[probes, parameters]: coordinates at which the screen simulates it, the smallest of interest among them. An effect
-    with several sizes, such as x, y and z, has a probe for each of them alone."""
+    """[probes, parameters]: coordinates at which the screen simulates it, the smallest of interest among them. An
+    effect with several sizes, such as x, y and z, has a probe for each of them alone."""
     bounds: np.ndarray
     """[parameters, 2]: least and largest coordinate."""
     prior: np.ndarray
@@ -138,7 +138,8 @@ class Problem:
     components: Mapping[str, tuple[str, ...]]
     """Names of the components of every signal, such as the joints."""
     trees: np.ndarray
-    """[joints]: number of the kinematic tree that each joint is in; joints of different trees do not move each other."""
+    """[joints]: number of the kinematic tree that each joint is in; joints of different trees do not move each
+    other."""
     values: Callable[[np.ndarray], np.ndarray] = lambda vectors: vectors
     """Turns coordinates [n, axes] into what the simulator is given, [n, axes]."""
     push: Mapping[str, int] = field(default_factory=dict)

@@ -3,9 +3,9 @@
 A fit of the whole library would cost thousands of simulations. The screen simulates each effect at each single place at
 a few sizes, while the nominal parameters stand where they are believed to be, on a part of the segments. Limits, delays
 and play have no slope at zero, and their best size is found among these. Between sizes residuals are interpolated, and
-effects at several places are sums of those at each. `profile` then says what every hypothesis would cost, at every size,
-if the nominal parameters answered it within their bounds and their prior. So all hypotheses are compared by what counts
-in the end, and a pair costs no more simulations than its parts.
+effects at several places are sums of those at each. `profile` then says what every hypothesis would cost, at every
+size, if the nominal parameters answered it within their bounds and their prior. So all hypotheses are compared by what
+counts in the end, and a pair costs no more simulations than its parts.
 """
 
 from collections.abc import Mapping, Sequence

@@ -37,7 +37,8 @@ class State:
     screened: bool = False
     """True once the library was screened, and the fields below are settled."""
     price: float = 0.0
-    """Cost of every effect: the gain that the best hypothesis exceeds on null logs with probability `Settings.level`."""
+    """Cost of every effect: the gain that the best hypothesis exceeds on null logs with probability
+    `Settings.level`."""
     penalty: float = 0.0
     """Smallest weight of the group lasso (`localise.free_torque`) at which no joint of a null log gets a torque."""
     not_testable: tuple[str, ...] = ()
