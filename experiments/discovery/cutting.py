@@ -25,6 +25,7 @@ _HORIZON_ROWS = (4, 12, 36)  # least lengths by default; the first is the least 
 _PARTS = {"train": (0.0, 0.5), "select": (0.5, 0.75), "sealed": (0.75, 1.0)}  # of a run that is cut in time
 _LEAST_ROWS = 8  # of such a part
 _LEAST_SEGMENTS = 3  # of a split: a bootstrap needs a few to draw from
+_ENOUGH, _ENOUGH_S = (40, 128), 20.0  # segments of a split that are simulated, and their length together in s
 
 
 def row_rate(log: Log) -> float:
@@ -114,6 +115,12 @@ def told_alike(null: Cuts, measured: Cuts) -> Cuts:
     }
 
 
+def _spread(found: np.ndarray, horizon: float) -> np.ndarray:
+    """Takes segments evenly from those of a split, where there are more than it takes to decide."""
+    count = min(len(found), int(np.clip(round(_ENOUGH_S / horizon), *_ENOUGH)))
+    return found[np.linspace(0, len(found) - 1, count).round().astype(int)]
+
+
 def cut_log(log: Log, dt: float, signals: Sequence[str], horizons: Sequence[float]) -> Cuts:
     """Cuts a log into segments of each horizon, and labels every row with the motion regime of its joints.
 
@@ -145,6 +152,7 @@ def cut_log(log: Log, dt: float, signals: Sequence[str], horizons: Sequence[floa
                     f"runs: '{split}' has {mine.sum()} segment(s) of {horizon:g} s, expected {_LEAST_SEGMENTS} or "
                     "more: record longer runs or more of them, or choose shorter horizons"
                 )
+            mine = _spread(np.flatnonzero(mine), horizon)
             data[split][horizon] = Segments(
                 inputs=jax.tree.map(lambda leaf, mine=mine: leaf[mine], cut.segments),
                 signals={name: cut.signals[name][mine] for name in signals},

@@ -216,7 +216,7 @@ def _proved(
         weakest = min(wrong, key=lambda key: weighed[key][1].gain)
         failed.append((weakest, {"hypothesis": weakest, "tests": tests[weakest], "evidence": weighed[weakest][1]}))
         best = weighed[weakest][2]
-        (fit,) = polish([best.fit], at.residuals["train"], settings.rounds)
+        (fit,) = polish([best.fit], at.residuals["train"], 1)
         best = replace(best, fit=fit, select=at.residuals["select"](fit.vector[None])[0])
     if not best.hypotheses:
         best = state.null
