@@ -52,7 +52,7 @@ def physics(run: Run, joints: tuple[str, ...], model: mujoco.MjModel, held: bool
     Returns:
       Findings: repairs in the order in which they were made, then drift of the clock and quantisation.
     """
-    run, found = _thinned(run), []
+    run, done = _thinned(run), []
     # With coarse encoders accelerations are mostly rounding errors, so the inverse dynamics are not compared.
     disagreement = Disagreement(run, joints, model, held and not _is_coarse(run))
     now = disagreement(run)
@@ -69,9 +69,19 @@ def physics(run: Run, joints: tuple[str, ...], model: mujoco.MjModel, held: bool
                 chain, repaired, then = best
         if not _believed(now, then):
             break
-        found += [_as_finding(repair, joints) for repair in chain]
+        done += chain
         run, now = repaired, then
+    found = [_as_finding(repair, joints) for repair in _summed(done)]
     return [*found, *_drift(run, disagreement), *_coarse(run, joints)]
+
+
+def _summed(repairs: list[_Repair]) -> list[_Repair]:
+    """Makes one delay of those of one signal, which are taken back in steps."""
+    total: dict[tuple, _Repair] = {}
+    for number, one in enumerate(repairs):
+        key = (one.kind, one.signal) if one.kind == "late" else (number,)
+        total[key] = replace(one, size=one.size + (total[key].size if key in total else 0.0))
+    return list(total.values())
 
 
 def _best(chains: list[list[_Repair]], run: Run, disagreement: Disagreement) -> tuple[list[_Repair], Run, float]:
@@ -129,7 +139,10 @@ def _on(names: tuple[str, ...], change: Callable[[np.ndarray], np.ndarray]) -> C
 def _delays(run: Run, measured: tuple[str, ...]) -> list[_Repair]:
     """Repairs of a delay: all measured signals taken earlier, or velocities alone."""
     period, found = float(np.median(np.diff(run.time))), []
-    for label, names in {"measured": measured, "dq": ("dq",)}.items():
+    # Only the inverse dynamics distinguish a delay from the time that a joint takes to follow its target; behind coarse
+    # encoders they are not compared.
+    groups = {"dq": ("dq",)} | ({} if _is_coarse(run) else {"measured": measured})
+    for label, names in groups.items():
         for delay in _DELAYS_S if "target" in run.signals and set(names) <= set(measured) else ():
             rows = round(delay / period)
             if rows:

@@ -10,7 +10,7 @@ from envs import corrected
 from envs.logs import Log
 from experiments.common import checkpoint
 from experiments.common.checkpoint import write_json
-from experiments.discovery.setup import HORIZONS_S, Question, build_question, read_logs
+from experiments.discovery.setup import Question, build_question, read_logs
 from experiments.discovery.summary import details, free_runs, summarise
 from jaxtune.discovery import workflow
 from jaxtune.discovery.noise_floor import Say
@@ -34,7 +34,7 @@ def investigate(
     logs: Sequence[Path],
     out: Path,
     *,
-    horizons: Sequence[float] = HORIZONS_S,
+    horizons: Sequence[float] | None = None,
     null_logs: int = 20,
     seed: int = 0,
     clear_flags: bool = False,
@@ -47,7 +47,7 @@ def investigate(
     Args:
       logs: folders of logs of one robot.
       out: folder of `summary.json`, `details.json`, `state.json` and `model/`.
-      horizons: three increasing lengths of segments in s.
+      horizons: three increasing lengths of segments in s; None takes those that fit the rows.
       null_logs: number of simulated null logs.
       seed: of the null logs.
       clear_flags: whether flags of the model that switch physics off are cleared; else they are refused.

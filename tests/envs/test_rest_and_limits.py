@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from envs.diagnosis import diagnose_log
 from envs.diagnosis.clipping import clipped, clipped_alike
 from envs.diagnosis.repeats import repeated
 from envs.diagnosis.structure import structure
@@ -145,3 +146,14 @@ def test_of_real_robots_only_what_is_so_is_said(name, rows):
     assert not any(clipped(run, log.joints) for run in log.runs)
     kinds = {one.kind for run in log.runs for one in structure(run)[0]}
     assert kinds <= {"low rate", "duplicated rows"}
+
+
+def test_a_servo_that_follows_late_is_not_said_to_be_delayed_where_dynamics_cannot_tell():
+    log = recorded("so101_sage")
+    found = diagnose_log(replace(log, runs=log.runs[1:3]))
+    # Velocities lag positions by one row, as the recording's own description says.
+    assert {(one.kind, one.signal) for each in found.values() for one in each} == {
+        ("low rate", "t"),
+        ("quantised", "q"),
+        ("late", "dq"),
+    }
