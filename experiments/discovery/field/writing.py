@@ -131,12 +131,11 @@ class Scene:
 def draw_places(case: FieldCase, scene: Scene, rng: np.random.Generator) -> list[tuple[int, ...]]:
     """Draws the places of a case's effects: one joint or body mostly, now and then a left and right pair or all.
 
-    Several effects sit at different joints, as far as there are as many.
+    Several effects sit at different joints.
     """
     names, count = scene.topology.joints, len(scene.topology.joints)
     if len(case.effects) > 1:
-        order = rng.permutation(count)
-        return [(int(order[number % count]),) for number in range(len(case.effects))]
+        return [(int(place),) for place in rng.permutation(count)[: len(case.effects)]]
     if case.effects[0] == "loose_foot":
         return [(count - 1,)]
     first, draw = int(rng.integers(count)), rng.uniform()
@@ -169,10 +168,8 @@ def prepared(case: FieldCase, error: float, seed: int) -> tuple[Scene, list[Plac
         trace = scene.play(placed)
         if not np.isfinite(trace.q).all() or np.abs(trace.q).max() > _FARTHEST_RAD:
             continue
-        off = max(
-            (abs(np.log(max(one.severity, 1e-3) / wanted)) for one, wanted in zip(placed, case.severities, strict=True)),
-            default=0.0,
-        )
+        ratios = [one.severity / asked for one, asked in zip(placed, case.severities, strict=True)]
+        off = max((abs(np.log(ratio)) for ratio in ratios), default=0.0)
         if nearest is None or off < nearest[0]:
             nearest = (off, (scene, placed, trace))
         if off < np.log(_SEVERITY_RATIO):
@@ -247,7 +244,10 @@ def _truth(case: FieldCase, scene: Scene, placed: Sequence[Placed]) -> dict:
             }
         )
     return {
-        **{"kind": case.kind, "topology": case.topology, "generator": case.generator, "effects": effects},
+        "kind": case.kind,
+        "topology": case.topology,
+        "generator": case.generator,
+        "effects": effects,
         "speed": scene.sensors.speed,
         "gains": sorted({motion.gain for motion in scene.motions}),
         "floor_rad": scene.meter.floor_rad.tolist(),
