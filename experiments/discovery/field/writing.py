@@ -98,15 +98,21 @@ class Scene:
         return self.generator.play(real, self.script, whole(1, self.script, range(runs)), hidden)
 
     def log(self, trace: Trace, rng: np.random.Generator) -> Log:
-        """Makes the log that a user would have recorded."""
+        """Makes the log that a user would have recorded.
+
+        Half of the users say how targets go on between rows, and half of those whose speeds are filtered say how.
+        """
         nominal, row_s = self.nominal, self.meter.row_s
-        runs = []
+        runs, tells_targets, tells_filter = [], rng.uniform() < 0.5, rng.uniform() < 0.5
+        between = ("linear" if self.script.linear else "hold") if tells_targets else "unknown"
+        filters = np.full(len(nominal.joints), self.sensors.filter_hz)
+        known = {"dq": {"filter_hz": filters}} if tells_filter and self.sensors.speed == "filtered" else {}
         for motion, q, v in zip(self.motions, trace.q, trace.v, strict=True):
             signals = {"q": self.sensors.positions(q, rng), "target": motion.target}
             speed = self.sensors.speeds(v, row_s, rng)
             signals |= {} if speed is None else {"dq": speed}
             signals |= {} if motion.enabled.all() else {"enabled": motion.enabled}
-            runs.append(self._run(motion, nominal, signals))
+            runs.append(self._run(motion, between, signals, known))
         return Log(
             robot="robot.xml",
             base="fixed",
@@ -116,15 +122,17 @@ class Scene:
             runs=tuple(runs),
         )
 
-    def _run(self, motion: TargetRun, nominal: robots.Robot, signals: dict) -> Run:
+    def _run(self, motion: TargetRun, between: str, signals: dict, known: dict) -> Run:
+        nominal, rate = self.nominal, self.topology.control_hz
         gains = {"kp": nominal.kp * motion.gain, "kd": nominal.kd * motion.gain, "torque_limit_nm": nominal.limit}
         return Run(
             name=motion.name,
             condition=motion.condition,
             split=motion.split or None,
-            controller=Controller(kind="pd", rate_hz=self.topology.control_hz, gains=gains),
+            controller=Controller(kind="pd", rate_hz=rate, gains=gains, between_rows=between),
             time=motion.time,
             signals=signals,
+            known=known,
         )
 
 
