@@ -27,9 +27,9 @@ class Args:
     out: Path = Path("runs/discovery_bench")
     """Folder of the cases and the scores."""
     size: str = "smoke"
-    """Cases: field (184 robots of six kinds in three engines, 6 hours on two cores), field_smoke (6 of them), smoke (6
-    two-joint arms, to see that it works), arm (75 arms, an hour), standard (98 BITenos, a night on a CPU) or full
-    (BITenos with longer logs, for a GPU or a few nights)."""
+    """Cases: smoke (6 two-joint arms, to see that it works), arm (75 arms, an hour), standard (98 BITenos, a night on a
+    CPU) or full (BITenos with longer logs, for a GPU or a few nights). In field (184 cases, 6 hours on two cores) every
+    case is another robot, in one of three engines; field_smoke is six of them."""
     seed: int = 0
     """Random seed of the cases, their places, sizes and wrong parameters."""
     nominal_error: float = 0.1

@@ -1,15 +1,12 @@
-"""The blind benchmark: writes the log of a robot with a hidden effect, lets discovery answer, and scores the answer.
+"""The blind benchmark of one robot: writes its logs with a hidden effect, and the truth beside them.
 
-The truth goes into a folder of its own, `sealed`, which only `Bench.scored` opens. Every case is a file, so an
+The truth goes into a folder of its own, `sealed`, which only `Benchmark.scored` opens. Every case is a file, so an
 interrupted benchmark continues where it stopped, and several processes may share its cases.
 """
 
-import json
-import os
 import shutil
-import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import asdict, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -17,27 +14,22 @@ import numpy as np
 
 from envs import models
 from envs.effects import LIBRARY
-from envs.logs import Controller, Log, read, write
-from envs.rig import Rig
-from experiments.common import checkpoint, plots
+from envs.logs import Controller, Log, write
 from experiments.common.checkpoint import write_json
+from experiments.discovery.benchmark import Benchmark
 from experiments.discovery.blind_cases import SIZE_BOUNDS, SIZES, Case
 from experiments.discovery.blind_robots import Truth, record
 from experiments.discovery.excitation import TargetRun, excitation
-from experiments.discovery.scores import page, score, tally
 from experiments.discovery.setup import HORIZONS_S, Question, build_question
-from experiments.discovery.summary import summarise
-from jaxtune.discovery import workflow
-from jaxtune.discovery.noise_floor import Calibration, left_by_prior, prior_slopes
+from jaxtune.discovery.least_squares import Linear
+from jaxtune.discovery.noise_floor import Floor, measure
 from jaxtune.discovery.simulation import residuals
 
 _HALVINGS = 6  # of the interval in which an effect's size is searched; the severity is then right to about a tenth
 
 
-class Bench:
-    """The cases of a benchmark: their logs, truths, answers and scores, each in a file.
-
-    Call `answer` for every case in `cases`, then `report`.
+class Bench(Benchmark):
+    """The cases of a benchmark of one robot.
 
     Args:
       out: folder of the benchmark.
@@ -48,13 +40,13 @@ class Bench:
     """
 
     def __init__(self, out: Path, size: str, seed: int, nominal_error: float):
-        self._out, self._seed, self._nominal_error = out, seed, nominal_error
+        super().__init__(out)
+        self._seed, self._nominal_error = seed, nominal_error
         self.size = SIZES[size]
         self.spec = models.spec(self.size.model)
         names = ("kp", "kd", "torque_limit_nm")
         gains = {name: np.array(values) for name, values in zip(names, self.size.gains, strict=True)}
         self.controller = Controller(kind="pd", rate_hz=1000.0, gains=gains)
-        self.rig = Rig(self.spec, self.size.joints, self.controller.rate_hz)
         self.motions: list[TargetRun] = excitation(
             self.spec, self.size.joints, self.size.runs, self.size.seconds, 500.0, seed
         )
@@ -79,45 +71,14 @@ class Bench:
         )
         return replace(log, robot=self.size.model)
 
-    def build_question(self, log: Log, horizons: Sequence[float] = HORIZONS_S, null_logs: int = 0) -> Question:
-        """Builds the question for discovery from a log and the nominal model; all cases share compiled programs.
-
-        Args:
-          log: of a case.
-          horizons: lengths of the segments in s.
-          null_logs: number of simulated null logs; zero if `calibration` takes their place.
-        """
-        return build_question(log, self.spec, horizons, null_logs, plain=self.rig)
-
     @cached_property
-    def calibration(self) -> Calibration:
-        """Noise floor and thresholds for this robot and these motions, from simulated null logs.
+    def floor(self) -> Floor:
+        """The noise floor of a robot without any effect at the main horizon, by which sizes are chosen."""
+        question = self._question(self.record(Truth(None), 10_000), self.size.null_logs)
+        return measure(question.problem, lambda text: None)[question.problem.main_horizon]
 
-        They are computed once and kept in `calibration.npz`, because computing them takes as long as a discovery and
-        all cases share robot, motions and noise.
-        """
-        path = self._out / "calibration.npz"
-        if not path.exists():
-            question = self.build_question(self.record(Truth(None), 10_000), null_logs=self.size.null_logs)
-            found = workflow.calibrate(question.problem)
-            arrays = {
-                f"floor {horizon} {split}": floor
-                for horizon, (floors, _) in found.floors.items()
-                for split, floor in floors.items()
-            }
-            arrays |= {f"weight {horizon}": weight for horizon, (_, weight) in found.floors.items()}
-            partial = path.with_suffix(f".{os.getpid()}.npz")
-            np.savez(partial, gain=found.gain, penalty=found.penalty, **arrays)
-            partial.replace(path)
-        with np.load(path) as saved:
-            floors = {}
-            for name in saved.files:
-                kind, *place = name.split()
-                if kind == "floor":
-                    horizon, split = place
-                    of_splits, _ = floors.setdefault(float(horizon), ({}, float(saved[f"weight {horizon}"])))
-                    of_splits[split] = saved[name]
-            return Calibration(floors, float(saved["gain"]), float(saved["penalty"]))
+    def _question(self, log: Log, null_logs: int = 0) -> Question:
+        return build_question(log, self.spec, HORIZONS_S, null_logs)
 
     def truth(self, case: Case) -> tuple[Truth, float]:
         """Draws the place of a case's effect, and searches the size at which it has the severity of the case.
@@ -158,23 +119,24 @@ class Bench:
           case: its effect and seed.
           places: joints or bodies that have the effect.
         """
-        main = sorted(self.calibration.floors)[len(self.calibration.floors) // 2]
-        (floors, weight), seed = self.calibration.floors[main], self.seed(case)
-        floor = floors["train"]
-        problem = self.build_question(self.record(Truth(None), seed, noise=False), (main,)).problem
-        zero = np.zeros(problem.axes)
-        slope = prior_slopes(problem, main) / floor[..., None]
-        plain = residuals(problem, zero, problem.data["train"][main])[0]
+        floor, seed = self.floor, self.seed(case)
+        scale, main, prior = floor.scale["train"], floor.horizon, floor.prior
+        problem = self._question(self.record(Truth(None), seed, noise=False)).problem
+        vectors = np.concatenate([np.zeros((1, problem.axes)), prior.directions])
+        plain, *shifted = residuals(problem, vectors, problem.data["train"][main])
+        slopes = np.stack([(one - plain) / scale for one in shifted], axis=-1)
         positions = slice(-len(self.size.joints), None)  # the last columns of a residual are q
 
         def severity(size: float) -> float:
             log = self.record(Truth(case.effect, places, size), seed, noise=False)
-            segments = self.build_question(log, (main,)).problem.data["train"][main]
-            moved = (residuals(problem, zero, segments)[0] - plain) / floor
+            segments = self._question(log).problem.data["train"][main]
+            moved = (residuals(problem, vectors[0], segments)[0] - plain) / scale
             # A robot whose simulation diverges is more severe than any wanted severity.
             if not np.isfinite(moved).all():
                 return np.inf
-            left = left_by_prior(moved, slope, weight)
+            count, weight = slopes.shape[-1], np.full(moved.size, floor.counts.independent)
+            linear = Linear(moved.ravel(), slopes.reshape(-1, count), np.zeros(count), prior.sd, weight)
+            left = moved + slopes @ linear.step(0.0, prior.bounds)
             return float(np.sqrt((left[..., positions] ** 2).mean(axis=(0, 1))).max())
 
         return severity
@@ -189,7 +151,8 @@ class Bench:
         Returns:
           Folder of the log.
         """
-        folder, sealed = self._out / "logs" / f"case_{case.number:03d}", self._sealed(case)
+        sealed = self.truth_path(case)
+        folder = self.out / "logs" / sealed.stem
         if not sealed.exists():
             truth, severity = self.truth(case)
             log = self.record(truth, self.seed(case))
@@ -200,58 +163,22 @@ class Bench:
             if log.robot not in models.BUILT_IN:
                 shutil.copy(log.robot, folder / "log" / name)
             sealed.parent.mkdir(parents=True, exist_ok=True)
-            write_json(sealed, {"effect": case.effect, "asked": case.severity, "severity": severity, "truth": truth})
+            write_json(sealed, sealed_truth(case, truth, severity))
         return folder / "log"
 
-    def _sealed(self, case: Case) -> Path:
-        return self._out / "sealed" / f"case_{case.number:03d}.json"
 
-    def answer(self, case: Case) -> dict:
-        """Lets discovery answer a case, or reads an earlier answer.
+def sealed_truth(case: Case, truth: Truth, severity: float) -> dict:
+    """Returns what `scores.score` takes of a hidden effect.
 
-        Discovery gets the log, the nominal model and the calibration, and nothing of the truth.
-
-        Returns:
-          Content of `summary.json`, and the best hypothesis that was rejected.
-        """
-        path = self._out / "answers" / f"case_{case.number:03d}.json"
-        if not path.exists():
-            folder = self.write(case)
-            began = time.monotonic()
-            log = read(folder)
-            question = self.build_question(log)
-            result = workflow.discover(question.problem, calibration=self.calibration)
-            path.parent.mkdir(parents=True, exist_ok=True)
-            answer = summarise(question, result) | {"seconds": time.monotonic() - began, "rejected": result.rejected}
-            write_json(path, answer)
-        return json.loads(path.read_text())
-
-    def scored(self) -> list[dict]:
-        """Scores every case that is answered. No other function opens the truth.
-
-        Returns:
-          Rows of `experiments.discovery.scores.score`, with the number of the `case`.
-        """
-        rows = []
-        for case in self.cases:
-            path = self._out / "answers" / f"case_{case.number:03d}.json"
-            if path.exists():
-                truth = json.loads(self._sealed(case).read_text())
-                rows.append(score(truth, json.loads(path.read_text())) | {"case": case.number})
-        return rows
-
-    def report(self, identity: Mapping[str, object]) -> list[dict]:
-        """Writes scores, confusion matrix and page of the cases that are answered so far.
-
-        Args:
-          identity: options of the benchmark, for the page.
-
-        Returns:
-          The table of rates (`experiments.discovery.scores.tally`).
-        """
-        rows, out = self.scored(), self._out
-        lines = tally(rows)
-        write_json(out / "scores.json", {"cases": rows, "table": lines, "versions": checkpoint.versions()})
-        plots.confusion(out / "confusion.png", rows)
-        (out / "README.md").write_text(page(identity, len(rows), len(self.cases), lines))
-        return lines
+    Args:
+      case: that hides it.
+      truth: with place and size.
+      severity: that was reached.
+    """
+    if case.effect is None:
+        return {"kind": "empty", "effects": []}
+    inside = case.effect in LIBRARY
+    kind = "outside" if not inside else "weak" if case.severity < 5.0 else "single"
+    effect = asdict(truth) | {"name": case.effect, "family": LIBRARY[case.effect].family if inside else None}
+    # The formulas differ from the library's, so its parameter has no true value.
+    return {"kind": kind, "effects": [effect | {"value": None, "asked": case.severity, "severity": severity}]}

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from experiments.discovery.field.outside import OUTSIDE
-from experiments.discovery.field.robots import TOPOLOGIES
 from experiments.discovery.field.sizes import FAMILY
 
 GENERATORS = ("mujoco_c", "bullet", "pinocchio")
@@ -73,6 +72,10 @@ def cases(size: FieldSize, seed: int) -> list[FieldCase]:
     topologies = _in_turn(names, len(hidden), rng)
     # Effects come in turn, so generators in turn would give each effect one generator alone.
     generators = _in_turn(GENERATORS, len(hidden), rng)
+    # Three effects need three joints.
+    topologies = [
+        "arm3" if len(one[1]) > 2 and name == "arm2" else name for one, name in zip(hidden, topologies, strict=True)
+    ]
     order = rng.permutation(len(hidden))
     return [FieldCase(number, *hidden[at], topologies[at], generators[at]) for number, at in enumerate(order)]
 

@@ -80,10 +80,11 @@ def _torque_limit(setting: Setting):
 
 @FORMS.add("torque", scalar=False)
 def _torque_speed(setting: Setting):
-    """Constant power: most = limit / (1 + c |speed| / limit) where the motor drives."""
+    """An ellipse: (torque / limit)^2 + (c speed / limit)^2 <= 1 where the motor drives."""
 
     def act(torque: np.ndarray, now: Now) -> np.ndarray:
-        most = setting.limit / (1.0 + setting.size * np.abs(now.v) / setting.limit)
+        share = setting.size * np.abs(now.v) / setting.limit
+        most = setting.limit * np.sqrt(np.maximum(1.0 - share**2, 0.0))
         return np.where(torque * now.v > 0, np.clip(torque, -most, most), torque)
 
     return act
@@ -243,7 +244,7 @@ def _sensor_delay(setting: Setting):
 
 @FORMS.add("sensor", scalar=False)
 def _sensor_lag(setting: Setting):
-    """An observer of second order, whose speed belongs to its own position; its delay at low frequencies is the size."""
+    """An observer of second order, whose speed is that of its own position; slow motion is late by the size."""
     state: dict[str, np.ndarray] = {}
     # x'' = w^2 (q - x) - 2 w x' is late by 2 / w.
     rate = 2.0 / np.maximum(setting.size, 4 * setting.dt)

@@ -1,4 +1,4 @@
-"""Effects as the Pinocchio generator has them: bristles (LuGre), hard edges with ripples, windows, structural damping."""
+"""Effects as the Pinocchio generator has them: bristles (LuGre), whole messages, windows, structural damping."""
 
 import numpy as np
 
@@ -259,7 +259,7 @@ def _drag(setting: Setting, links: Kinematics, at: list[int]):
 
     def act(q: np.ndarray, v: np.ndarray) -> np.ndarray:
         reach = links.jacobian(q, at[0], point)
-        force = -setting.size * (reach @ v[..., None])
+        force = -setting.size[..., None] * (reach @ v[..., None])
         return (reach.transpose(0, 2, 1) @ force)[..., 0]
 
     return act

@@ -44,8 +44,17 @@ def _loose_foot(robot: Robot, place: int, size: float) -> Robot:
 
     below = 1.6 * robot.com[place]
     fields = {
-        **{"pos": below, "axis": [0, 1, 0], "mass": size, "com": [0, 0, -0.06], "inertia": np.eye(3) * 4e-4 * size},
-        **{"armature": 1e-5, "damping": 6e-4 * size, "friction": 0.0, "kp": 0.0, "kd": 0.0, "limit": 0.0},
+        "pos": below,
+        "axis": [0, 1, 0],
+        "mass": size,
+        "com": [0, 0, -0.06],
+        "inertia": np.eye(3) * 4e-4 * size,
+        "armature": 1e-5,
+        "damping": 6e-4 * size,
+        "friction": 0.0,
+        "kp": 0.0,
+        "kd": 0.0,
+        "limit": 0.0,
     }
     numbers = {name: more(getattr(robot, name), value) for name, value in fields.items()}
     names = {"joints": (*robot.joints, "loose"), "bodies": (*robot.bodies, "loose"), "parents": (*robot.parents, place)}

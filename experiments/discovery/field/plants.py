@@ -6,7 +6,9 @@ robots.
 
 import tempfile
 from collections.abc import Sequence
+from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 from typing import Protocol
 
 import mujoco
@@ -81,8 +83,7 @@ class PinocchioPlant:
     dt = 0.00025
 
     def __init__(self, robots: Sequence[Robot], robot_of: np.ndarray, q: np.ndarray, v: np.ndarray):
-        import pinocchio
-
+        pinocchio = _engine("pinocchio")
         self._aba = pinocchio.aba
         self.q, self.v = q.copy(), v.copy()
         models = [self._model(pinocchio, robot) for robot in robots]
@@ -126,11 +127,9 @@ class BulletPlant:
     dt = 0.0005
 
     def __init__(self, robots: Sequence[Robot], robot_of: np.ndarray, q: np.ndarray, v: np.ndarray):
-        import pybullet
-        from pybullet_utils.bullet_client import BulletClient
-
+        pybullet = _engine("pybullet")
         self.q, self.v = q.copy(), v.copy()
-        self._client = BulletClient(pybullet.DIRECT)
+        self._client = _engine("pybullet_utils.bullet_client").BulletClient(pybullet.DIRECT)
         self._client.setGravity(0, 0, -_GRAVITY)
         flags = pybullet.URDF_USE_INERTIA_FROM_FILE
         bodies = []
@@ -162,6 +161,14 @@ class BulletPlant:
         acceleration = np.linalg.solve(full, (torque - self._bias[:, self._place])[..., None])[..., 0]
         self.q += self.dt * (self.v + 0.5 * self.dt * acceleration)
         self.v += self.dt * acceleration
+
+
+def _engine(name: str) -> ModuleType:
+    """Imports an engine that is an extra."""
+    try:
+        return import_module(name)
+    except ImportError as error:
+        raise ValueError(f"size: 'field' needs {name}: pip install 'jaxtune[bullet]'") from error
 
 
 def urdf(robot: Robot) -> str:

@@ -42,6 +42,8 @@ class Script:
     """[runs] factor on kp and kd."""
     ticks: np.ndarray
     """[runs, steps] where the controller reads anew; the first steps are those of `LEAD_S`."""
+    other_ticks: np.ndarray
+    """The same with another jitter, as one who does not know it would simulate it."""
     steps_a_row: int
     period: float
     """Of the controller in s."""
@@ -66,17 +68,21 @@ def script(
     row_s = float(motions[0].time[1] - motions[0].time[0])
     steps_a_row, period = round(row_s / dt), 1.0 / control_hz
     steps = len(motions[0].time) * steps_a_row + round(LEAD_S / dt)
-    ticks = np.zeros((len(motions), steps), bool)
     phase = rng.uniform(0, 0.4)
-    for run in ticks:
-        count = int(steps * dt / period)
-        times = (np.arange(count) + phase + rng.uniform(0, 0.25, count)) * period
-        run[np.minimum((times / dt).astype(int), steps - 1)] = True
+
+    def ticks() -> np.ndarray:
+        found, count = np.zeros((len(motions), steps), bool), int(steps * dt / period)
+        for run in found:
+            times = (np.arange(count) + phase + rng.uniform(0, 0.25, count)) * period
+            run[np.minimum((times / dt).astype(int), steps - 1)] = True
+        return found
+
     return Script(
         target=np.stack([motion.target for motion in motions]),
         enabled=np.stack([motion.enabled for motion in motions]),
         gain=np.array([motion.gain for motion in motions]),
-        ticks=ticks,
+        ticks=ticks(),
+        other_ticks=ticks(),
         steps_a_row=steps_a_row,
         period=period,
         linear=linear,
@@ -125,7 +131,9 @@ def whole(robots: int, script: Script, runs: Sequence[int]) -> Lanes:
         row=np.full(len(run), -1),
         rows=script.target.shape[1],
         q=start,
-        **{"v": none, "held": none, "bristle": none},
+        v=none,
+        held=none,
+        bristle=none,
     )
 
 
@@ -276,4 +284,3 @@ def with_numbers(robot: Robot, form: Form, places: Sequence[int], size: float) -
     for place in places:
         robot = form.make(robot, place, size)
     return robot
-

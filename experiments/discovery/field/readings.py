@@ -77,5 +77,5 @@ def draw(joints: int, rng: np.random.Generator) -> Sensors:
         speed=speed,
         speed_noise=float(np.exp(rng.uniform(np.log(0.004), np.log(0.03)))),
         speed_quantum=float(rng.choice([0.001, 0.005, 0.01])),
-        filter_hz=float(rng.uniform(12, 30)),
+        filter_hz=float(rng.uniform(7, 14)),
     )

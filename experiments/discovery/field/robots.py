@@ -74,7 +74,11 @@ TOPOLOGIES = {
             (1000.0, 200.0, 6, 3.0, False),
         ),
         ("biped", _legs("left", "right"), (1000.0, 500.0, 6, 3.0, True)),
-        ("leg4", _chain("twist roll pitch knee", "hip rocker thigh shank", "zxyy", "00zz"), (200.0, 100.0, 12, 5.0, True)),
+        (
+            "leg4",
+            _chain("twist roll pitch knee", "hip rocker thigh shank", "zxyy", "00zz"),
+            (200.0, 100.0, 12, 5.0, True),
+        ),
     )
 }
 """By name: arms of 2, 3, 5 and 7 joints, a biped's two legs and a leg of 4 joints."""
@@ -159,8 +163,17 @@ def draw(topology: Topology, rng: np.random.Generator) -> Robot:
         bodies=topology.bodies,
         parents=topology.parents,
         limited=topology.limited,
-        **{"pos": pos, "axis": axis, "mass": mass, "com": com, "inertia": inertia, "armature": none},
-        **{"damping": none, "friction": none, "kp": none, "kd": none, "limit": none},
+        pos=pos,
+        axis=axis,
+        mass=mass,
+        com=com,
+        inertia=inertia,
+        armature=none,
+        damping=none,
+        friction=none,
+        kp=none,
+        kd=none,
+        limit=none,
     )
     return _motors(body, topology, rng)
 
@@ -188,7 +201,9 @@ def _motors(body: Robot, topology: Topology, rng: np.random.Generator) -> Robot:
         with_motors,
         damping=rng.uniform(0.02, 0.12, count) * kd,
         friction=rng.uniform(0.03, 0.12, count) * (0.3 * weight + 0.08 * kp),
-        **{"kp": kp, "kd": kd, "limit": limit},
+        kp=kp,
+        kd=kd,
+        limit=limit,
     )
 
 
@@ -244,7 +259,9 @@ def mistaken(robot: Robot, error: float, rng: np.random.Generator) -> Robot:
 def rounded(robot: Robot) -> Robot:
     """Returns the robot with the digits that its MJCF has, so that file and numbers agree."""
     arrays = {name: value for name, value in vars(robot).items() if isinstance(value, np.ndarray)}
-    fields = {name: np.array([float(f"{x:.6g}") for x in value.flat]).reshape(value.shape) for name, value in arrays.items()}
+    fields = {
+        name: np.array([float(f"{x:.6g}") for x in value.flat]).reshape(value.shape) for name, value in arrays.items()
+    }
     fields["axis"] /= np.linalg.norm(fields["axis"], axis=1, keepdims=True)
     return replace(robot, **fields)
 

@@ -5,7 +5,8 @@ same robot without the effect. The difference at their rows is what a model that
 errors of the nominal parameters (masses, armatures, dampings, frictions, kp, kd; at most three prior deviations each)
 may imitate a part, which a least-squares fit takes away. Severity is the rms of the rest in the position of the most
 affected joint, over the floor: the rms of the same difference for the same robot without any effect, whose readings
-have noise and quantum, and whose segments start from what a smoothing of these readings gives.
+have noise and quantum, whose segments start from what a smoothing of these readings gives, and whose controller ticks
+with another jitter.
 """
 
 from collections.abc import Callable, Sequence
@@ -22,6 +23,7 @@ _HORIZON_S = 0.15
 _BIN_S = 0.01
 _PRIOR = {"mass": 0.1, "armature": 0.1, "damping": 0.1, "friction": 0.1, "kp": 0.035, "kd": 0.035}
 _MOST = 3.0  # prior deviations that a parameter may be off
+_MOST_SEVERE = 1e4  # in place of infinity, which files cannot hold
 _RUNS, _STARTS = 4, 9  # that are measured, and segments of each
 
 
@@ -88,7 +90,7 @@ class Meter:
 
     def severities(self, trace: Trace) -> np.ndarray:
         """Returns the severity of each robot of a trace of `play`; infinite where a simulation diverged."""
-        difference = self._difference(trace, trace)
+        difference = self._difference(trace, trace, self._script)
         count = len(difference) // self._starts.size
         found = np.empty(count)
         for number, one in enumerate(np.split(difference, count)):
@@ -109,10 +111,10 @@ class Meter:
         off = np.linalg.solve(normal, matrix.T @ (weight * (difference / self._floor).ravel()))
         return difference - np.tensordot(np.clip(off, -_MOST, _MOST), self._slopes, axes=1)
 
-    def _difference(self, measured: Trace, starts: Trace, robot: Robot | None = None) -> np.ndarray:
+    def _difference(self, measured: Trace, starts: Trace, script: Script) -> np.ndarray:
         """Returns what was read less what segments without the effect show, [segments, bins, joints] rad."""
         lanes = self._segments(starts)
-        simulated = self._generator.play([robot or self._robot], self._script, lanes)
+        simulated = self._generator.play([self._robot], script, lanes)
         lane = np.repeat(np.arange(len(measured.q)), _STARTS)
         row = lanes.row[:, None] + np.arange(self._long)
         return self._binned(measured.q[lane[:, None], row] - simulated.q)
@@ -140,7 +142,8 @@ class Meter:
         trace = self._plain
         q = sensors.positions(trace.q, rng)
         smooth_q, smooth_v = sensors.smoothed(q, trace.v, self.row_s, rng)
-        difference = self._difference(replace(trace, q=q), replace(trace, q=smooth_q, v=smooth_v))
+        other = replace(self._script, ticks=self._script.other_ticks)
+        difference = self._difference(replace(trace, q=q), replace(trace, q=smooth_q, v=smooth_v), other)
         return np.sqrt((difference**2).mean(axis=(0, 1)))
 
     def _measure_slopes(self) -> np.ndarray:
@@ -154,18 +157,24 @@ class Meter:
                     off = off.with_at("inertia", joint, robot.inertia[joint] * np.exp(deviation))
                 robots.append(off)
         count = len(lanes.run)
-        fields = {name: np.tile(value, (len(robots),) + (1,) * (np.ndim(value) - 1)) for name, value in vars(lanes).items() if name != "rows"}
+        fields = {
+            name: np.tile(value, (len(robots),) + (1,) * (np.ndim(value) - 1))
+            for name, value in vars(lanes).items()
+            if name != "rows"
+        }
         fields["robot"] = np.repeat(np.arange(len(robots)), count)
         trace = self._generator.play(robots, self._script, Lanes(rows=lanes.rows, **fields))
         binned = self._binned(trace.q).reshape(len(robots), count, -1, trace.q.shape[2])
         return binned[1:] - binned[:1]
 
 
-def search(severities: Callable[[np.ndarray], np.ndarray], low: float, high: float, wanted: float) -> tuple[float, float]:
+def search(
+    severities: Callable[[np.ndarray], np.ndarray], low: float, high: float, wanted: float
+) -> tuple[float, float]:
     """Searches the size that has a severity.
 
     Args:
-      severities: of several sizes at once.
+      severities: takes several sizes [sizes], and returns the severity of each.
       low: the harmless size.
       high: the extreme size.
       wanted: severity.
@@ -173,17 +182,12 @@ def search(severities: Callable[[np.ndarray], np.ndarray], low: float, high: flo
     Returns:
       The size and its severity, which differs from the wanted one where no size between the bounds has it.
     """
-    best = (high, 0.0)
     for _ in range(2):
         sizes = np.exp(np.linspace(np.log(low), np.log(high), 6))
-        found = severities(sizes)
+        found = np.clip(severities(sizes), 1e-3, _MOST_SEVERE)
         above = np.flatnonzero(found >= wanted)
-        if not len(above):
-            return float(sizes[-1]), float(found[-1])
-        first = above[0]
-        close = min(range(6), key=lambda number: abs(np.log(max(found[number], 1e-9) / wanted)))
-        best = float(sizes[close]), float(found[close])
-        if first == 0:
-            return best
-        low, high = sizes[first - 1], sizes[first]
-    return best
+        close = int(np.abs(np.log(found / wanted)).argmin())
+        if not len(above) or above[0] == 0:
+            break
+        low, high = sizes[above[0] - 1], sizes[above[0]]
+    return float(sizes[close]), float(found[close])

@@ -98,15 +98,21 @@ class Scene:
         return self.generator.play(real, self.script, whole(1, self.script, range(runs)), hidden)
 
     def log(self, trace: Trace, rng: np.random.Generator) -> Log:
-        """Makes the log that a user would have recorded."""
+        """Makes the log that a user would have recorded.
+
+        Half of the users say how targets go on between rows, and half of those whose speeds are filtered say how.
+        """
         nominal, row_s = self.nominal, self.meter.row_s
-        runs = []
+        runs, tells_targets, tells_filter = [], rng.uniform() < 0.5, rng.uniform() < 0.5
+        between = ("linear" if self.script.linear else "hold") if tells_targets else "unknown"
+        filters = np.full(len(nominal.joints), self.sensors.filter_hz)
+        known = {"dq": {"filter_hz": filters}} if tells_filter and self.sensors.speed == "filtered" else {}
         for motion, q, v in zip(self.motions, trace.q, trace.v, strict=True):
             signals = {"q": self.sensors.positions(q, rng), "target": motion.target}
             speed = self.sensors.speeds(v, row_s, rng)
             signals |= {} if speed is None else {"dq": speed}
             signals |= {} if motion.enabled.all() else {"enabled": motion.enabled}
-            runs.append(self._run(motion, nominal, signals))
+            runs.append(self._run(motion, between, signals, known))
         return Log(
             robot="robot.xml",
             base="fixed",
@@ -116,27 +122,28 @@ class Scene:
             runs=tuple(runs),
         )
 
-    def _run(self, motion: TargetRun, nominal: robots.Robot, signals: dict) -> Run:
+    def _run(self, motion: TargetRun, between: str, signals: dict, known: dict) -> Run:
+        nominal, rate = self.nominal, self.topology.control_hz
         gains = {"kp": nominal.kp * motion.gain, "kd": nominal.kd * motion.gain, "torque_limit_nm": nominal.limit}
         return Run(
             name=motion.name,
             condition=motion.condition,
             split=motion.split or None,
-            controller=Controller(kind="pd", rate_hz=self.topology.control_hz, gains=gains),
+            controller=Controller(kind="pd", rate_hz=rate, gains=gains, between_rows=between),
             time=motion.time,
             signals=signals,
+            known=known,
         )
 
 
 def draw_places(case: FieldCase, scene: Scene, rng: np.random.Generator) -> list[tuple[int, ...]]:
     """Draws the places of a case's effects: one joint or body mostly, now and then a left and right pair or all.
 
-    Several effects sit at different joints, as far as there are as many.
+    Several effects sit at different joints.
     """
     names, count = scene.topology.joints, len(scene.topology.joints)
     if len(case.effects) > 1:
-        order = rng.permutation(count)
-        return [(int(order[number % count]),) for number in range(len(case.effects))]
+        return [(int(place),) for place in rng.permutation(count)[: len(case.effects)]]
     if case.effects[0] == "loose_foot":
         return [(count - 1,)]
     first, draw = int(rng.integers(count)), rng.uniform()
@@ -169,10 +176,8 @@ def prepared(case: FieldCase, error: float, seed: int) -> tuple[Scene, list[Plac
         trace = scene.play(placed)
         if not np.isfinite(trace.q).all() or np.abs(trace.q).max() > _FARTHEST_RAD:
             continue
-        off = max(
-            (abs(np.log(max(one.severity, 1e-3) / wanted)) for one, wanted in zip(placed, case.severities, strict=True)),
-            default=0.0,
-        )
+        ratios = [one.severity / asked for one, asked in zip(placed, case.severities, strict=True)]
+        off = max((abs(np.log(ratio)) for ratio in ratios), default=0.0)
         if nearest is None or off < nearest[0]:
             nearest = (off, (scene, placed, trace))
         if off < np.log(_SEVERITY_RATIO):
@@ -247,7 +252,10 @@ def _truth(case: FieldCase, scene: Scene, placed: Sequence[Placed]) -> dict:
             }
         )
     return {
-        **{"kind": case.kind, "topology": case.topology, "generator": case.generator, "effects": effects},
+        "kind": case.kind,
+        "topology": case.topology,
+        "generator": case.generator,
+        "effects": effects,
         "speed": scene.sensors.speed,
         "gains": sorted({motion.gain for motion in scene.motions}),
         "floor_rad": scene.meter.floor_rad.tolist(),
