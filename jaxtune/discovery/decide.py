@@ -5,7 +5,7 @@ effect: what chance gains on null logs. A model is believed in the share of resa
 model with the weight exp(-cost / 2): pseudo-Bayesian model averaging with a bootstrap (Yao et al., 2018).
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -32,7 +32,12 @@ class Candidate:
     @property
     def key(self) -> str:
         """The keys of its effects in one word, such as `coulomb@elbow + payload@forearm`; `null` without any."""
-        return " + ".join(sorted(hypothesis.key for hypothesis in self.hypotheses)) or "null"
+        return key_of(self.hypotheses)
+
+
+def key_of(hypotheses: Sequence[Hypothesis]) -> str:
+    """The key of a model with these effects."""
+    return " + ".join(sorted(hypothesis.key for hypothesis in hypotheses)) or "null"
 
 
 @dataclass(frozen=True)
@@ -103,21 +108,26 @@ def units_of(problem: Problem, at: Floor, of_segments: np.ndarray) -> np.ndarray
 
 
 def weigh_evidence(
-    problem: Problem, floor: NoiseFloor, candidate: Candidate, hypothesis: Hypothesis
+    problem: Problem,
+    floor: NoiseFloor,
+    candidate: Candidate,
+    hypothesis: Hypothesis,
+    fitted: Mapping[str, Candidate],
 ) -> tuple[Evidence, Candidate]:
-    """Collects what speaks for one effect of a candidate: takes it out, fits all else again, and compares.
+    """Collects what speaks for one effect of a candidate: compares it with the best model without the effect.
 
     Args:
       problem: the runs of the segments.
       floor: the noise floor.
       candidate: the model with the effect, with fresh slopes.
       hypothesis: the effect.
+      fitted: models that were fitted already, by key.
 
     Returns:
       The evidence, and the model without the effect.
     """
     at = floor[problem.main_horizon]
-    ablated = ablate(at, candidate, hypothesis)
+    ablated = ablate(at, candidate, hypothesis, fitted)
     now, before = squares(at, candidate), squares(at, ablated)
     held_out = len(problem.data["train"][at.horizon].run)
     own = candidate.fit.along(hypothesis)
@@ -158,13 +168,22 @@ def passes(evidence: Evidence, thresholds: Thresholds) -> dict[str, bool]:
     }
 
 
-def ablate(at: Floor, candidate: Candidate, hypothesis: Hypothesis) -> Candidate:
-    """Takes an effect out of a candidate and fits everything else again."""
+def ablate(at: Floor, candidate: Candidate, hypothesis: Hypothesis, fitted: Mapping[str, Candidate]) -> Candidate:
+    """Takes an effect out of a candidate and fits everything else again, unless that model was fitted already.
+
+    Args:
+      at: the floor at the main horizon.
+      candidate: the model with the effect.
+      hypothesis: the effect.
+      fitted: models by key.
+    """
+    others = tuple(other for other in candidate.hypotheses if other is not hypothesis)
+    if key_of(others) in fitted:
+        return fitted[key_of(others)]
     start = without(candidate.fit, hypothesis, at.prior, at.slopes)
     evaluate = at.residuals["train"]
     start = replace(start, residual=evaluate(start.vector[None])[0])
     (fit,) = refine([start], evaluate, _ABLATION_ROUNDS)
-    others = tuple(other for other in candidate.hypotheses if other is not hypothesis)
     return Candidate(others, fit, at.residuals["select"](fit.vector[None])[0])
 
 

@@ -207,8 +207,9 @@ def _proved(
     at, failed = floor[problem.main_horizon], []
     (fit,) = polish([state.best.fit], at.residuals["train"], 0)
     best, thresholds = replace(state.best, fit=fit), Thresholds(gain=state.price)
+    fitted = {one.key: one for one in state.candidates}
     while True:
-        weighed = {h.key: (h, *weigh_evidence(problem, floor, best, h)) for h in best.hypotheses}
+        weighed = {h.key: (h, *weigh_evidence(problem, floor, best, h, fitted)) for h in best.hypotheses}
         tests = {key: passes(evidence, thresholds) for key, (_, evidence, _) in weighed.items()}
         wrong = [key for key, passed in tests.items() if not all(passed.values())]
         if not wrong:

@@ -36,7 +36,7 @@ class Info:
 
     def lines(self) -> list[str]:
         """Says in a line each which models cost least."""
-        return [f"{cost:.1f} {key}" for key, cost in self.fitted[:5]]
+        return [f"{cost:.1f} {key}" for key, cost in self.fitted]
 
 
 def step(
@@ -78,6 +78,7 @@ def step(
     least = min(state.candidates, key=lambda one: total_cost(at, one, state.price))
     improved = least.key != best.key
     ranked = tuple(sorted(((one.key, cost[one.key]) for one in fitted), key=lambda pair: pair[1]))
+    ranked = (*ranked[:5], ("before", total_cost(at, best, state.price)), ("price", state.price))
     return replace(state, best=least, finished=not improved), Info(ranked, improved)
 
 
