@@ -12,6 +12,7 @@ from envs.readings import aligned, fresh, noise_of
 _PARABOLA_S, _CUBIC_S = 0.012, 0.03  # half widths of the local fits
 _WIDEST_S = 0.018  # half width from which on a parabola no longer follows the motion
 _MIN_HALF_ROWS = 2  # a parabola needs three rows
+_AGREES = 2.0  # chi squared per degree of freedom below which a polynomial agrees with readings
 
 
 def smoothed(run: Run) -> np.ndarray:
@@ -23,7 +24,8 @@ def smoothed(run: Run) -> np.ndarray:
         q(t + s) = q + dq s + ddq s^2 / 2,   dq(t + s) = dq + ddq s
 
     Where the rows are so slow (100 Hz and less) that two of them span more than 18 ms, it is a cubic over 30 ms on both
-    sides. Stale readings (`envs.readings.stale`) are left out.
+    sides. Where a polynomial misses the readings by more than their noise, as after a step of the target, the window is
+    narrower. Stale readings (`envs.readings.stale`) are left out.
 
     Args:
       run: with `q` and perhaps `dq`.
@@ -42,11 +44,29 @@ def smoothed(run: Run) -> np.ndarray:
 
 
 def _fit(time: np.ndarray, parts: Sequence[tuple[np.ndarray, np.ndarray, float]]) -> np.ndarray:
-    """Fits polynomials around every row to positions, and to velocities in the second part: [rows, 2]."""
-    half, order, width = _window(parts[0][0])
+    """Fits polynomials around every row to positions, and to velocities in the second part: [rows, 2].
+
+    Every row has the widest window in which the polynomial agrees with the readings, or the narrowest one.
+    """
+    widest, order, period = _window(parts[0][0])
+    least = 1 if len(parts) > 1 else _MIN_HALF_ROWS + (order > 2)
+    found = None
+    for half in sorted({least, max(least, widest // 2), max(least, widest)}):
+        fit, misfit = _fit_window(time, parts, half, order, half * period)
+        if found is None:
+            found = fit
+        else:
+            found = np.where((misfit < _AGREES)[:, None], fit, found)
+    return found
+
+
+def _fit_window(
+    time: np.ndarray, parts: Sequence[tuple[np.ndarray, np.ndarray, float]], half: int, order: int, width: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Fits polynomials in windows of one width: states [rows, 2], and chi squared per degree of freedom [rows]."""
     designs, values = [], []
     for derivative, (at, read, sd) in enumerate(parts):
-        near = _nearest(at, time, half if derivative == 0 else _window(at)[0])
+        near = _nearest(at, time, half)
         # In units of the width; otherwise the normal equations would be badly conditioned.
         share = (at[near] - time[:, None]) / width
         terms = [
@@ -60,16 +80,18 @@ def _fit(time: np.ndarray, parts: Sequence[tuple[np.ndarray, np.ndarray, float]]
     design, value = np.concatenate(designs, axis=1), np.concatenate(values, axis=1)
     normal = np.einsum("rki,rkj->rij", design, design) + 1e-9 * np.eye(order + 1)
     fit = np.linalg.solve(normal, np.einsum("rki,rk->ri", design, value)[..., None])[..., 0]
-    return np.stack([fit[:, 0], fit[:, 1] / width], axis=1)
+    left = value - np.einsum("rki,ri->rk", design, fit)
+    misfit = (left**2).sum(axis=1) / max(value.shape[1] - order - 1, 1)
+    return np.stack([fit[:, 0], fit[:, 1] / width], axis=1), misfit
 
 
 def _window(time: np.ndarray) -> tuple[int, int, float]:
-    """Returns how many readings a fit takes on each side, its order, and the time that they span."""
+    """Returns how many readings a fit takes on each side at most, its order, and the time between them."""
     period = float(np.median(np.diff(time))) if len(time) > 1 else _PARABOLA_S
     half, order = max(_MIN_HALF_ROWS, round(_PARABOLA_S / period)), 2
     if half * period > _WIDEST_S:
         half, order = max(_MIN_HALF_ROWS, round(_CUBIC_S / period)), 3
-    return half, order, half * period
+    return half, order, period
 
 
 def _nearest(at: np.ndarray, time: np.ndarray, half: int) -> np.ndarray:
