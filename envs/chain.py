@@ -76,6 +76,9 @@ class Chain:
     """[joints] addresses of the joints' velocities."""
     bodies: np.ndarray
     """[bodies] ids of the bodies that a wrench may act on."""
+    lead_s: float = 0.0
+    """How far positions of the simulation are ahead of its velocities; half a step makes semi-implicit Euler of second
+    order, which is then the leapfrog scheme."""
 
     def step(self, model: mjx.Model, data: mjx.Data, memory: dict, values, x) -> tuple[mjx.Data, dict, dict]:
         """Simulates one step of the physics, from the controller's inputs to the robot's motion.
@@ -131,7 +134,8 @@ class Chain:
 
         They are the true ones, before any effect of transmission or sensors.
         """
-        return jnp.stack([data.qpos[self.qpos], data.qvel[self.dof]])
+        speed = data.qvel[self.dof]
+        return jnp.stack([data.qpos[self.qpos] - self.lead_s * speed, speed])
 
     def entering(self, stage: str) -> list[Effect]:
         """Lists the effects that enter a stage (`jaxtune.types.Effect.enters`), in the order in which they act."""

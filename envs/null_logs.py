@@ -143,7 +143,8 @@ def play(pairs: Sequence[tuple[_Robot, Run]], joints: Sequence[str]) -> list[_Mo
     at_q, at_v = 1 + qpos, 1 + first.nq + dof
     with rollout.Rollout(nthread=len(data)) as pool:
         for look in range(len(looks)):
-            q, dq = state[:, at_q], state[:, at_v]
+            # Positions of a semi-implicit step are half a step ahead of velocities, as on the rig (`Chain.lead_s`).
+            q, dq = state[:, at_q] - 0.5 * first.opt.timestep * state[:, at_v], state[:, at_v]
             held, brake = drive.torque(look, q, dq)
             found[look, :, 0], found[look, :, 1], torques[look] = q, dq, held - brake
             if look == len(gaps):
@@ -169,7 +170,8 @@ def _first_state(model: mujoco.MjModel, run: Run, qpos: np.ndarray, dof: np.ndar
     """The state of a model at a run's first row; smoothed, so that noise there does not become an error of the
     start."""
     data = mujoco.MjData(model)
-    data.qpos[qpos], data.qvel[dof] = smoothed(run)[0]
+    position, velocity = smoothed(run)[0]
+    data.qpos[qpos], data.qvel[dof] = position + 0.5 * model.opt.timestep * velocity, velocity
     state = np.empty(mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS))
     mujoco.mj_getState(model, data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
     return state
@@ -221,7 +223,7 @@ def _as_run(robot: _Robot, run: Run, motion: _Motion) -> Run:
     # Without targets the torques are what was sent, not what was measured.
     sensed = [name for name in exact if name in run.signals and ("target" in run.signals or name != "tau")]
     read = {name: _as_read(run, name, motion.times, exact[name], robot.rng) for name in sensed}
-    return replace(run, signals={**run.signals, **read})
+    return replace(run, signals={**run.signals, **read}, phase_s=float(motion.times[0] - run.time[0]))
 
 
 def _last_row(run: Run, times: np.ndarray) -> np.ndarray:

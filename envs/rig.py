@@ -96,7 +96,7 @@ class Rig:
         # A robot on a rig has no feet on the ground, so effects of contact have no place and drop out below.
         self.places = {"joint": self.joints, "body": self.bodies, "foot": (), "robot": ("robot",)}
         self.effects = {row.name: row for row in EVERY.values() if self.places[row.on] and row.needs != "free"}
-        self.chain = Chain(self.dt, tuple(self.effects.values()), self.qpos, self.dof, self._bodies)
+        self.chain = Chain(self.dt, tuple(self.effects.values()), self.qpos, self.dof, self._bodies, 0.5 * self.dt)
         self.axes = self._describe_axes()
         # The IMU is taken to sit on the first body, which carries the others.
         self._gravity = sensing.projected_gravity(jnp.asarray(model.body_quat[1], jnp.float32))
@@ -307,7 +307,7 @@ class Rig:
         start = truth[before] - chain.ahead(memory)
         # The chain's first step needs an acceleration, for the rotors' torque.
         data = self._data.replace(
-            qpos=self._data.qpos.at[self.qpos].set(start[0]),
+            qpos=self._data.qpos.at[self.qpos].set(start[0] + chain.lead_s * start[1]),
             qvel=self._data.qvel.at[self.dof].set(start[1]),
             qacc=self._data.qacc.at[self.dof].set(acceleration[before]),
         )

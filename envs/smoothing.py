@@ -53,10 +53,7 @@ def _fit(time: np.ndarray, parts: Sequence[tuple[np.ndarray, np.ndarray, float]]
     found = None
     for half in sorted({least, max(least, widest // 2), max(least, widest)}):
         fit, misfit = _fit_window(time, parts, half, order, half * period)
-        if found is None:
-            found = fit
-        else:
-            found = np.where((misfit < _AGREES)[:, None], fit, found)
+        found = fit if found is None else np.where((misfit < _AGREES)[:, None], fit, found)
     return found
 
 

@@ -108,7 +108,11 @@ def told_alike(null: Cuts, measured: Cuts) -> Cuts:
     """
     return {
         split: {
-            horizon: replace(own, inputs=measured[split][horizon].inputs.replace(measured=own.inputs.measured))
+            horizon: replace(
+                own,
+                # Its controller ticks at its own times.
+                inputs=measured[split][horizon].inputs.replace(measured=own.inputs.measured, sample=own.inputs.sample),
+            )
             for horizon, own in lengths.items()
         }
         for split, lengths in null.items()

@@ -25,6 +25,7 @@ from experiments.discovery.cutting import (
     told_alike,
 )
 from experiments.discovery.hypotheses import hypotheses, learned_torque, timing_directions
+from experiments.discovery.phases import with_phases
 from jaxtune.discovery.problem import Problem
 
 __all__ = ["HORIZONS_S", "Question", "build_question", "drop_filtered", "read_logs", "without_sealed"]
@@ -144,9 +145,6 @@ def build_question(
     library = {name: row for name, row in rig.effects.items() if name in LIBRARY}
     every = hypotheses(rig.axes, rig.places, library)
     timing, timing_bounds = timing_directions(rig.axes, rig.control_hz)
-    simulated = simulate_null_logs(log, spec, null_logs, seed)
-    measured = cut_log(log, rig.dt, signals, horizons)
-    nulls = [told_alike(cut_log(one, rig.dt, signals, horizons), measured) for one in simulated]
     problem = Problem(
         simulate=_Simulator(plain, plain.layout, signals),
         system=plain.system,
@@ -157,14 +155,19 @@ def build_question(
         timing=timing,
         timing_bounds=timing_bounds,
         trees=rig.trees,
-        data=measured,
-        null_logs=nulls,
+        data=cut_log(log, rig.dt, signals, horizons),
+        null_logs=(),
         bin_rows=segments.rows_together(1.0 / log.rate_hz, BIN_S),
         regimes=REGIMES,
         components={name: tuple("xyz") if name == "gravity" else rig.joints for name in signals},
         push={joint: axes["constant_push", joint] for joint in rig.joints},
         residual=learned_torque(rig.axes, LEARNED),
     )
+    log = with_phases(log, problem, rig.dt, signals)
+    measured = cut_log(log, rig.dt, signals, horizons)
+    simulated = simulate_null_logs(log, spec, null_logs, seed)
+    nulls = [told_alike(cut_log(one, rig.dt, signals, horizons), measured) for one in simulated]
+    problem = replace(problem, data=measured, null_logs=nulls)
     names = {split: tuple(run.name for run in runs) for split, runs in splits(log).items()}
     return Question(problem, rig, names, (*log.notes, *notes, *_stale_notes(unsealed)))
 
