@@ -27,7 +27,7 @@ from envs.models import suspended
 from envs.readings import noise_of, read_later, rounding_of, stale
 from envs.smoothing import smoothed
 
-_STEP_S = 0.0005  # half the step of `Rig`
+_STEP_S, _RIG_STEP_S = 0.0005, 0.001  # half the longest step of `Rig`, and that
 _SPREAD = 0.1  # standard deviation of the logarithm of every drawn parameter, as in `Axis.prior_sd`
 
 
@@ -130,8 +130,9 @@ def play(pairs: Sequence[tuple[_Robot, Run]], joints: Sequence[str]) -> list[_Mo
     # Jitter does not add up: a tick that comes early is followed by a longer interval.
     gaps = steps + np.diff(rng.integers(0, min(steps, 2), int(np.ceil(longest * rate)) + 3))
     looks = first.opt.timestep * np.concatenate([[0], np.cumsum(gaps)])
-    # Where a controller's first tick lies is its own matter.
-    times = np.array([run.time[0] + robot.rng.uniform(0.0, 1.0 / rate) + looks for robot, run in pairs])
+    # The first tick is where the measured run's is, as far as a simulation can resolve that (`Run.phase_s`).
+    finest = 1.0 / rate / np.ceil(1.0 / rate / _RIG_STEP_S - 1e-9)
+    times = np.array([run.time[0] + run.phase_s + robot.rng.uniform(0.0, finest) + looks for robot, run in pairs])
     drive = _Drive([run for _, run in pairs], times, [robot.goes_straight(run) for robot, run in pairs])
     size = mujoco.mj_stateSize(first, mujoco.mjtState.mjSTATE_FULLPHYSICS)
     state = np.stack([_first_state(robot.model, run, qpos, dof) for robot, run in pairs])
@@ -223,7 +224,7 @@ def _as_run(robot: _Robot, run: Run, motion: _Motion) -> Run:
     # Without targets the torques are what was sent, not what was measured.
     sensed = [name for name in exact if name in run.signals and ("target" in run.signals or name != "tau")]
     read = {name: _as_read(run, name, motion.times, exact[name], robot.rng) for name in sensed}
-    return replace(run, signals={**run.signals, **read}, phase_s=float(motion.times[0] - run.time[0]))
+    return replace(run, signals={**run.signals, **read})
 
 
 def _last_row(run: Run, times: np.ndarray) -> np.ndarray:

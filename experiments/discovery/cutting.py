@@ -108,11 +108,7 @@ def told_alike(null: Cuts, measured: Cuts) -> Cuts:
     """
     return {
         split: {
-            horizon: replace(
-                own,
-                # Its controller ticks at its own times.
-                inputs=measured[split][horizon].inputs.replace(measured=own.inputs.measured, sample=own.inputs.sample),
-            )
+            horizon: replace(own, inputs=measured[split][horizon].inputs.replace(measured=own.inputs.measured))
             for horizon, own in lengths.items()
         }
         for split, lengths in null.items()

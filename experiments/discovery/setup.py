@@ -25,7 +25,7 @@ from experiments.discovery.cutting import (
     told_alike,
 )
 from experiments.discovery.hypotheses import hypotheses, learned_torque, timing_directions
-from experiments.discovery.phases import with_phases
+from experiments.discovery.timing import with_timing
 from jaxtune.discovery.problem import Problem
 
 __all__ = ["HORIZONS_S", "Question", "build_question", "drop_filtered", "read_logs", "without_sealed"]
@@ -163,7 +163,7 @@ def build_question(
         push={joint: axes["constant_push", joint] for joint in rig.joints},
         residual=learned_torque(rig.axes, LEARNED),
     )
-    log = with_phases(log, problem, rig.dt, signals)
+    log = with_timing(log, problem, rig.dt, signals)
     measured = cut_log(log, rig.dt, signals, horizons)
     simulated = simulate_null_logs(log, spec, null_logs, seed)
     nulls = [told_alike(cut_log(one, rig.dt, signals, horizons), measured) for one in simulated]

@@ -2,8 +2,9 @@
 
 It is measured on simulated null logs: another engine moves the nominal robot, with parameters drawn from the prior and
 the measured log's noise. Their nominal parameters are fitted. The residuals that are left hold noise, rounding, the
-error of the state that a segment starts from, and the gap between engines. Their rms, for every component of every
-signal and every moment of a segment, is the floor. All other modules work on residuals divided by it: a residual of one
+error of the state that a segment starts from, and the gap between engines. What all logs leave alike is subtracted from
+the measured residuals too. The rms of the rest, for every component of every signal and every moment of a segment, is
+the floor. All other modules work on residuals divided by it: a residual of one
 floor unit is as large as that rms, which even a model in which nothing is missing leaves.
 """
 
@@ -52,6 +53,8 @@ class Floor:
     """The prior directions, which are free under every hypothesis."""
     null_residuals: np.ndarray
     """[logs, features]: what fits of the prior directions leave of the null logs' `train`, in floor units."""
+    null_coordinates: np.ndarray
+    """[logs, directions]: where these fits stand."""
 
     @cached_property
     def slopes(self) -> np.ndarray:
@@ -98,13 +101,16 @@ def measure(problem: Problem, say: Say) -> NoiseFloor:
     prior, main = prior_directions(problem), problem.main_horizon
     say(f"noise floor at {main:g} s")
     train = _merged(problem, "train", main, len(problem.null_logs))
-    fits, unit = _fit_null_logs(problem, prior, train)
+    coordinates, unit = _fit_null_logs(problem, prior, train)
+    fits = coordinates @ prior.directions
     found = {}
     for horizon in problem.horizons:
         say(f"noise floor at {horizon:g} s")
         # All logs where thresholds come from them too; for a scale a few are enough.
         logs = {split: len(fits) if (split, horizon) == ("train", main) else _FEW for split in problem.data}
         left = {split: _simulated(problem, split, horizon, fits[: logs[split]]) for split in problem.data}
+        shared = {split: _shared(values) for split, values in left.items()}
+        left = {split: values - shared[split] for split, values in left.items()}
         scale = {split: _rms_floor(values) for split, values in left.items()}
         in_units = left["train"] / scale["train"]
         segments = {split: data[horizon] for split, data in problem.data.items()}
@@ -115,11 +121,13 @@ def measure(problem: Problem, say: Say) -> NoiseFloor:
                 components=unit.shape[-1], independent=independent_share(in_units.reshape(-1, *in_units.shape[2:]))
             ),
             residuals={
-                split: partial(flat_residuals, problem, segments[split], scale[split]) for split in problem.data
+                split: partial(flat_residuals, problem, segments[split], scale[split], shared[split])
+                for split in problem.data
             },
-            on_some=partial(_on_some, problem, segments["train"], scale["train"]),
+            on_some=partial(_on_some, problem, segments["train"], scale["train"], shared["train"]),
             prior=prior,
             null_residuals=in_units.reshape(len(in_units), -1),
+            null_coordinates=coordinates[: len(in_units)],
         )
     return found
 
@@ -157,7 +165,7 @@ def with_systematic_share(floor: NoiseFloor, at: Floor, residual: np.ndarray) ->
 
 
 def _fit_null_logs(problem: Problem, prior: Free, train: Segments) -> tuple[np.ndarray, np.ndarray]:
-    """Fits the prior directions to every null log, all side by side; returns vectors [logs, axes] and the unit.
+    """Fits the prior directions to every null log, all side by side; returns coordinates [logs, ...] and the unit.
 
     The unit in which a fit weighs residuals is the floor that is looked for, so both are found in turn.
     """
@@ -182,7 +190,7 @@ def _fit_null_logs(problem: Problem, prior: Free, train: Segments) -> tuple[np.n
             unit = np.maximum(np.sqrt((left**2).mean(axis=(0, 1))), 1e-9)
             share = independent_share((left / unit).reshape(-1, *unit.shape))
         coordinates = np.clip(coordinates + np.stack(steps), *prior.bounds.T)
-    return coordinates @ prior.directions, unit
+    return coordinates, unit
 
 
 def _step(prior: Free, point: np.ndarray, residual: np.ndarray, slopes: np.ndarray, share: float) -> np.ndarray:
@@ -211,13 +219,25 @@ def _merged(problem: Problem, split: str, horizon: float, count: int) -> Segment
     )
 
 
+def _shared(left: np.ndarray) -> np.ndarray:
+    """What all null logs leave alike [segments, bins, components]: the gap between engines in this very motion.
+
+    The mean over logs [logs, ...] is shrunk by the share of it that is chance (James and Stein, 1961).
+    """
+    mean, chance = left.mean(axis=0), left.var(axis=0, ddof=1) / len(left)
+    share = 1.0 - chance.mean(axis=(0, 1)) / np.maximum((mean**2).mean(axis=(0, 1)), 1e-30)
+    return np.maximum(share, 0.0) * mean
+
+
 def _rms_floor(left: np.ndarray) -> np.ndarray:
     """The floor [bins, components] from what fits left of null logs, [logs, segments, bins, components]."""
     fresh = np.sqrt((left**2).mean(axis=(0, 1)))
     return np.maximum(fresh, _LEAST_SHARE * fresh.mean(axis=0))
 
 
-def _on_some(problem: Problem, segments: Segments, scale: np.ndarray, chosen: np.ndarray) -> Evaluate:
+def _on_some(
+    problem: Problem, segments: Segments, scale: np.ndarray, shared: np.ndarray, chosen: np.ndarray
+) -> Evaluate:
     """Makes the function from vectors to residuals on the chosen segments."""
     some = replace(
         segments,
@@ -226,4 +246,4 @@ def _on_some(problem: Problem, segments: Segments, scale: np.ndarray, chosen: np
         run=segments.run[chosen],
         regimes=segments.regimes[chosen],
     )
-    return partial(flat_residuals, problem, some, scale)
+    return partial(flat_residuals, problem, some, scale, shared[chosen])

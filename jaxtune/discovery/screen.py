@@ -77,9 +77,17 @@ def screen(problem: Problem, at: Floor, base: Fit, hypotheses: Sequence[Hypothes
     (cost,), _ = profile.costs(np.zeros((1, len(some.residual)), np.float32))
     firsts = sorted((_best(some, profile, h, curves) for h in hypotheses), key=lambda lead: lead.cost)
     couples = [pair for lead in firsts[:pairs] for pair in _pairs_with(some, lead, hypotheses, curves)]
-    null_residuals = at.unflatten(at.null_residuals.T)[chosen].reshape(len(some.residual), -1).T
-    testable, chance = _seen(some, hypotheses, curves, null_residuals)
+    null_residuals = at.unflatten(_tempered(at).T)[chosen].reshape(len(some.residual), -1).T
+    testable, chance = _seen(some, hypotheses, curves, null_residuals, at.null_coordinates)
     return Screen(tuple(firsts), _best_pairs(couples), float(cost), testable, chance)
+
+
+def _tempered(at: Floor) -> np.ndarray:
+    """Residuals [logs, features] of the null logs, those of a log beyond the floor divided by its own rms, as in the
+    cost."""
+    mean_squares = np.stack([at.counts.mean_squares(log) for log in at.null_residuals])
+    root = np.sqrt(np.maximum(mean_squares, 1.0))
+    return at.null_residuals / np.tile(root, at.null_residuals.shape[1] // root.shape[1])
 
 
 def spread_segments(at: Floor, base: Fit) -> np.ndarray:
@@ -217,13 +225,22 @@ def _best_pairs(pairs: Sequence[Lead]) -> tuple[Lead, ...]:
 
 
 def _seen(
-    some: Fit, hypotheses: Sequence[Hypothesis], curves: Curves, null_residuals: np.ndarray
+    some: Fit,
+    hypotheses: Sequence[Hypothesis],
+    curves: Curves,
+    null_residuals: np.ndarray,
+    null_coordinates: np.ndarray,
 ) -> tuple[frozenset[str], np.ndarray]:
     """Names of the effects that these logs could show, and the largest gain [logs] that each null log gives any."""
     root, prior = np.sqrt(some.counts.independent), np.diag(1.0 / some.free.sd)
     project = complement(np.concatenate([root * some.jacobian, prior]))
     padded = lambda rows: np.pad(root * rows, ((0, 0), (0, len(prior)))).T  # noqa: E731
-    logs, seen, chance = project(padded(null_residuals)), set(), np.zeros(len(null_residuals))
+    # Nominal parameters that were fitted pull against their prior as hard as the residuals do.
+    # Beside a model with effects nobody asks what chance gains.
+    alike = null_coordinates.shape[1] == len(prior)
+    pulls = null_coordinates / some.free.sd if alike else np.zeros((len(null_coordinates), len(prior)))
+    logs = project(np.concatenate([root * null_residuals, pulls], axis=1).T)
+    seen, chance = set(), np.zeros(len(null_residuals))
     for hypothesis in hypotheses:
         mine = project(padded(change_of(hypothesis, hypothesis.probes, curves)))
         length = np.sqrt((mine**2).sum(axis=0))

@@ -79,19 +79,22 @@ def paired_residuals(
     return measured[piece] - np.concatenate(found)
 
 
-def flat_residuals(problem: Problem, segments: Segments, scale: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+def flat_residuals(
+    problem: Problem, segments: Segments, scale: np.ndarray, shared: np.ndarray, vectors: np.ndarray
+) -> np.ndarray:
     """Simulates vectors and returns residuals over a scale, flat; with all but the vectors given it is an `Evaluate`.
 
     Args:
       problem: the simulator.
       segments: what was measured.
       scale: [bins, components] the noise floor that residuals are divided by.
+      shared: [segments, bins, components] what a model that lacks nothing leaves, which is subtracted.
       vectors: [n, axes] coordinates.
 
     Returns:
       [n, features] in floor units.
     """
-    return (residuals(problem, vectors, segments) / scale).reshape(len(vectors), -1)
+    return ((residuals(problem, vectors, segments) - shared) / scale).reshape(len(vectors), -1)
 
 
 def binned(signals: Mapping[str, Any], rows: int):
