@@ -28,9 +28,9 @@ SUBSETS = {
 """Kinds of parameters by the name of a subset.
 
 `armature`, `damping` and `friction` are fields of a joint. `gain` scales the controller's stiffness, `brake` its
-damping or back electromotive force, `limit` its torque limit; one per joint each, left out where the log cannot show it.
-`delay` is one for all commands, `bias` one per position sensor. `mass` is one per moving body and scales its inertia
-too; `inertia` is its pseudo-inertia, ten numbers."""
+damping or back electromotive force, `limit` its torque limit; one per joint each, left out where the log cannot show
+it. `delay` is one for all commands, `bias` one per position sensor. `mass` is one per moving body, with its inertia in
+proportion; `inertia` is its pseudo-inertia, ten numbers."""
 
 _FRACTION_RAD = 0.01  # the unit of friction, where the model has none, is the torque of this position error
 _DIFFERENCE = 1e-4  # step of finite differences in units of a parameter
@@ -245,10 +245,13 @@ def _inertia(robot: Robot, model: mujoco.MjModel, body: str, whole: bool):
     sysid = package()
 
     def modify(spec, parameter):
-        sysid.apply_body_inertia(spec, body, parameter)
+        # With the package's own modifiers MuJoCo 3.17 refuses both: the mass, an array, and the NaN beside an inertia.
         if whole:
-            # The package leaves NaN here, for which MuJoCo 3.17 refuses the full inertia.
+            sysid.apply_body_inertia(spec, body, parameter)
             spec.body(body).iquat = [1.0, 0.0, 0.0, 0.0]
+        else:
+            mass = float(parameter.value[0])
+            sysid.model_modifier.apply_body_mass_ipos(spec, body, mass=mass, rot_inertia_scale=True)
 
     return sysid.body_inertia_param(
         robot.spec.copy(),  # the package changes what it is given
