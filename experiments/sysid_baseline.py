@@ -18,7 +18,7 @@ from envs.logs import Log, Run, splits
 from envs.segments import HISTORY_S
 from experiments.common import checkpoint
 from experiments.common.cli import console, run
-from experiments.discovery import identification, playback
+from experiments.discovery import playback, sysid_fit, sysid_parameters
 from experiments.discovery.setup import read_logs
 
 SEGMENTS_S = (0.15, 0.45)
@@ -56,18 +56,18 @@ def main(args: Args) -> None:
     Raises:
       ValueError: an option is wrong, a log cannot be used, or `mujoco.sysid` is missing.
     """
-    identification.package()
+    sysid_parameters.package()
     _check(args)
     log, spec = read_logs(args.logs)
     begin = time.perf_counter()
-    bench = Bench(log, identification.robot_of(spec, log))
+    bench = Bench(log, sysid_parameters.robot_of(spec, log))
     tried = _fit_all(args, bench)
     chosen = {}
     for measure in MEASURES:
         best = min(tried, key=lambda one: one.select[measure])
         same = [name for name in chosen if chosen[name]["fit"] == best.name()]
         chosen[measure] = {"as": same[0], "fit": best.name()} if same else _prove(args, bench, best)
-    nominal = identification.declare(bench.robot, "joints")
+    nominal = sysid_parameters.declare(bench.robot, "joints")
     args.out.parent.mkdir(parents=True, exist_ok=True)
     report = {
         "logs": [path.name for path in args.logs],
@@ -87,7 +87,7 @@ class Bench:
     """A log, its runs by split, and the robot that is fitted to them."""
 
     log: Log
-    robot: identification.Robot
+    robot: sysid_parameters.Robot
 
     @property
     def parts(self) -> dict[str, tuple[Run, ...]]:
@@ -151,14 +151,14 @@ def _fit_all(args: Args, bench: Bench) -> list[Candidate]:
 def _fit(args: Args, bench: Bench, runs: Sequence[Run], how: tuple[str, float, float], before=None) -> tuple:
     """Fits parameters to runs, from those of `before` where both have them; returns them and the seconds it took."""
     begin, (subset, horizon, weight) = time.perf_counter(), how
-    start = identification.declare(bench.robot, subset)
+    start = sysid_parameters.declare(bench.robot, subset)
     for name, parameter in before.items() if before else ():
         if name in start:
             start[name].value = parameter.value.copy()
     # A fit that starts at a bound may stay there, so the package's own remedy is taken.
     start.move_off_bounds()
-    pieces = identification.subsample(bench.take(runs, horizon), args.train_s)
-    fitted = identification.fit(bench.robot, start, pieces, weight, args.iterations)
+    pieces = sysid_fit.subsample(bench.take(runs, horizon), args.train_s)
+    fitted = sysid_fit.fit(bench.robot, start, pieces, weight, args.iterations)
     return fitted, time.perf_counter() - begin
 
 
@@ -166,7 +166,7 @@ def _prove(args: Args, bench: Bench, best: Candidate) -> dict:
     """Measures the chosen fit on every split, the held-out runs included, and repeats it on halves of the training."""
     chosen = {
         "fit": best.name(),
-        "parameters": identification.physical(bench.robot, best.parameters),
+        "parameters": sysid_parameters.physical(bench.robot, best.parameters),
         "errors": {split: bench.errors(best.parameters, runs) for split, runs in bench.parts.items()},
     }
     if args.halves:
@@ -177,7 +177,7 @@ def _prove(args: Args, bench: Bench, best: Candidate) -> dict:
             chosen["halves"].append(
                 {
                     "runs": [run.name for run in runs],
-                    "parameters": identification.physical(bench.robot, fitted),
+                    "parameters": sysid_parameters.physical(bench.robot, fitted),
                     "sealed": bench.errors(fitted, bench.parts["sealed"]),
                 }
             )
@@ -196,8 +196,8 @@ def _show(report: dict) -> None:
 
 def _check(args: Args) -> None:
     for subset in args.subsets:
-        if subset not in identification.SUBSETS:
-            raise ValueError(f"subsets: got '{subset}', expected some of {', '.join(identification.SUBSETS)}")
+        if subset not in sysid_parameters.SUBSETS:
+            raise ValueError(f"subsets: got '{subset}', expected some of {', '.join(sysid_parameters.SUBSETS)}")
     for name, least in {"horizons": 0.05, "weights": 0.0}.items():
         values = getattr(args, name)
         if not values or min(values) < least:

@@ -11,7 +11,7 @@ from mujoco import sysid
 from envs import models
 from envs.logs import Controller, Log, Run, write
 from experiments import sysid_baseline
-from experiments.discovery import identification, playback
+from experiments.discovery import playback, sysid_fit, sysid_parameters
 
 needs_sysid = pytest.mark.skipif(not hasattr(sysid, "optimize"), reason="needs the extra sysid")
 
@@ -95,22 +95,22 @@ def test_a_delay_moves_commands_and_a_bias_moves_what_is_read():
 @needs_sysid
 def test_a_fit_finds_damping_and_armature():
     log = pendulum(1.0, damping=DAMPING, armature=ARMATURE)
-    robot = identification.robot_of(models.spec("pendulum"), log)
+    robot = sysid_parameters.robot_of(models.spec("pendulum"), log)
     pieces = playback.take(log.runs, playback.step_s(log), 0.45)
-    fitted = identification.fit(robot, identification.declare(robot, "joints").move_off_bounds(), pieces, 1e-6, 20)
-    found = identification.physical(robot, fitted)
+    fitted = sysid_fit.fit(robot, sysid_parameters.declare(robot, "joints").move_off_bounds(), pieces, 1e-6, 20)
+    found = sysid_parameters.physical(robot, fitted)
     assert found["damping.hinge"] == pytest.approx(DAMPING, rel=0.1)
     assert found["armature.hinge"] == pytest.approx(ARMATURE, rel=0.1)
 
 
 @needs_sysid
-@pytest.mark.parametrize("subset", list(identification.SUBSETS))
+@pytest.mark.parametrize("subset", list(sysid_parameters.SUBSETS))
 def test_nominal_parameters_change_nothing(subset):
     log = pendulum(0.6)
-    robot = identification.robot_of(models.spec("pendulum"), log)
+    robot = sysid_parameters.robot_of(models.spec("pendulum"), log)
     whole = playback.take(log.runs, playback.step_s(log))
     nominal = playback.play(robot.spec.compile(), log.joints, whole)
-    np.testing.assert_allclose(robot.play(identification.declare(robot, subset), whole), nominal, atol=1e-7)
+    np.testing.assert_allclose(robot.play(sysid_parameters.declare(robot, subset), whole), nominal, atol=1e-7)
 
 
 @needs_sysid
