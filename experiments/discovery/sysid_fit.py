@@ -9,8 +9,8 @@ from collections.abc import Callable
 import mujoco
 import numpy as np
 
-from experiments.discovery.sysid_parameters import Robot, package
 from experiments.discovery.playback import Pieces
+from experiments.discovery.sysid_parameters import Robot, package
 
 _DIFFERENCE = 1e-4  # step of finite differences in units of a parameter
 _TOLERANCE = 1e-4
