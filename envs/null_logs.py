@@ -27,7 +27,7 @@ from envs.models import suspended
 from envs.readings import noise_of, read_later, rounding_of, stale
 from envs.smoothing import smoothed
 
-_STEP_S, _RIG_STEP_S = 0.0005, 0.001  # half the longest step of `Rig`, and that
+_STEP_S = 0.0005  # half the step of `Rig`
 _SPREAD = 0.1  # standard deviation of the logarithm of every drawn parameter, as in `Axis.prior_sd`
 
 
@@ -130,9 +130,9 @@ def play(pairs: Sequence[tuple[_Robot, Run]], joints: Sequence[str]) -> list[_Mo
     # Jitter does not add up: a tick that comes early is followed by a longer interval.
     gaps = steps + np.diff(rng.integers(0, min(steps, 2), int(np.ceil(longest * rate)) + 3))
     looks = first.opt.timestep * np.concatenate([[0], np.cumsum(gaps)])
-    # The first tick is where the measured run's is, as far as a simulation can resolve that (`Run.phase_s`).
-    finest = 1.0 / rate / np.ceil(1.0 / rate / _RIG_STEP_S - 1e-9)
-    times = np.array([run.time[0] + run.phase_s + robot.rng.uniform(0.0, finest) + looks for robot, run in pairs])
+    # When a controller ticks is its own matter, but the same in all runs of a robot.
+    phases = {id(robot): robot.rng.uniform(0.0, 1.0 / rate) for robot, _ in pairs}
+    times = np.array([run.time[0] + phases[id(robot)] + looks for robot, run in pairs])
     drive = _Drive([run for _, run in pairs], times, [robot.goes_straight(run) for robot, run in pairs])
     size = mujoco.mj_stateSize(first, mujoco.mjtState.mjSTATE_FULLPHYSICS)
     state = np.stack([_first_state(robot.model, run, qpos, dof) for robot, run in pairs])

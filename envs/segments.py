@@ -188,9 +188,8 @@ def _of_run(run: Run, start: np.ndarray, rows: np.ndarray, after: int, dt: float
         "limit": controller.limit,
         "emf": controller.back_emf,
     }
-    # A tick on the grid is early rather than late: one that is late may see the target of the next row.
-    phase = dt * np.floor(run.phase_s / dt + 1e-6)
-    ticks = np.floor((grid - run.time[0] - phase) * run.controller.rate_hz + 1e-6)
+    # Where the controller's ticks lie between rows is unknown; they are counted from the run's first row.
+    ticks = np.floor((grid - run.time[0]) * run.controller.rate_hz + 1e-6)
     at = (run.time[rows] - begin) / dt
     step = np.minimum(np.floor(at + 1e-6).astype(np.int32), after - 1)
     position, velocity = np.moveaxis(smoothed(run), 1, 0)

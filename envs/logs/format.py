@@ -70,9 +70,6 @@ class Run:
     known: Mapping[str, Mapping[str, np.ndarray]] = field(default_factory=dict)
     """What is known of a signal's columns, [columns] by signal and name (`FACTS`), NaN where it is not known. Signals
     are never changed by it: who uses them corrects them (`envs.readings`)."""
-    phase_s: float = 0.0
-    """Time from the first row to the controller's first tick, less than its period; no log says it, but discovery
-    estimates it."""
 
     def fact(self, signal: str, name: str) -> np.ndarray:
         """Returns what is known of a signal's columns, [columns], NaN where it is not known.

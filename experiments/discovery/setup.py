@@ -25,13 +25,12 @@ from experiments.discovery.cutting import (
     told_alike,
 )
 from experiments.discovery.hypotheses import hypotheses, learned_torque, timing_directions
-from experiments.discovery.timing import with_timing
 from jaxtune.discovery.problem import Problem
 
 __all__ = ["HORIZONS_S", "Question", "build_question", "drop_filtered", "read_logs", "without_sealed"]
 
 _LEAST_STALE = 0.02  # share of readings
-_LATE_S = 0.004  # a velocity that lags its position by more was filtered, and would be mistaken for a sensor's lag
+_LATE_S = 0.001  # a velocity that lags its position by more was filtered, and would be mistaken for a sensor's lag
 
 
 @dataclass(frozen=True)
@@ -145,6 +144,9 @@ def build_question(
     library = {name: row for name, row in rig.effects.items() if name in LIBRARY}
     every = hypotheses(rig.axes, rig.places, library)
     timing, timing_bounds = timing_directions(rig.axes, rig.control_hz)
+    measured = cut_log(log, rig.dt, signals, horizons)
+    simulated = simulate_null_logs(log, spec, null_logs, seed)
+    nulls = [told_alike(cut_log(one, rig.dt, signals, horizons), measured) for one in simulated]
     problem = Problem(
         simulate=_Simulator(plain, plain.layout, signals),
         system=plain.system,
@@ -155,19 +157,14 @@ def build_question(
         timing=timing,
         timing_bounds=timing_bounds,
         trees=rig.trees,
-        data=cut_log(log, rig.dt, signals, horizons),
-        null_logs=(),
+        data=measured,
+        null_logs=nulls,
         bin_rows=segments.rows_together(1.0 / log.rate_hz, BIN_S),
         regimes=REGIMES,
         components={name: tuple("xyz") if name == "gravity" else rig.joints for name in signals},
         push={joint: axes["constant_push", joint] for joint in rig.joints},
         residual=learned_torque(rig.axes, LEARNED),
     )
-    log = with_timing(log, problem, rig.dt, signals)
-    measured = cut_log(log, rig.dt, signals, horizons)
-    simulated = simulate_null_logs(log, spec, null_logs, seed)
-    nulls = [told_alike(cut_log(one, rig.dt, signals, horizons), measured) for one in simulated]
-    problem = replace(problem, data=measured, null_logs=nulls)
     names = {split: tuple(run.name for run in runs) for split, runs in splits(log).items()}
     return Question(problem, rig, names, (*log.notes, *notes, *_stale_notes(unsealed)))
 
@@ -224,7 +221,7 @@ def drop_filtered(log: Log) -> tuple[Log, tuple[str, ...]]:
     """Leaves out signals that were filtered, because their lag would be mistaken for a sensor's.
 
     A signal counts as filtered if the log says so, and a velocity also if it lags the derivative of the position by
-    more than 4 ms in the median run. Positions stay: the delay of their filter is taken out (`envs.readings`).
+    more than 1 ms in the median run. Positions stay: the delay of their filter is taken out (`envs.readings`).
 
     Args:
       log: as it was read.
