@@ -25,11 +25,12 @@ ADVICE = {
     "parameter_change": "Use the corrected model (--model OUT/model), and check the parameter on the robot.",
     "no_missing_effect": "Keep the model. If a policy still fails on the robot, look at what these logs cannot show: "
     "contact, the free base, commands and delays on the way to the controller.",
-    "unnamed": "Look at the joint and regime where the gap is largest. The saved model has a torque without a name "
-    "there. It explains nothing; use it only if its gap is smaller than the nominal model's.",
+    "unnamed": "Look at the suspects, and at the joint and regime where the gap is largest. The saved model is the best "
+    "one on validation runs; it may have a learned torque, which names nothing.",
 }
 """What to do next, by verdict."""
 
+_SHOWN = 4  # suspects on the console
 _TEMPLATE = Path(__file__).with_suffix(".html")
 
 
@@ -95,6 +96,11 @@ def show(console: Console, question: Question, summary: dict, free: dict) -> Non
     table.add_row("short segments, floor units", *(f"{gap[name]:.2f}" for name in ("before", "null", "after")))
     table.add_row("whole runs, mean in rad", *(f"{error[name]:.4f}" for name in ("before", "null", "after")))
     console.print(table)
+    suspects = [f"{one['name']} at {', '.join(one['places'])} {one['probability']:.2f}" for one in summary["suspects"]]
+    if suspects:
+        console.print(f"suspects: {'; '.join(suspects[:_SHOWN])}")
+    if summary["withdrawn"]:
+        console.print("the corrected model was withdrawn: on held-out runs it was worse than the one that is saved")
     if summary["not_testable"]:
         console.print(f"effects that these logs could not show: {', '.join(summary['not_testable'])}")
 
