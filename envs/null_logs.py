@@ -46,16 +46,16 @@ def simulate_null_logs(log: Log, spec: mujoco.MjSpec, count: int, seed: int) -> 
       Logs of the same runs, joints and signals. Signals of the controller (targets, supply, enabling) are copied,
       signals of sensors are simulated.
     """
-    robots = [_Robot.drawn(spec, np.random.default_rng(seed + number)) for number in range(count)]
+    robots = [Robot.drawn(spec, np.random.default_rng(seed + number)) for number in range(count)]
     pairs = [(robot, run) for robot in robots for run in log.runs]
     played = play(pairs, log.joints)
-    runs = [_as_run(robot, run, motion) for (robot, run), motion in zip(pairs, played, strict=True)]
+    runs = [as_recorded(robot, run, motion) for (robot, run), motion in zip(pairs, played, strict=True)]
     each = len(log.runs)
     return [replace(log, runs=tuple(runs[start : start + each])) for start in range(0, len(runs), each)]
 
 
 @dataclass(frozen=True)
-class _Robot:
+class Robot:
     """One robot that lacks nothing: its model, how its targets go on between rows, and its random numbers."""
 
     model: mujoco.MjModel
@@ -63,9 +63,9 @@ class _Robot:
     rng: np.random.Generator
 
     @staticmethod
-    def drawn(spec: mujoco.MjSpec, rng: np.random.Generator) -> "_Robot":
+    def drawn(spec: mujoco.MjSpec, rng: np.random.Generator) -> "Robot":
         """Draws a robot from the prior. Where a log does not say how targets go on, half of all robots go straight."""
-        return _Robot(_drawn(spec, rng), bool(rng.integers(0, 2)), rng)
+        return Robot(_drawn(spec, rng), bool(rng.integers(0, 2)), rng)
 
     def goes_straight(self, run: Run) -> bool:
         """Whether targets move to the next row in a straight line; else they are held."""
@@ -73,7 +73,7 @@ class _Robot:
 
 
 @dataclass(frozen=True)
-class _Motion:
+class Motion:
     """A simulated run where its controller looked: times [n], states [n, 2, joints], torques [n, joints]."""
 
     times: np.ndarray
@@ -104,7 +104,7 @@ def _factors(rng: np.random.Generator, count: int) -> np.ndarray:
     return np.exp(_SPREAD * rng.standard_normal(count).clip(-2.0, 2.0))
 
 
-def play(pairs: Sequence[tuple[_Robot, Run]], joints: Sequence[str]) -> list[_Motion]:
+def play(pairs: Sequence[tuple[Robot, Run]], joints: Sequence[str]) -> list[Motion]:
     """Plays runs' targets (or their torques, where they have no targets) on models in MuJoCo C, all side by side.
 
     The controller's law is `envs.logs.Controller`'s. It reads the joint at its own rate, each time up to one step of
@@ -164,7 +164,7 @@ def play(pairs: Sequence[tuple[_Robot, Run]], joints: Sequence[str]) -> list[_Mo
                 skip_checks=True,
             )
             state = np.ascontiguousarray(after[:, -1])
-    return [_Motion(times[index], found[:, index], torques[:, index]) for index in range(len(pairs))]
+    return [Motion(times[index], found[:, index], torques[:, index]) for index in range(len(pairs))]
 
 
 def _first_state(model: mujoco.MjModel, run: Run, qpos: np.ndarray, dof: np.ndarray) -> np.ndarray:
@@ -211,7 +211,7 @@ class _Drive:
         return (law.torque(wanted, q, dq) if self._driven else wanted), law.back_emf * dq
 
 
-def _as_run(robot: _Robot, run: Run, motion: _Motion) -> Run:
+def as_recorded(robot: Robot, run: Run, motion: Motion) -> Run:
     """Makes a run of a motion, with the signals that the measured one has, read by sensors like its own."""
     level = np.asarray(sensing.projected_gravity(robot.model.body_quat[1]))
     exact = {

@@ -49,9 +49,9 @@ def _fit(time: np.ndarray, parts: Sequence[tuple[np.ndarray, np.ndarray, float]]
     Every row has the widest window in which the polynomial agrees with the readings, or the narrowest one.
     """
     widest, order, period = _window(parts[0][0])
-    least = 1 if len(parts) > 1 else _MIN_HALF_ROWS + (order > 2)
+    least = min(1 if len(parts) > 1 else _MIN_HALF_ROWS, widest)
     found = None
-    for half in sorted({least, max(least, widest // 2), max(least, widest)}):
+    for half in sorted({least, max(least, widest // 2), widest}):
         fit, misfit = _fit_window(time, parts, half, order, half * period)
         found = fit if found is None else np.where((misfit < _AGREES)[:, None], fit, found)
     return found

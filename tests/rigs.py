@@ -114,11 +114,14 @@ def in_mujoco(rig, model, segment, command=None, sense=None, motor=None, outside
     if command is not None:
         drive["target"] = command(drive["target"])
     data = mujoco.MjData(model)
-    data.qpos[rig.qpos], data.qvel[rig.dof] = segment.measured[before] if start is None else start
+    # Positions of a semi-implicit step are half a step ahead of its velocities; that makes it of second order.
+    lead = 0.5 * model.opt.timestep
+    position, velocity = np.asarray(segment.measured[before] if start is None else start)
+    data.qpos[rig.qpos], data.qvel[rig.dof] = position + lead * velocity, velocity
     read, held = [], None
     for step in range(before, len(segment.target)):
         x = {name: values[step] for name, values in drive.items()}
-        seen = np.stack([data.qpos[rig.qpos], data.qvel[rig.dof]])
+        seen = np.stack([data.qpos[rig.qpos] - lead * data.qvel[rig.dof], data.qvel[rig.dof]])
         seen = seen if sense is None else sense(seen)
         read.append(seen)
         if x["sample"]:

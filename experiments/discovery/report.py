@@ -25,8 +25,8 @@ ADVICE = {
     "parameter_change": "Use the corrected model (--model OUT/model), and check the parameter on the robot.",
     "no_missing_effect": "Keep the model. If a policy still fails on the robot, look at what these logs cannot show: "
     "contact, the free base, commands and delays on the way to the controller.",
-    "unnamed": "Look at the suspects, and at the joint and regime where the gap is largest. The saved model is the best "
-    "one on validation runs; it may have a learned torque, which names nothing.",
+    "unnamed": "Look at the suspects, and at the joint and regime where the gap is largest. The saved model is the "
+    "best one on validation runs; it may have a learned torque, which names nothing.",
 }
 """What to do next, by verdict."""
 

@@ -23,7 +23,7 @@ from jaxtune.discovery.simulation import Evaluate, flat_residuals, paired_residu
 FURTHEST = 3.0
 """Prior standard deviations that a nominal parameter may move. One that stops there is a finding, not a nuisance."""
 
-_STEPS = 3  # of the fits to null logs; a tenth off in the parameters, one step would leave an engine gap
+_STEPS = 5  # of the fits to null logs; a tenth off in the parameters, one step would leave an engine gap
 _FEW = 8  # null logs that scales are measured on, at most
 _LEAST_SHARE = 0.25  # of a component's mean floor: else the first rows of a segment would count without end
 

@@ -14,7 +14,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from jaxtune.discovery.fit import Fit
+from jaxtune.discovery.fit import Fit, taken_over
 from jaxtune.discovery.least_squares import complement
 from jaxtune.discovery.noise_floor import Floor, Say
 from jaxtune.discovery.problem import Hypothesis, Problem, are_distinct
@@ -233,15 +233,21 @@ def _seen(
 ) -> tuple[frozenset[str], np.ndarray]:
     """Names of the effects that these logs could show, and the largest gain [logs] that each null log gives any."""
     root, prior = np.sqrt(some.counts.independent), np.diag(1.0 / some.free.sd)
-    project = complement(np.concatenate([root * some.jacobian, prior]))
+    slopes = np.concatenate([root * some.jacobian, prior])
+    # Many hypotheses share what they take over, mostly nothing.
+    taken = {hypothesis.key: taken_over(some.free, hypothesis) for hypothesis in hypotheses}
+    masks = {mask.tobytes(): mask for mask in taken.values()}
+    projections = {key: complement(slopes[:, ~mask]) for key, mask in masks.items()}
     padded = lambda rows: np.pad(root * rows, ((0, 0), (0, len(prior)))).T  # noqa: E731
     # Nominal parameters that were fitted pull against their prior as hard as the residuals do.
     # Beside a model with effects nobody asks what chance gains.
     alike = null_coordinates.shape[1] == len(prior)
     pulls = null_coordinates / some.free.sd if alike else np.zeros((len(null_coordinates), len(prior)))
-    logs = project(np.concatenate([root * null_residuals, pulls], axis=1).T)
+    values = np.concatenate([root * null_residuals, pulls], axis=1).T
+    left = {key: project(values) for key, project in projections.items()}
     seen, chance = set(), np.zeros(len(null_residuals))
     for hypothesis in hypotheses:
+        project, logs = (found[taken[hypothesis.key].tobytes()] for found in (projections, left))
         mine = project(padded(change_of(hypothesis, hypothesis.probes, curves)))
         length = np.sqrt((mine**2).sum(axis=0))
         sizes = np.abs(hypothesis.probes).max(axis=1)

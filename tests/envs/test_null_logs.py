@@ -9,7 +9,7 @@ import pytest
 from envs import readings
 from envs.logs import Controller, Log, Run
 from envs.models import suspended
-from envs.null_logs import replay, simulate_null_log
+from envs.null_logs import Robot, as_recorded, play, simulate_null_logs
 from envs.smoothing import smoothed
 from tests.rigs import ARM, ARM_JOINTS
 
@@ -46,7 +46,10 @@ def played(run, spec, linear=False):
     model = suspended(spec)
     model.opt.timestep = 0.0005
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION
-    return replay(run, model, ARM_JOINTS, linear, np.random.default_rng(0)).signals
+    between = "linear" if linear else "hold"
+    run = replace(run, controller=replace(run.controller, between_rows=between))
+    robot = Robot(model, linear, np.random.default_rng(0))
+    return as_recorded(robot, run, play([(robot, run)], ARM_JOINTS)[0]).signals
 
 
 def test_held_targets_come_half_a_row_later_than_lines(spec):
@@ -63,7 +66,7 @@ def test_unknown_targets_between_rows_are_drawn_for_every_null_log(spec):
     found = {}
     for between in ("hold", "linear", "unknown"):
         log = log_of(measured(20.0, between, known))
-        found[between] = [simulate_null_log(log, spec, seed).runs[0].signals["q"] for seed in range(6)]
+        found[between] = [one.runs[0].signals["q"] for one in simulate_null_logs(log, spec, 6, 0)]
     kinds = [
         "hold" if np.abs(unknown - held).max() < np.abs(unknown - line).max() else "linear"
         for held, line, unknown in zip(*found.values(), strict=True)

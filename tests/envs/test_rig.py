@@ -251,6 +251,7 @@ def test_nominal_parameters_are_those_that_the_model_has(pendulum):
     expected = {
         ("coulomb", "hinge"): 0.0019,
         ("gain_error", "hinge"): 0.1,
+        ("damping_gain", "hinge"): 0.1,
         ("armature", "hinge"): 0.00019,
         ("link_mass", "arm"): 0.1,
     }
@@ -266,7 +267,7 @@ def test_prior_standard_deviations_are_in_coordinates(arm):
     np.testing.assert_allclose(got["armature", "shoulder"], 0.001 / 0.11, rtol=1e-6)
     np.testing.assert_allclose(got["armature", "elbow"], 0.001 / 0.03, rtol=1e-6)
     np.testing.assert_allclose(got["viscous", "elbow"], 0.005 / 0.3, rtol=1e-6)
-    assert {effect for effect, _ in got} == {"armature", "viscous", "link_mass", "gain_error"}
+    assert {effect for effect, _ in got} == {"armature", "viscous", "link_mass", "gain_error", "damping_gain"}
     assert {place for _, place in got} == {"shoulder", "elbow", "upper", "lower"}
 
 

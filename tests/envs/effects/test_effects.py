@@ -9,12 +9,12 @@ import rigs
 
 from envs import effects, models, sensing
 from envs.chain import Now, Wrench
-from envs.effects import LIBRARY, RESIDUAL
+from envs.effects import LEARNED, LIBRARY, NOMINAL
 from envs.effects.memory import LONGEST_S, delay_line, delayed
 from envs.rig import Rig
 
 DT = 0.001
-ROWS = (*LIBRARY.values(), RESIDUAL)
+ROWS = (*NOMINAL.values(), *LIBRARY.values(), LEARNED)
 PARAMETERS = [
     pytest.param(parameter, id=f"{row.name}.{parameter.name}") for row in ROWS for parameter in row.parameters
 ]
@@ -35,6 +35,7 @@ def now(speed=0.0, **fields):
         "rotor": 0.0 * joints,
         "carried": 0.0 * joints,
         "body_velocity": np.zeros((JOINTS, 3), np.float32),
+        "between": joints * 0.0,
     }
     return Now(**(standard | {"speed": speed * joints} | fields))
 
@@ -85,7 +86,7 @@ def series(name, signals, at=None, **physical):
 def test_no_two_rows_have_one_name():
     families = (getattr(effects, name) for name in {row.family for row in ROWS})
     assert sum(len(family.ROWS) for family in families) == len(LIBRARY)
-    assert RESIDUAL.name not in LIBRARY
+    assert LEARNED.name not in LIBRARY
     assert len({row.sentence for row in ROWS}) == len(ROWS)
 
 
@@ -448,13 +449,14 @@ def test_a_tilted_imu_reads_gravity_in_its_own_frame(axis):
 # From outside.
 
 
-def test_what_has_no_name_depends_on_position_and_speed():
-    zero = dict.fromkeys(("constant_nm", "sine_nm", "cosine_nm", "direction_nm", "speed_nm_s_per_rad"), 0.0)
+def test_the_learned_torque_is_a_sum_of_features_of_the_joint_and_its_short_history():
+    zero = {parameter.name: 0.0 for parameter in LEARNED.parameters}
+    wanted = jnp.full(JOINTS, 0.5)
 
-    def torque(position, speed, **terms):
-        nothing = Wrench(torque=jnp.full(JOINTS, 0.5), force=jnp.zeros((JOINTS, 3)))
+    def torque(position, speed, past=(0.5, 0.0), **terms):
         at = now(speed, position=jnp.full(JOINTS, position))
-        return RESIDUAL.act(values_of(RESIDUAL, **(zero | terms)), nothing, at, None)[0].torque
+        memory = jnp.stack([jnp.full(JOINTS, past[0]), jnp.full(JOINTS, past[1])])
+        return LEARNED.act(values_of(LEARNED, **(zero | terms)), wanted, at, memory)[0]
 
     np.testing.assert_allclose(torque(0.3, 2.0, constant_nm=0.2), 0.7, rtol=1e-6)
     np.testing.assert_allclose(torque(np.pi / 2, 2.0, sine_nm=0.2, cosine_nm=9.0), 0.7, rtol=1e-5)
@@ -462,6 +464,18 @@ def test_what_has_no_name_depends_on_position_and_speed():
     # From 0.1 rad/s on it has its direction.
     np.testing.assert_allclose(torque(0.3, -2.0, direction_nm=0.2), 0.3, rtol=1e-5)
     np.testing.assert_allclose(torque(0.3, -2.0, speed_nm_s_per_rad=0.2), 0.1, rtol=1e-5)
+    np.testing.assert_allclose(torque(0.3, -2.0, square_nm_s2_per_rad2=0.1), 0.1, rtol=1e-5)
+    np.testing.assert_allclose(torque(0.3, 2.0, share=0.2), 0.6, rtol=1e-5)
+    # A torque that was there all the time is not late; one that has just come is, but for the step that has passed.
+    np.testing.assert_allclose(torque(0.3, 2.0, late_share=1.0), 0.5, rtol=1e-5)
+    fresh = torque(0.3, 2.0, past=(0.0, 0.0), late_share=1.0) - 0.5
+    assert ((fresh > 0.45) & (fresh < 0.5)).all()
+
+
+def test_the_damping_gain_scales_what_the_controller_damps():
+    row = NOMINAL["damping_gain"]
+    speed, _ = row.act(values_of(row, ratio=1.5), jnp.full(JOINTS, 2.0), None, None)
+    np.testing.assert_allclose(speed, 3.0, rtol=1e-6)
 
 
 # Against MuJoCo C: an arm under its controller, with the effect and without.

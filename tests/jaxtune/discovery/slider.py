@@ -13,8 +13,9 @@ DRAWS = np.random.default_rng(5).standard_normal((12, 2)).clip(-2, 2)
 """[null logs, 2] mass and damping of the simulated null logs, in prior standard deviations."""
 
 
-def simulate(vector, segment):
-    """A slider of 1 kg and 1 N s/m pushed by a force [steps]; coordinates are what is added to them."""
+def simulate(system, vector, segment, steps):
+    """A slider of `system` kg and 1 N s/m pushed by a force [steps]; coordinates are what is added to them."""
+    del steps
     mass, damping, coulomb, push, _, cubic, wild = vector
 
     def step(state, force):
@@ -22,7 +23,7 @@ def simulate(vector, segment):
         rub = coulomb * jnp.tanh(v / 0.02) + cubic * x**3
         # A hypothesis that breaks the simulation wherever it is tried.
         broken = jnp.where(wild > 0, jnp.nan, 0.0)
-        v = v + DT * (force + push - (1.0 + damping) * v - rub) / jnp.exp(mass) + broken
+        v = v + DT * (force + push - (1.0 + damping) * v - rub) / (system * jnp.exp(mass)) + broken
         x = x + DT * v
         return (x, v), (x, v)
 
@@ -30,7 +31,7 @@ def simulate(vector, segment):
     return {"q": x[:, None], "dq": v[:, None]}
 
 
-play = jax.jit(jax.vmap(simulate, (None, 0)))
+play = jax.jit(jax.vmap(lambda vector, segment: simulate(1.0, vector, segment, 0), (None, 0)))
 
 
 def hypothesis(name, bounds, probes, family="friction"):
@@ -48,11 +49,11 @@ def hypothesis(name, bounds, probes, family="friction"):
 
 
 HYPOTHESES = (
-    hypothesis("mass", (-1.0, 1.0), [0.1], "inertia"),
-    hypothesis("damping", (-0.9, 5.0), [0.3]),
-    hypothesis("coulomb", (0.0, 5.0), [0.05, 0.3]),
-    hypothesis("push", (-5.0, 5.0), [0.3], "external"),
-    hypothesis("nothing", (-5.0, 5.0), [0.05], "external"),
+    hypothesis("mass", (-1.0, 1.0), [-0.5, -0.1, 0.1, 0.5], "inertia"),
+    hypothesis("damping", (-0.9, 5.0), [-0.5, 0.3, 1.0, 3.0]),
+    hypothesis("coulomb", (0.0, 5.0), [0.05, 0.2, 0.8, 3.0]),
+    hypothesis("push", (-5.0, 5.0), [-3.0, -0.3, 0.3, 3.0], "external"),
+    hypothesis("nothing", (-5.0, 5.0), [-1.0, -0.05, 0.05, 1.0], "external"),
 )
 WILD = hypothesis("wild", (0.0, 1.0), [0.1], "external")
 
@@ -76,6 +77,7 @@ def measured(truth, seed, split=0, count=40, motion=None):
         found[horizon] = Segments(
             inputs=inputs,
             signals=read,
+            steps=steps,
             run=4 * split + np.arange(count) // 10,
             regimes=np.zeros((count, steps, 1), int),
         )
@@ -93,10 +95,13 @@ def problem(truth, seed=0, hypotheses=HYPOTHESES):
     ]
     return Problem(
         simulate=simulate,
+        system=np.float32(1.0),
         axes=len(AXES),
         hypotheses=hypotheses,
         prior=prior,
         timing=np.zeros((0, len(AXES))),
+        timing_bounds=np.zeros((0, 2)),
+        trees=np.array([0]),
         data={split: measured(truth, 10 * seed + i, i) for i, split in enumerate(splits)},
         null_logs=null_logs,
         bin_rows=2,

@@ -1,116 +1,100 @@
-"""Resampling, comparison and pairs, against what they must be."""
+"""What is believed of models, and statistics of segments that go together."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from slider import HYPOTHESES
+from slider import HYPOTHESES, problem
 
-from jaxtune.discovery import decide, resample
-from jaxtune.discovery.least_squares import Linear
-from jaxtune.discovery.problem import pair_of
-from jaxtune.discovery.resample import blocks, standard_error
+from jaxtune.discovery import noise_floor, state, step
+from jaxtune.discovery.decide import Evidence, Thresholds, believed, passes, posterior, rivals, weigh_evidence
+from jaxtune.discovery.resample import correlation_length, times_drawn, units
+from jaxtune.discovery.result import Settings
 
-RUN = np.repeat([4, 1, 7], [10, 5, 2])
-
-
-def test_blocks_follow_on_each_other_and_stay_in_their_run():
-    drawn = blocks(RUN, draws=50)
-    assert drawn.shape == (50, len(RUN))
-    for draw in drawn:
-        for start in range(0, len(RUN) - 2, 3):
-            piece = draw[start : start + 3]
-            assert len(set(RUN[piece])) == 1
-            rows = np.flatnonzero(RUN[piece[0]] == RUN)
-            # The first follows on the last.
-            following = [rows[(np.searchsorted(rows, index) + 1) % len(rows)] for index in piece[:-1]]
-            np.testing.assert_array_equal(piece[1:], following)
-    # Every segment is drawn as often as any other: 50 x 17 draws of 17.
-    counts = np.bincount(blocks(RUN, draws=4000).ravel(), minlength=len(RUN))
-    np.testing.assert_allclose(counts / 4000, 1.0, atol=0.1)
+GOOD = Evidence(gain=50.0, confirmed=20.0, floors=2.0, interval=(0.1, 0.2), inside=True, horizons=3)
 
 
-def test_the_standard_error_knows_that_neighbours_go_together():
-    rng = np.random.default_rng(0)
-    run = np.repeat(np.arange(20), 30)
-    alone = rng.standard_normal(600)
-    assert standard_error(alone, blocks(run)) == pytest.approx(1 / np.sqrt(600), rel=0.1)
-    # Three at a time alike: a third as many count, and blocks of three, which do not begin where these do, see
-    # (1 + 2 x 2/3 x 2/3 + 2 x 1/3 x 1/3) / 3 of three times the variance.
-    together = np.repeat(rng.standard_normal(200), 3)
-    assert standard_error(together, blocks(run)) == pytest.approx(np.sqrt(1 + 8 / 9 + 2 / 9) / np.sqrt(600), rel=0.15)
+@pytest.fixture(scope="module")
+def stepped():
+    asked = problem({"coulomb": 0.5})
+    floor, begun = state.begin(asked, noise_floor.measure(asked, lambda text: None))
+    found, _ = step.step(Settings(), asked, floor, begun)
+    return asked, floor, found
 
 
-def test_the_threshold_over_many_is_higher_than_over_one():
-    rng = np.random.default_rng(1)
-    run = np.repeat(np.arange(8), 25)
-    gains = {str(i): rng.standard_normal(200) for i in range(12)}
-    one = resample.max_t({"0": gains["0"]}, run, 0.05)
-    # One-sided: 1.64 for one normal, and 1 - 0.05 ** (1 / 12) of it, 2.63, for the largest of twelve.
-    assert one == pytest.approx(1.64, abs=0.15)
-    assert resample.max_t(gains, run, 0.05) == pytest.approx(2.63, abs=0.25)
+@pytest.mark.parametrize(
+    ("test", "change"),
+    [
+        ("beyond_chance", {"gain": 9.0}),
+        ("confirmed", {"confirmed": -0.1}),
+        ("floor_unit", {"floors": 0.9}),
+        ("clear_of_zero", {"interval": (-0.1, 0.2)}),
+        ("inside_bounds", {"inside": False}),
+        ("horizons", {"horizons": 1}),
+    ],
+)
+def test_every_test_can_fail_alone(test, change):
+    thresholds = Thresholds(gain=10.0)
+    assert all(passes(GOOD, thresholds).values())
+    failed = [name for name, passed in passes(replace(GOOD, **change), thresholds).items() if not passed]
+    assert failed == [test]
 
 
-def test_a_difference_that_nobody_cares_for_is_none():
-    rng = np.random.default_rng(2)
-    run = np.repeat(np.arange(4), 10)
-    loss = 1.0 + 0.2 * rng.uniform(size=40)
-    lost = {"best": loss, "a hair worse": loss + 0.01, "worse": loss + 0.1}
-    # No scatter at all in the differences: both are significant.
-    assert resample.alike(lost, blocks(run), 2.0) == ["best", "a hair worse"]
-
-
-def test_the_better_hypothesis_wins_when_it_is_fitted_again():
-    rng = np.random.default_rng(3)
-    run = np.repeat(np.arange(4), 10)
-    right, wrong = rng.standard_normal((2, 40, 5))
-    # The right one explains its share of what is left once it is fitted; the wrong one has nothing to do with it.
-    residual = 0.1 * rng.standard_normal((40, 5))
-    start = {
-        name: Linear((residual - 0.3 * right).ravel(), slope.reshape(-1, 1), np.zeros(1), np.ones(1), 1.0)
-        for name, slope in {"right": right, "wrong": wrong}.items()
+def test_models_that_are_equal_are_believed_alike(stepped):
+    asked, floor, found = stepped
+    at = floor[asked.main_horizon]
+    twin = replace(found.best, hypotheses=(replace(HYPOTHESES[2], name="twin"),))
+    candidates = [found.best, twin, found.null]
+    probabilities = posterior(asked, at, candidates, found.price)
+    np.testing.assert_allclose(probabilities, [0.5, 0.5, 0.0], atol=1e-6)
+    assert {hypothesis.name: p for hypothesis, p in believed(candidates, probabilities)} == {
+        "coulomb": pytest.approx(0.5),
+        "twin": pytest.approx(0.5),
     }
-    fits = {}
-    for name, fit in start.items():
-        step = fit.step()
-        fits[name] = Linear(fit.residual + fit.jacobian @ step, fit.jacobian, step, fit.sd, fit.weight)
-    assert resample.bagged(fits, run) == {"right": 1.0, "wrong": 0.0}
-    # Slopes that promise what a fit has not found are not believed.
-    assert resample.bagged({"found": fits["right"], "promised": start["right"]}, run) == {"found": 1.0, "promised": 0.0}
-    alike = resample.bagged({"one": fits["wrong"], "other": fits["wrong"]}, run)
-    assert sum(alike.values()) == 1.0
+    names = rivals(at, candidates, probabilities, found.best, found.best.hypotheses[0], Settings())
+    assert names == ("twin",)
 
 
-def test_a_pair_is_two_hypotheses_side_by_side():
-    one, two = HYPOTHESES[2], HYPOTHESES[3]
-    pair = pair_of(one, two)
-    point = np.array([0.4, -0.3])
-    np.testing.assert_allclose(point @ pair.directions, 0.4 * one.directions[0] - 0.3 * two.directions[0])
-    np.testing.assert_allclose(pair.bounds, np.concatenate([one.bounds, two.bounds]))
-    # Each is looked for alone.
-    assert ((pair.probes != 0).sum(axis=1) == 1).all()
-    assert pair.probes.shape == (len(one.probes) + len(two.probes), 2)
+def test_evidence_compares_with_the_model_without_the_effect(stepped):
+    asked, floor, found = stepped
+    (coulomb,) = found.best.hypotheses
+    evidence, ablated = weigh_evidence(asked, floor, found.best, coulomb, {})
+    assert ablated.hypotheses == ()
+    assert all(passes(evidence, Thresholds(gain=found.price)).values())
+    low, high = evidence.interval
+    assert low < 0.5 < high
+    # The null that was fitted from the nominal model is the same model.
+    known, _ = weigh_evidence(asked, floor, found.best, coulomb, {"null": found.null})
+    assert known.gain == pytest.approx(evidence.gain, rel=0.05)
 
 
-def test_what_shows_in_few_segments_is_confirmed_there():
-    run = np.repeat([0, 1], 15)
-    before = np.random.default_rng(0).standard_normal((30, 4, 2))
-    after = before.copy()
-    before[[2, 9, 20]] += 10.0
-    # Three blocks gain 800 each or nearly, of which one does not count; a t of the same gains is low.
-    gain = resample.confirmed(before, after, run, 0.5)
-    expected = 0.5 * ((before[[2, 9, 20]] ** 2).sum() - (after[[2, 9, 20]] ** 2).sum())
-    assert gain == pytest.approx(expected * 2 / 3, rel=0.1)
-    assert resample.t_statistic(resample.paired(before, after), run) < 2.0
-    # One block proves nothing, and what is worse elsewhere counts.
-    lucky = after.copy()
-    lucky[2] += 10.0
-    assert resample.confirmed(lucky, after, run, 0.5) == 0.0
-    assert resample.confirmed(lucky, after + 0.1 * np.sign(after), run, 0.5) < 0.0
+def test_whole_runs_are_drawn_where_there_are_enough():
+    run = np.repeat(np.arange(12), 5)
+    squares = np.ones((60, 1))
+    assert len(set(units(run, squares, 8).tolist())) == 12
+    # Else blocks of three segments or more, which stay within a run.
+    blocks = units(run, squares, 2)
+    assert len(set(zip(run.tolist(), blocks.tolist(), strict=True))) == len(set(blocks.tolist())) == 12
 
 
-def test_either_way_of_being_significant_is_enough():
-    sure = {"floors": 9.0, "interval": (1.0, 2.0), "inside": True, "horizons": 3, "chosen": 1.0}
-    least = decide.Thresholds(t=2.0, gain=100.0)
-    for t, confirmed, enough in ((3.0, -5.0, True), (1.0, 101.0, True), (1.0, 99.0, False)):
-        evidence = decide.Evidence(gain=500.0, t=t, confirmed=confirmed, **sure)
-        assert decide.passes(evidence, least)["significant"] is enough
-        assert all(decide.passes(evidence, least).values()) is enough
+def test_blocks_are_longer_than_the_correlation():
+    rng = np.random.default_rng(0)
+    run = np.zeros(400, int)
+    slow = np.repeat(rng.exponential(size=(40, 1)), 10, axis=0)
+    assert correlation_length(run, rng.exponential(size=(400, 1))) <= 2
+    assert 5 <= correlation_length(run, slow) <= 12
+    count = np.bincount(units(run, slow, 1))
+    assert count.min() >= 5
+
+
+def test_a_draw_stands_for_as_many_segments_as_there_are():
+    unit = np.repeat(np.arange(9), [3, 3, 3, 4, 4, 3, 3, 3, 3])
+    times = times_drawn(unit, draws=50, seed=1)
+    np.testing.assert_allclose(times.sum(axis=1), len(unit))
+    # Segments of a unit are drawn together.
+    assert all((times[:, unit == number].T[0] == times[:, unit == number].T).all() for number in range(9))
+
+
+def test_segments_of_a_run_must_follow_on_each_other():
+    with pytest.raises(ValueError, match="apart from each other"):
+        units(np.array([0, 1, 0]), np.ones((3, 1)), 1)

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from jaxtune.discovery.least_squares import Linear
+from jaxtune.discovery.least_squares import Counts, Linear
 
 
 def linear(slope, value, offset=None):
     count = slope.shape[1]
-    return Linear(value, slope, np.zeros(count) if offset is None else offset, np.full(count, 1e6), 1.0)
+    return Linear(value, slope, np.zeros(count) if offset is None else offset, np.full(count, 1e6), np.ones(len(value)))
 
 
 def test_what_meets_a_bound_takes_the_others_along():
@@ -35,3 +35,13 @@ def test_no_other_step_within_bounds_is_better(seed):
     assert ((bounds[:, 0] - 1e-9 <= found) & (found <= bounds[:, 1] + 1e-9)).all()
     others = rng.uniform(*bounds.T, (5000, 4))
     assert loss(found) <= min(map(loss, others)) + 1e-9
+
+
+def test_the_cost_is_that_of_the_floor_below_it_and_logarithmic_above():
+    counts = Counts(components=2, independent=0.5, systematic=0.1)
+    # 10 rows; mean squares 0.6 and e^2: 10 (0.5 * 0.6 + 0.5 + 0.1 * 2).
+    assert counts.cost(np.array([0.6, np.e**2]), 10) == pytest.approx(10.0)
+    residual = np.tile([0.5, 3.0], 10)
+    np.testing.assert_allclose(counts.mean_squares(residual), [0.25, 9.0])
+    # What is nine times the floor weighs a ninth of the systematic share.
+    np.testing.assert_allclose(counts.weights(residual).reshape(10, 2), np.tile([0.5, 0.1 / 9.0], (10, 1)))

@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 import slider as toy
 
-from jaxtune.discovery.noise_floor import measure_at
+from jaxtune.discovery.noise_floor import measure
 
 
 def floor_of(draws, monkeypatch):
     """Mean floor [components] with null logs of these nominal parameters, in prior standard deviations."""
     monkeypatch.setattr(toy, "DRAWS", draws)
     problem = toy.problem({})
-    found = measure_at(problem, 0.4)
-    assert len(found.null_fits) == len(draws)
+    found = measure(problem, lambda text: None)[problem.main_horizon]
+    assert len(found.null_residuals) == len(draws)
     return found.scale["train"].mean(axis=0), found
 
 
@@ -22,12 +22,12 @@ def test_parameters_a_fifth_off_do_not_raise_the_floor(monkeypatch):
     moved, found = floor_of(np.random.default_rng(1).choice([-2.0, 2.0], (12, 2)), monkeypatch)
     # One step leaves five to forty times that here.
     np.testing.assert_allclose(moved, still, rtol=0.05)
-    for log in found.null_fits:
+    for log in found.null_residuals:
         # Of residuals in floor units, all of one size.
-        assert np.mean(log.residual**2) == pytest.approx(1.0, abs=0.25)
+        assert np.mean(log**2) == pytest.approx(1.0, abs=0.25)
 
 
 def test_fits_to_null_logs_find_what_was_drawn(monkeypatch):
     draws = np.random.default_rng(2).uniform(-1.5, 1.5, (6, 2))
     _, found = floor_of(draws, monkeypatch)
-    np.testing.assert_allclose([log.coordinates for log in found.null_fits], draws, atol=0.3)
+    np.testing.assert_allclose(found.null_coordinates, draws, atol=0.3)

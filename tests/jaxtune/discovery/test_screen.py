@@ -1,50 +1,72 @@
-"""What looks like the change of a nominal parameter."""
+"""The screen finds effects at about their size, and pairs of which neither shows alone."""
 
 from dataclasses import replace
 
 import numpy as np
+import pytest
+from slider import AXES, HYPOTHESES, problem
 
+from jaxtune.discovery import noise_floor, state
 from jaxtune.discovery.fit import Fit, Free
-from jaxtune.discovery.problem import Hypothesis
-from jaxtune.discovery.screen import looks_like
+from jaxtune.discovery.least_squares import Counts
+from jaxtune.discovery.profile import Profile
+from jaxtune.discovery.screen import screen
 
 
-def hypothesis(name, axis, least=-1.0):
-    return Hypothesis(
-        name=name,
-        family="any",
-        places=("joint",),
-        directions=np.eye(5)[[axis]],
-        probes=np.array([[0.5]]),
-        bounds=np.array([[least, 1.0]]),
-        prior=np.ones(1),
-        joints=(0,),
-    )
+def screened(truth, pairs=0):
+    asked = problem(truth)
+    floor, begun = state.begin(asked, noise_floor.measure(asked, lambda text: None))
+    at = floor[asked.main_horizon]
+    return screen(asked, at, begun.nominal, HYPOTHESES, pairs=pairs, say=lambda text: None)
 
 
-def test_a_change_looks_like_what_moves_the_residuals_as_it_does():
-    change, other, third = np.eye(60)[:3]
-    free = Free(directions=np.eye(5)[:1], sd=np.ones(1), bounds=np.array([[-5.0, 5.0]]), nominal=np.ones(1, bool))
-    fit = Fit(free=free, coordinates=np.ones(1), residual=other, jacobian=change[:, None], weight=0.5)
-    # A share of 0.81 of what the change does, and of 0.36.
-    columns = {
-        (1, 0.5): 3 * change,
-        (2, 0.5): 0.9 * change + np.sqrt(0.19) * third,
-        (3, 0.5): 0.6 * change + 0.8 * third,
-    }
-    columns[4, 0.5] = -change
-    same, near, far, less = (
-        hypothesis(name, axis) for axis, name in enumerate(("same", "near", "far", "less"), start=1)
-    )
+def test_the_best_lead_is_what_is_hidden_at_about_its_size():
+    found = screened({"coulomb": 0.6, "mass": 0.08, "damping": -0.1})
+    lead = found.leads[0]
+    assert [hypothesis.name for hypothesis in lead.hypotheses] == ["coulomb"]
+    assert lead.point[0] == pytest.approx(0.6, rel=0.4)
+    # The nominal parameters answer it near where they are: a tenth is one prior deviation.
+    np.testing.assert_allclose(lead.start, [0.8, -1.0], atol=0.8)
+    assert lead.cost < found.cost
 
-    def alike(hypotheses, share, axis=0, change=1.0):
-        moved = replace(fit, coordinates=np.array([change]))
-        return looks_like(moved, columns, axis, hypotheses, share)
 
-    assert alike([near, far, same, less], 0.8) == ("same", "less", "near")
-    assert alike([near, far, same], 0.3) == ("same", "near", "far")
-    # What can only be added explains a change in one direction alone.
-    added = hypothesis("less", 4, least=0.0)
-    assert alike([added], 0.8) == ()
-    assert alike([added], 0.8, change=-1.0) == ("less",)
-    assert alike([same], 0.8, axis=2) == (), "nothing that is free lies along this axis"
+def test_two_that_hide_each_other_are_found_as_a_pair():
+    found = screened({"coulomb": 0.8, "push": 0.8}, pairs=2)
+    assert {hypothesis.name for hypothesis in found.pairs[0].hypotheses} == {"coulomb", "push"}
+    assert found.pairs[0].cost < found.leads[0].cost
+
+
+def fit_of(rng, count=3, rows=60, parts=2):
+    free = Free(np.eye(count), np.ones(count), np.tile([-3.0, 3.0], (count, 1)), np.ones(count, bool))
+    counts = Counts(components=parts, independent=0.5, systematic=0.2)
+    jacobian = rng.normal(size=(rows * parts, count))
+    return Fit(free, 0.1 * rng.normal(size=count), rng.normal(size=rows * parts), jacobian, counts)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_profile_is_no_dearer_than_any_answer_within_bounds(seed):
+    rng = np.random.default_rng(seed)
+    fit = fit_of(rng)
+    change = 3.0 * rng.normal(size=(1, len(fit.residual)))
+    (cost,), (at,) = Profile(fit).costs(change)
+
+    def cost_at(coordinates):
+        residual = fit.residual + change[0] + fit.jacobian @ (coordinates - fit.coordinates)
+        rows = len(residual) // fit.counts.components
+        return fit.counts.cost(fit.counts.mean_squares(residual), rows) + (coordinates**2).sum()
+
+    assert cost == pytest.approx(cost_at(at), rel=1e-4)
+    assert cost <= min(cost_at(at + 0.3 * rng.normal(size=3)) for _ in range(200)) + 1e-3
+
+
+def test_a_profile_keeps_bounds():
+    fit = fit_of(np.random.default_rng(0))
+    fit = replace(fit, free=replace(fit.free, sd=np.full(3, 100.0)))
+    change = -50.0 * fit.jacobian[:, :1].T
+    _, at = Profile(fit).costs(change)
+    assert (np.abs(at) <= 3.0 + 1e-6).all()
+    assert at[0, 0] == pytest.approx(3.0)
+
+
+def test_axes_are_named_as_the_toy_names_them():
+    assert [hypothesis.name for hypothesis in HYPOTHESES] == list(AXES[:5])

@@ -17,9 +17,9 @@ def test_residuals_compile_once_for_any_number_of_vectors_and_segments():
     traces = []
     asked = problem({})
 
-    def counted(vector, segment):
+    def counted(*args):
         traces.append(1)
-        return simulate(vector, segment)
+        return simulate(*args)
 
     asked = replace(asked, simulate=counted)
     segments = asked.data["train"][0.2]
@@ -33,6 +33,10 @@ def test_residuals_compile_once_for_any_number_of_vectors_and_segments():
     many = residuals(asked, vectors, segments, width=16)
     count = len(traces)
     assert residuals(asked, vectors[2:3], few, width=16).shape == (1, 7, 10, 2)
+    # Other lengths of segments and other robots need no other program either.
+    assert residuals(asked, vectors[:2], asked.data["train"][0.1], width=16).shape == (2, 40, 5, 2)
+    heavier = residuals(replace(asked, system=np.float32(2.0)), vectors, segments, width=16)
+    assert np.abs(heavier - many).max() > 0.01
     assert len(traces) == count
     # Each pair is what it is alone: binned means of measured less simulated, signals in the order of their names.
     alone = play(jnp.asarray(vectors[3], jnp.float32), segments.inputs)
