@@ -46,42 +46,16 @@ class Hypothesis:
     """[parameters]: standard deviation of the coordinates before anything was measured."""
     joints: tuple[int, ...]
     """Components of the signals in which the effect shows first; empty where it may show in any."""
-    parts: tuple["Hypothesis", ...] = ()
-    """The two hypotheses that a pair consists of; empty for a single effect."""
 
     @property
     def key(self) -> str:
         """Name and places as one word, such as `coulomb@elbow`; it identifies the hypothesis in messages and files."""
         return f"{self.name}@{'+'.join(self.places)}"
 
-    @property
-    def singles(self) -> tuple["Hypothesis", ...]:
-        """The single effects that it consists of: the two parts of a pair, else the hypothesis itself."""
-        return self.parts or (self,)
-
 
 def are_distinct(one: Hypothesis, two: Hypothesis) -> bool:
     """Says whether two hypotheses may form a pair: they have other names, or share no place."""
     return one.name != two.name or not set(one.places) & set(two.places)
-
-
-def pair_of(one: Hypothesis, two: Hypothesis) -> Hypothesis:
-    """Joins two hypotheses to one that has both effects at once.
-
-    Its coordinates are those of the first, then those of the second. Each part is probed alone.
-    """
-    parts, zero = (one, two), np.zeros((len(one.probes), len(two.directions)))
-    return Hypothesis(
-        name=f"{one.name} and {two.name}",
-        family=f"{one.family} and {two.family}",
-        places=(*one.places, *two.places),
-        directions=np.concatenate([part.directions for part in parts]),
-        probes=np.block([[one.probes, zero], [np.zeros((len(two.probes), len(one.directions))), two.probes]]),
-        bounds=np.concatenate([part.bounds for part in parts]),
-        prior=np.concatenate([part.prior for part in parts]),
-        joints=tuple(sorted({*one.joints, *two.joints})),
-        parts=parts,
-    )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from jaxtune.discovery.decide import Candidate, total_cost
+from jaxtune.discovery.decide import Candidate, key_of, total_cost
 from jaxtune.discovery.evaluate import worst
 from jaxtune.discovery.fit import Fit, begin, polish, refine
 from jaxtune.discovery.localise import localise
@@ -73,7 +73,8 @@ def step(
     leads = shortlist(settings, found, state.price)
     say(f"fit {len(leads)}")
     fitted = fit_leads(settings, at, base, state.best.hypotheses, leads)
-    state = state.with_candidates(fitted)
+    broken = {key_of((*state.best.hypotheses, *lead.hypotheses)) for lead in leads} - {one.key for one in fitted}
+    state = replace(state.with_candidates(fitted), not_finite=(*state.not_finite, *sorted(broken)))
     cost = {one.key: total_cost(at, one, state.price) for one in (*fitted, best)}
     least = min(state.candidates, key=lambda one: total_cost(at, one, state.price))
     improved = least.key != best.key
