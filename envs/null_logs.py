@@ -48,7 +48,7 @@ def simulate_null_logs(log: Log, spec: mujoco.MjSpec, count: int, seed: int) -> 
     """
     robots = [Robot.drawn(spec, np.random.default_rng(seed + number)) for number in range(count)]
     pairs = [(robot, run) for robot in robots for run in log.runs]
-    played = play(pairs, log.joints)
+    played = play(pairs, log.joints) if pairs else []
     runs = [as_recorded(robot, run, motion) for (robot, run), motion in zip(pairs, played, strict=True)]
     each = len(log.runs)
     return [replace(log, runs=tuple(runs[start : start + each])) for start in range(0, len(runs), each)]

@@ -11,7 +11,7 @@ import pytest
 from envs import segments
 from envs.logs import Controller, Log, Run, splits, write
 from envs.models import suspended
-from envs.null_logs import replay
+from envs.null_logs import Robot, as_recorded, play
 from experiments.discovery.blind_cases import ARM
 from experiments.discovery.cutting import HORIZONS_S, fitting_horizons, split_in_time
 from experiments.discovery.setup import build_question, drop_filtered, read_logs
@@ -48,7 +48,8 @@ def played(spec):
     )
     model = suspended(spec)
     model.opt.timestep, model.opt.disableflags = 0.0005, model.opt.disableflags | mujoco.mjtDisableBit.mjDSBL_ACTUATION
-    run = replay(run, model, JOINTS, True, np.random.default_rng(0))
+    robot = Robot(model, True, np.random.default_rng(0))
+    run = as_recorded(robot, run, play([(robot, run)], JOINTS)[0])
     return Log(robot="arm.xml", base="fixed", rate_hz=50.0, joints=JOINTS, policy=None, runs=(run,))
 
 
@@ -120,7 +121,8 @@ def test_what_was_measured_is_compared_and_the_rig_reads_it(played, spec):
     for name, of in data.inputs.items():
         assert (getattr(null.inputs, name) is of) == (name != "measured"), name
     values = np.asarray(problem.values(np.zeros((1, problem.axes))))[0].astype(np.float32)
-    read = jax.jit(jax.vmap(problem.simulate, in_axes=(None, 0)))(values, data.inputs)
+    play = jax.jit(jax.vmap(problem.simulate, in_axes=(None, None, 0, None)))
+    read = play(problem.system, values, data.inputs, data.steps)
     for name, size in {"q": 1e-3, "dq": 0.02, "tau": 0.02, "abs_tau": 0.02}.items():
         error = np.sqrt(((read[name] - data.signals[name]) ** 2).mean())
         assert error < size, name
