@@ -1,68 +1,147 @@
 """What many small changes of a model would cost, once the free coordinates have answered each, without a simulation.
 
-Near a fit the residuals are linear in the coordinates that are free. So for a change d of the residuals, such as an
-effect of some size makes, the step u of the free coordinates that answers it follows from sums over the rows:
+Near a fit the residuals r are linear in the coordinates that are free, with slopes J. A library of simulated changes,
+the rows of D, says what effects of some sizes make of them. For a sum D'w of such changes, the step u of the free
+coordinates that answers it is
 
-    u = argmin C(r + d + J u),
+    u = argmin C(r + D'w + J u),
 
-with the cost C of `least_squares`, prior included. Thousands of changes are answered in one batch.
+with the cost C of `least_squares`, prior included. The cost needs no more than the mean square of every component. So
+everything follows from the products of r, J and D with each other, which are summed once.
 """
+
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from jaxtune.discovery.fit import Fit
+from jaxtune.discovery.least_squares import Counts
 
 _REWEIGHTED = 4  # times; the cost changes by less than chance after
 
 
+@dataclass(frozen=True)
+class Changes:
+    """Sums of changes of a library: `weights` [n, some] of those with numbers `which` [some]."""
+
+    which: np.ndarray
+    weights: np.ndarray
+
+
+@dataclass(frozen=True, kw_only=True)
 class Profile:
-    """A fit with the sums that answer a change of its residuals.
+    """A model near a fit, as sums over the rows of every component; see `profile_of`."""
 
-    Args:
-      fit: the model, whose coordinates answer.
-      columns: [features, k] further directions that may answer, without a prior, in both senses.
-    """
+    counts: Counts
+    rows: int
+    """Residuals of every component."""
+    square: np.ndarray
+    """[components] r'r"""
+    pull: np.ndarray
+    """[components, coordinates] J'r"""
+    normal: np.ndarray
+    """[components, coordinates, coordinates] J'J"""
+    of_residual: np.ndarray
+    """[components, library] D r"""
+    of_slopes: np.ndarray
+    """[components, coordinates, library] J'D'"""
+    gram: np.ndarray
+    """[components, library, library] D D'"""
+    offset: np.ndarray
+    """[coordinates] where the fit stands."""
+    precision: np.ndarray
+    """[coordinates] of the prior."""
+    bounds: np.ndarray
+    """[coordinates, 2]"""
 
-    def __init__(self, fit: Fit, columns: np.ndarray | None = None):
-        self._counts, parts = fit.counts, fit.counts.components
-        extra = np.zeros((len(fit.residual), 0)) if columns is None else columns
-        slopes = np.concatenate([fit.jacobian, extra], axis=1).astype(np.float32)
-        none = np.zeros(extra.shape[1])
-        self._slopes = np.moveaxis(slopes.reshape(-1, parts, slopes.shape[1]), 1, 0)
-        self._residual = np.moveaxis(fit.residual.reshape(-1, parts), 1, 0).astype(np.float32)
-        self._normal = (np.swapaxes(self._slopes, 1, 2) @ self._slopes).astype(float)
-        self._offset = np.concatenate([fit.coordinates, none])
-        self._precision = np.concatenate([fit.free.sd**-2.0, none])
-        self._low, self._high = np.concatenate([fit.free.bounds, np.tile([-np.inf, np.inf], (len(none), 1))]).T
+    def moved(self, change: Changes) -> "Profile":
+        """Makes the profile of the model with one change (`weights` [1, some]) in it."""
+        which, (weights,) = change.which, change.weights
+        return replace(
+            self,
+            square=self.square
+            + 2 * self.of_residual[:, which] @ weights
+            + np.einsum("s,pst,t->p", weights, self.gram[:, which[:, None], which], weights),
+            pull=self.pull + self.of_slopes[:, :, which] @ weights,
+            of_residual=self.of_residual + np.einsum("s,psl->pl", weights, self.gram[:, which]),
+        )
 
-    def costs(self, changes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def with_directions(self, changes: Changes) -> "Profile":
+        """Makes the profile of the model in which some changes may have any size, without a prior, in both senses."""
+        which, weights = changes.which, changes.weights
+        mixed = np.einsum("ns,pis->pin", weights, self.of_slopes[:, :, which])
+        own = np.einsum("ns,pst,mt->pnm", weights, self.gram[:, which[:, None], which], weights)
+        of_library = np.einsum("ns,psl->pnl", weights, self.gram[:, which])
+        none = np.zeros(len(weights))
+        return replace(
+            self,
+            pull=np.concatenate([self.pull, self.of_residual[:, which] @ weights.T], axis=1),
+            normal=np.block([[self.normal, mixed], [np.swapaxes(mixed, 1, 2), own]]),
+            of_slopes=np.concatenate([self.of_slopes, of_library], axis=1),
+            offset=np.concatenate([self.offset, none]),
+            precision=np.concatenate([self.precision, none]),
+            bounds=np.concatenate([self.bounds, np.tile([-np.inf, np.inf], (len(none), 1))]),
+        )
+
+    def costs(self, changes: Changes, reweighted: int = _REWEIGHTED) -> tuple[np.ndarray, np.ndarray]:
         """Answers changes of the residuals.
 
         Bounds are kept by clipping, so that a cost is never too low; a fit finds the bounded optimum later.
 
         Args:
-          changes: [n, features]
+          changes: n of them.
+          reweighted: how often the weights of the components are computed anew.
 
         Returns:
-          Costs [n], and the coordinates [n, coordinates and columns] that answer.
+          Costs [n], and the coordinates [n, coordinates] that answer.
         """
-        parts = len(self._residual)
-        values = np.moveaxis(changes.reshape(len(changes), -1, parts), 2, 0) + self._residual[:, None]
-        # Sums over rows: [components, n] and [components, n, coordinates].
-        square = np.einsum("pnf,pnf->pn", values, values).astype(float)
-        pull = (values @ self._slopes).astype(float)
-        rows = values.shape[2]
+        which, weights = changes.which, changes.weights
+        # Sums over rows: [n, components] and [n, components, coordinates].
+        of_changes = np.einsum("ns,pst,nt->np", weights, self.gram[:, which[:, None], which], weights, optimize=True)
+        square = self.square + 2 * weights @ self.of_residual[:, which].T + of_changes
+        pull = self.pull + np.einsum("ns,pis->npi", weights, self.of_slopes[:, :, which], optimize=True)
+        parts, count = self.pull.shape
         least = square
-        for _ in range(_REWEIGHTED):
-            mean = least / rows
-            weight = np.where(mean > 1.0, self._counts.systematic / np.maximum(mean, 1.0), self._counts.independent)
-            normal = np.einsum("pn,pij->nij", weight, self._normal) + np.diag(self._precision)
+        for _ in range(reweighted):
+            mean = np.maximum(least, 0.0) / self.rows
+            weight = np.where(mean > 1.0, self.counts.systematic / np.maximum(mean, 1.0), self.counts.independent)
+            normal = (weight @ self.normal.reshape(parts, -1)).reshape(-1, count, count) + np.diag(self.precision)
             diagonal = np.einsum("nii->ni", normal)
-            normal = normal + np.eye(normal.shape[1]) * (1e-6 * np.maximum(diagonal, 1e-9))[:, None]
-            wanted = -np.einsum("pn,pni->ni", weight, pull) - self._precision * self._offset
+            normal = normal + np.eye(count) * (1e-6 * np.maximum(diagonal, 1e-9))[:, None]
+            wanted = -np.einsum("np,npi->ni", weight, pull) - self.precision * self.offset
             step = np.linalg.solve(normal, wanted[..., None])[..., 0]
-            step = np.clip(self._offset + step, self._low, self._high) - self._offset
-            least = square + 2 * np.einsum("pni,ni->pn", pull, step)
-            least = np.maximum(least + np.einsum("ni,pij,nj->pn", step, self._normal, step, optimize=True), 0.0)
-        at = self._offset + step
-        return self._counts.cost(least.T / rows, rows) + (self._precision * at**2).sum(axis=1), at
+            step = np.clip(self.offset + step, *self.bounds.T) - self.offset
+            bent = np.einsum("npi,ni->np", (step @ self.normal.reshape(parts, count, count)).swapaxes(0, 1), step)
+            least = np.maximum(square + 2 * np.einsum("npi,ni->np", pull, step) + bent, 0.0)
+        at = self.offset + step
+        return self.counts.cost(least / self.rows, self.rows) + (self.precision * at**2).sum(axis=1), at
+
+
+def profile_of(fit: Fit, library: np.ndarray) -> Profile:
+    """Sums over the rows of a fit.
+
+    Args:
+      fit: the model, whose coordinates answer.
+      library: [library, features] changes of the residuals.
+    """
+    parts, count = fit.counts.components, len(fit.coordinates)
+    by_part = lambda values: values.reshape(len(values), -1, parts)  # noqa: E731
+    columns = [by_part(fit.residual[None]), by_part(fit.jacobian.T), by_part(library)]
+    sums = []
+    for part in range(parts):
+        one = np.concatenate([values[..., part] for values in columns]).astype(float)
+        sums.append(one @ one.T)
+    total, slopes, changes = np.stack(sums), slice(1, 1 + count), slice(1 + count, None)
+    return Profile(
+        counts=fit.counts,
+        rows=len(fit.residual) // parts,
+        square=total[:, 0, 0],
+        pull=total[:, slopes, 0],
+        normal=np.ascontiguousarray(total[:, slopes, slopes]),
+        of_residual=total[:, changes, 0],
+        of_slopes=total[:, slopes, changes],
+        gram=total[:, changes, changes],
+        offset=fit.coordinates,
+        precision=fit.free.sd**-2.0,
+        bounds=fit.free.bounds,
+    )

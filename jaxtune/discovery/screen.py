@@ -8,26 +8,48 @@ size, if the nominal parameters answered it within their bounds and their prior.
 counts in the end, and a pair costs no more simulations than its parts.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 
 from jaxtune.discovery.fit import Fit, taken_over
-from jaxtune.discovery.least_squares import complement
 from jaxtune.discovery.noise_floor import Floor, Say
 from jaxtune.discovery.problem import Hypothesis, Problem, are_distinct
-from jaxtune.discovery.profile import Profile
+from jaxtune.discovery.profile import Changes, Profile, profile_of
 
 _SEGMENTS = 40  # that are simulated: half of them spread over all, half with the largest residuals
 _BATCH = 32  # simulations between two reports of progress
 _BETWEEN = (0.0, 0.25, 0.5, 0.75)  # of the way from a size to the next, where costs are computed
 _VISIBLE = 4.0  # standard deviations
 _PARTNERS = 4  # of a hypothesis that are kept
+_ROUGH = 2  # reweighted solutions with which partners are sorted out
 
-Curves = Mapping[int, tuple[np.ndarray, np.ndarray]]
-"""By axis: sizes [nodes], rising and with zero, and how they change the residuals, [nodes, features]."""
+
+@dataclass(frozen=True)
+class Curves:
+    """How the residuals change with each axis alone."""
+
+    sizes: dict[int, np.ndarray]
+    """By axis: sizes [nodes], rising and with zero."""
+    first: dict[int, int]
+    """By axis: number of its first node in `changes`; the others follow."""
+    changes: np.ndarray
+    """[nodes of all axes, features]"""
+
+    def at(self, hypothesis: Hypothesis, points: np.ndarray) -> Changes:
+        """Interpolates between nodes: how a hypothesis changes the residuals at points [n, parameters]."""
+        coordinates = points @ hypothesis.directions
+        which, weights = [], []
+        # Shape parameters have no curve: they mean nothing without a size.
+        for axis in (int(one) for one in np.flatnonzero((hypothesis.directions != 0).any(axis=0))):
+            if axis not in self.sizes:
+                continue
+            sizes = self.sizes[axis]
+            which.append(self.first[axis] + np.arange(len(sizes)))
+            weights.append(np.stack([np.interp(coordinates[:, axis], sizes, unit) for unit in np.eye(len(sizes))], 1))
+        return Changes(np.concatenate(which), np.concatenate(weights, axis=1))
 
 
 @dataclass(frozen=True)
@@ -73,13 +95,12 @@ def screen(problem: Problem, at: Floor, base: Fit, hypotheses: Sequence[Hypothes
     chosen = spread_segments(at, base)
     some = on_segments(at, base, chosen)
     curves = simulate_curves(problem, at, some, chosen, hypotheses, say)
-    profile = Profile(some)
-    (cost,), _ = profile.costs(np.zeros((1, len(some.residual)), np.float32))
-    firsts = sorted((_best(some, profile, h, curves) for h in hypotheses), key=lambda lead: lead.cost)
-    couples = [pair for lead in firsts[:pairs] for pair in _pairs_with(some, lead, hypotheses, curves)]
-    null_residuals = at.unflatten(_tempered(at).T)[chosen].reshape(len(some.residual), -1).T
-    testable, chance = _seen(some, hypotheses, curves, null_residuals, at.null_coordinates)
-    return Screen(tuple(firsts), _best_pairs(couples), float(cost), testable, chance)
+    say("answers of the nominal parameters")
+    profile = profile_of(some, curves.changes)
+    firsts = sorted((_best(profile, hypothesis, curves) for hypothesis in hypotheses), key=lambda lead: lead.cost)
+    couples = [pair for lead in firsts[:pairs] for pair in _pairs_with(profile, lead, hypotheses, curves)]
+    testable, chance = _seen(some, profile, hypotheses, curves, at, chosen)
+    return Screen(tuple(firsts), _best_pairs(couples), _cost_now(profile), testable, chance)
 
 
 def _tempered(at: Floor) -> np.ndarray:
@@ -148,49 +169,42 @@ def simulate_curves(
             for tree, key in keys:
                 mine = np.ones(len(parts)) if tree is None else parts == tree
                 found[key] = (change.reshape(-1, len(parts)) * mine.astype(np.float32)).ravel()
-    none = np.zeros(len(some.residual), np.float32)
-    return {
-        axis: (
-            np.array(sorted([0.0, *values])),
-            np.stack([found.get((axis, size), none) for size in sorted([0.0, *values])]),
-        )
-        for axis, values in sizes.items()
-    }
+    nodes = {axis: np.array(sorted([0.0, *values])) for axis, values in sizes.items()}
+    keys = [(axis, size) for axis, values in nodes.items() for size in values]
+    changes = np.zeros((len(keys), len(some.residual)), np.float32)
+    for row, key in enumerate(keys):
+        if key in found:
+            changes[row] = found[key]
+    firsts = np.cumsum([0, *(len(values) for values in nodes.values())]).tolist()
+    return Curves(nodes, dict(zip(nodes, firsts, strict=False)), changes)
 
 
-def change_of(hypothesis: Hypothesis, points: np.ndarray, curves: Curves) -> np.ndarray:
-    """Interpolates how a hypothesis changes the residuals at points [n, parameters]; returns [n, features]."""
-    found = 0.0
-    coordinates = points @ hypothesis.directions
-    # Shape parameters have no curve: they mean nothing without a size.
-    for axis in (int(one) for one in np.flatnonzero((hypothesis.directions != 0).any(axis=0)) if int(one) in curves):
-        sizes, values = curves[axis]
-        at = np.clip(coordinates[:, axis], sizes[0], sizes[-1])
-        left = np.clip(np.searchsorted(sizes, at, side="right") - 1, 0, len(sizes) - 2)
-        share = ((at - sizes[left]) / (sizes[left + 1] - sizes[left])).astype(np.float32)[:, None]
-        found = found + (1.0 - share) * values[left] + share * values[left + 1]
-    return found
+def _cost_now(profile: Profile) -> float:
+    """What the model costs as it is, answered by nothing but its own coordinates."""
+    return float(profile.costs(Changes(np.zeros(0, int), np.zeros((1, 0))))[0][0])
 
 
-def _best(some: Fit, profile: Profile, hypothesis: Hypothesis, curves: Curves) -> Lead:
-    """The point at which a hypothesis costs least beside a model, `some` with its profile."""
-    points = _points(some, hypothesis, curves)
-    costs, starts = profile.costs(change_of(hypothesis, points, curves))
+def _best(
+    profile: Profile, hypothesis: Hypothesis, curves: Curves, points: np.ndarray | None = None, reweighted: int = 4
+) -> Lead:
+    """The point, of some or of all that are worth a look, at which a hypothesis costs least beside a model."""
+    points = _points(profile, hypothesis, curves) if points is None else points
+    costs, starts = profile.costs(curves.at(hypothesis, points), reweighted)
     costs = costs + ((points / hypothesis.prior) ** 2).sum(axis=1)
     best = int(np.argmin(costs))
     return Lead((hypothesis,), points[best], starts[best], float(costs[best]))
 
 
-def _points(some: Fit, hypothesis: Hypothesis, curves: Curves) -> np.ndarray:
+def _points(profile: Profile, hypothesis: Hypothesis, curves: Curves) -> np.ndarray:
     """Points [n, parameters] at which a hypothesis is answered: between its sizes, or where its slopes lead to."""
     probes = hypothesis.probes
     several = np.count_nonzero((probes != 0).any(axis=0)) > 1
     if several:
-        slopes = change_of(hypothesis, probes, curves) / np.abs(probes).max(axis=1)[:, None]
-        _, at = Profile(some, slopes.T).costs(np.zeros((1, len(some.residual)), np.float32))
-        points = at[:, len(some.coordinates) :]
-        wanted = np.zeros((1, probes.shape[1]))
-        wanted[:, : points.shape[1]] = points
+        sizes, changes = np.abs(probes).max(axis=1)[:, None], curves.at(hypothesis, probes)
+        directions = replace(changes, weights=changes.weights / sizes)
+        nothing = Changes(np.zeros(0, int), np.zeros((1, 0)))
+        _, at = profile.with_directions(directions).costs(nothing)
+        wanted = at[:, len(profile.offset) :] @ (probes / sizes)
         return np.clip(wanted, *hypothesis.bounds.T)
     sizes = np.array(sorted([0.0, *probes[:, 0]]))
     between = [a + share * (b - a) for a, b in pairwise(sizes) for share in _BETWEEN]
@@ -199,20 +213,20 @@ def _points(some: Fit, hypothesis: Hypothesis, curves: Curves) -> np.ndarray:
     return points[points[:, 0] != 0]
 
 
-def _pairs_with(some: Fit, lead: Lead, hypotheses: Sequence[Hypothesis], curves: Curves) -> list[Lead]:
+def _pairs_with(profile: Profile, lead: Lead, hypotheses: Sequence[Hypothesis], curves: Curves) -> list[Lead]:
     """The best partners of a lead, whose size may still change a little."""
     (first,) = lead.hypotheses
-    change = change_of(first, lead.point[None], curves)[0]
-    further = change_of(first, 1.1 * lead.point[None], curves)[0] - change
-    moved = replace(some, residual=some.residual + change)
-    profile = Profile(moved, further[:, None] if further.any() else None)
+    change, further = curves.at(first, lead.point[None]), curves.at(first, 1.1 * lead.point[None])
+    beside = profile.moved(change)
+    if (further.weights != change.weights).any():
+        beside = beside.with_directions(replace(further, weights=further.weights - change.weights))
+    others = [other for other in hypotheses if are_distinct(first, other)]
+    rough = sorted(others, key=lambda other: _best(beside, other, curves, other.probes, _ROUGH).cost)
     found = []
-    for other in hypotheses:
-        if not are_distinct(first, other):
-            continue
-        best = _best(some, profile, other, curves)
-        point, start = np.concatenate([lead.point, best.point]), best.start[: len(some.coordinates)]
-        found.append(Lead((first, other), point, start, best.cost + ((lead.point / first.prior) ** 2).sum()))
+    for best in (_best(beside, other, curves) for other in rough[: 3 * _PARTNERS]):
+        point, start = np.concatenate([lead.point, best.point]), best.start[: len(profile.offset)]
+        cost = best.cost + ((lead.point / first.prior) ** 2).sum()
+        found.append(Lead((first, *best.hypotheses), point, start, cost))
     return sorted(found, key=lambda pair: pair.cost)[:_PARTNERS]
 
 
@@ -225,35 +239,34 @@ def _best_pairs(pairs: Sequence[Lead]) -> tuple[Lead, ...]:
 
 
 def _seen(
-    some: Fit,
-    hypotheses: Sequence[Hypothesis],
-    curves: Curves,
-    null_residuals: np.ndarray,
-    null_coordinates: np.ndarray,
+    some: Fit, profile: Profile, hypotheses: Sequence[Hypothesis], curves: Curves, at: Floor, chosen: np.ndarray
 ) -> tuple[frozenset[str], np.ndarray]:
-    """Names of the effects that these logs could show, and the largest gain [logs] that each null log gives any."""
-    root, prior = np.sqrt(some.counts.independent), np.diag(1.0 / some.free.sd)
-    slopes = np.concatenate([root * some.jacobian, prior])
-    # Many hypotheses share what they take over, mostly nothing.
-    taken = {hypothesis.key: taken_over(some.free, hypothesis) for hypothesis in hypotheses}
-    masks = {mask.tobytes(): mask for mask in taken.values()}
-    projections = {key: complement(slopes[:, ~mask]) for key, mask in masks.items()}
-    padded = lambda rows: np.pad(root * rows, ((0, 0), (0, len(prior)))).T  # noqa: E731
+    """Names of the effects that these logs could show, and the largest gain [logs] that each null log gives any.
+
+    Both are seen at the weights of the noise floor, after what is free has answered.
+    """
+    share = some.counts.independent
+    null_residuals = at.unflatten(_tempered(at).T)[chosen].reshape(len(some.residual), -1)
     # Nominal parameters that were fitted pull against their prior as hard as the residuals do.
     # Beside a model with effects nobody asks what chance gains.
-    alike = null_coordinates.shape[1] == len(prior)
-    pulls = null_coordinates / some.free.sd if alike else np.zeros((len(null_coordinates), len(prior)))
-    values = np.concatenate([root * null_residuals, pulls], axis=1).T
-    left = {key: project(values) for key, project in projections.items()}
-    seen, chance = set(), np.zeros(len(null_residuals))
+    alike = at.null_coordinates.shape[1] == len(profile.offset)
+    pulls = at.null_coordinates.T * profile.precision[:, None] if alike else 0.0
+    of_logs, of_slopes = share * (curves.changes @ null_residuals), share * (some.jacobian.T @ null_residuals) + pulls
+    gram, mixed = share * profile.gram.sum(axis=0), share * profile.of_slopes.sum(axis=0)
+    normal = share * profile.normal.sum(axis=0) + np.diag(profile.precision)
+    seen, chance = set(), np.zeros(null_residuals.shape[1])
     for hypothesis in hypotheses:
-        project, logs = (found[taken[hypothesis.key].tobytes()] for found in (projections, left))
-        mine = project(padded(change_of(hypothesis, hypothesis.probes, curves)))
-        length = np.sqrt((mine**2).sum(axis=0))
+        free = ~taken_over(some.free, hypothesis)
+        changes = curves.at(hypothesis, hypothesis.probes)
+        which, weights = changes.which, changes.weights
+        pull = mixed[free][:, which] @ weights.T
+        answer = np.linalg.solve(normal[free][:, free], pull)
+        left = np.einsum("ns,st,nt->n", weights, gram[which[:, None], which], weights) - (pull * answer).sum(axis=0)
+        length = np.sqrt(np.maximum(left, 0.0))
         sizes = np.abs(hypothesis.probes).max(axis=1)
         if length[np.argmin(sizes)] >= _VISIBLE:
             seen.add(hypothesis.name)
-        falls = mine.T @ logs / np.maximum(length, 1e-9)[:, None]
+        falls = (weights @ of_logs[which] - answer.T @ of_slopes[free]) / np.maximum(length, 1e-3)[:, None]
         chance = np.maximum(chance, (np.minimum(falls, 0.0) ** 2).max(axis=0))
     return frozenset(seen), chance
 

@@ -9,7 +9,7 @@ from slider import AXES, HYPOTHESES, problem
 from jaxtune.discovery import noise_floor, state
 from jaxtune.discovery.fit import Fit, Free
 from jaxtune.discovery.least_squares import Counts
-from jaxtune.discovery.profile import Profile
+from jaxtune.discovery.profile import Changes, profile_of
 from jaxtune.discovery.screen import screen
 
 
@@ -48,7 +48,7 @@ def test_a_profile_is_no_dearer_than_any_answer_within_bounds(seed):
     rng = np.random.default_rng(seed)
     fit = fit_of(rng)
     change = 3.0 * rng.normal(size=(1, len(fit.residual)))
-    (cost,), (at,) = Profile(fit).costs(change)
+    (cost,), (at,) = profile_of(fit, change).costs(Changes(np.arange(1), np.ones((1, 1))))
 
     def cost_at(coordinates):
         residual = fit.residual + change[0] + fit.jacobian @ (coordinates - fit.coordinates)
@@ -59,11 +59,30 @@ def test_a_profile_is_no_dearer_than_any_answer_within_bounds(seed):
     assert cost <= min(cost_at(at + 0.3 * rng.normal(size=3)) for _ in range(200)) + 1e-3
 
 
+def test_a_moved_profile_is_the_profile_of_the_moved_model():
+    rng = np.random.default_rng(0)
+    fit = fit_of(rng)
+    library = rng.normal(size=(3, len(fit.residual)))
+    change = Changes(np.array([0, 2]), np.array([[0.5, -1.0]]))
+    direction, other = Changes(np.array([1]), np.ones((1, 1))), Changes(np.array([2]), rng.normal(size=(4, 1)))
+    wide = Free(np.eye(4), np.array([1.0, 1, 1, 1e6]), np.tile([-9.0, 9], (4, 1)), np.ones(4, bool))
+    grown = replace(
+        fit,
+        free=replace(wide, bounds=np.array([[-3.0, 3]] * 3 + [[-1e9, 1e9]])),
+        coordinates=np.append(fit.coordinates, 0.0),
+        residual=fit.residual + 0.5 * library[0] - library[2],
+        jacobian=np.column_stack([fit.jacobian, library[1]]),
+    )
+    found = profile_of(fit, library).moved(change).with_directions(direction).costs(other)
+    for mine, want in zip(found, profile_of(grown, library).costs(other), strict=True):
+        np.testing.assert_allclose(mine, want, rtol=1e-5, atol=1e-6)
+
+
 def test_a_profile_keeps_bounds():
     fit = fit_of(np.random.default_rng(0))
     fit = replace(fit, free=replace(fit.free, sd=np.full(3, 100.0)))
     change = -50.0 * fit.jacobian[:, :1].T
-    _, at = Profile(fit).costs(change)
+    _, at = profile_of(fit, change).costs(Changes(np.arange(1), np.ones((1, 1))))
     assert (np.abs(at) <= 3.0 + 1e-6).all()
     assert at[0, 0] == pytest.approx(3.0)
 
