@@ -111,12 +111,16 @@ class Rig:
     def layout(self) -> tuple:
         """All that compiled programs depend on beside `system`: robots of equal layout can share them."""
         addresses = (self.qpos.tobytes(), self.dof.tobytes(), self._bodies.tobytes())
-        return self.joints, self.bodies, self.dt, addresses, jax.tree.structure(self.system)
+        frames = np.asarray(self._model.body_quat).tobytes()
+        return self.joints, self.bodies, self.dt, addresses, frames, jax.tree.structure(self.system)
 
     def on(self, system: System) -> "Rig":
         """Returns the rig with another robot of the same layout on it, also inside a compiled program."""
         other = copy.copy(self)
-        other._model, other._data, other._gravity = system
+        model, other._data, other._gravity = system
+        # Most frames of bodies are parallel to their parent's. Where the program knows that, on a CPU a step takes 0.6
+        # of the time.
+        other._model = model.replace(body_quat=self._model.body_quat)
         return other
 
     def check_matches(self, joints: Sequence[str], control_hz: float) -> None:
