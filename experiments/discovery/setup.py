@@ -157,6 +157,7 @@ def build_question(
         timing=timing,
         timing_bounds=timing_bounds,
         trees=rig.trees,
+        axis_trees=np.array([_one_tree(rig.trees[list(axis.joints)]) for axis in rig.axes]),
         data=measured,
         null_logs=nulls,
         bin_rows=segments.rows_together(1.0 / log.rate_hz, BIN_S),
@@ -167,6 +168,11 @@ def build_question(
     )
     names = {split: tuple(run.name for run in runs) for split, runs in splits(log).items()}
     return Question(problem, rig, names, (*log.notes, *notes, *_stale_notes(unsealed)))
+
+
+def _one_tree(trees: np.ndarray) -> int:
+    """The kinematic tree of some joints, or -1 where they are of several or none are given."""
+    return int(trees[0]) if len(set(trees.tolist())) == 1 else -1
 
 
 def _checked_rate(log: Log, least_s: float) -> float:

@@ -142,15 +142,12 @@ def polish(fits: Sequence[Fit], evaluate: Evaluate, rounds: int) -> list[Fit]:
 def with_slopes(fits: Sequence[Fit], which: Sequence[np.ndarray], evaluate: Evaluate) -> list[Fit]:
     """Takes the slopes of some coordinates, `which` [coordinates] of every fit, as secants where the fits stand."""
     steps = [_secant_step(fit) for fit in fits]
-    groups = [
-        (fit.coordinates + np.diag(step)[mine]) @ fit.free.directions
-        for fit, mine, step in zip(fits, which, steps, strict=True)
-    ]
-    found = np.split(evaluate(np.concatenate(groups)), np.cumsum([len(group) for group in groups])[:-1])
+    moves = [step[mine, None] * fit.free.directions[mine] for fit, mine, step in zip(fits, which, steps, strict=True)]
+    found = evaluate.changes([fit.vector for fit in fits], [fit.residual for fit in fits], moves)
     fresh = []
-    for fit, mine, step, moved in zip(fits, which, steps, found, strict=True):
+    for fit, mine, step, changes in zip(fits, which, steps, found, strict=True):
         jacobian = fit.jacobian.copy()
-        jacobian[:, mine] = np.nan_to_num((moved - fit.residual) / step[mine, None], posinf=0.0, neginf=0.0).T
+        jacobian[:, mine] = (changes / step[mine, None]).T
         fresh.append(replace(fit, jacobian=jacobian))
     return fresh
 

@@ -109,8 +109,8 @@ def torque_slopes(problem: Problem, at: Floor, fit: Fit) -> np.ndarray:
     """
     directions = np.zeros((len(problem.push), problem.axes))
     directions[np.arange(len(directions)), list(problem.push.values())] = _PUSH
-    slopes = (at.residuals["train"](fit.vector + directions) - fit.residual).T
-    return at.unflatten(slopes).reshape(-1, at.scale["train"].size, len(directions))
+    (slopes,) = at.residuals["train"].changes([fit.vector], [fit.residual], [directions])
+    return at.unflatten(slopes.T).reshape(-1, at.scale["train"].size, len(directions))
 
 
 def free_torque(residual: np.ndarray, slopes: np.ndarray, penalty: float) -> np.ndarray:

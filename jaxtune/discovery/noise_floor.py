@@ -18,7 +18,7 @@ import numpy as np
 from jaxtune.discovery.fit import Free
 from jaxtune.discovery.least_squares import Counts, Linear
 from jaxtune.discovery.problem import Problem, Segments
-from jaxtune.discovery.simulation import Evaluate, flat_residuals, paired_residuals, residuals
+from jaxtune.discovery.simulation import Evaluate, paired_residuals
 
 FURTHEST = 3.0
 """Prior standard deviations that a nominal parameter may move. One that stops there is a finding, not a nuisance."""
@@ -60,9 +60,9 @@ class Floor:
     def slopes(self) -> np.ndarray:
         """Secants along the prior directions from the nominal model on `train`, [features, directions], simulated at
         the first use."""
-        nominal = np.zeros((1, self.prior.directions.shape[1]))
-        found = self.residuals["train"](np.concatenate([nominal, self.prior.directions]))
-        return (found[1:] - found[:1]).T
+        evaluate, nominal = self.residuals["train"], np.zeros(self.prior.directions.shape[1])
+        (found,) = evaluate.changes([nominal], evaluate(nominal[None]), [self.prior.directions])
+        return found.T
 
     def unflatten(self, flat: np.ndarray) -> np.ndarray:
         """Reshapes flat residuals [features, ...], which fits work on, to [segments, bins, components, ...]."""
@@ -121,8 +121,7 @@ def measure(problem: Problem, say: Say) -> NoiseFloor:
                 components=unit.shape[-1], independent=independent_share(in_units.reshape(-1, *in_units.shape[2:]))
             ),
             residuals={
-                split: partial(flat_residuals, problem, segments[split], scale[split], shared[split])
-                for split in problem.data
+                split: Evaluate(problem, segments[split], scale[split], shared[split]) for split in problem.data
             },
             on_some=partial(_on_some, problem, segments["train"], scale["train"], shared["train"]),
             prior=prior,
@@ -171,9 +170,10 @@ def _fit_null_logs(problem: Problem, prior: Free, train: Segments) -> tuple[np.n
     """
     logs, main = len(problem.null_logs), problem.main_horizon
     measured = problem.data["train"][main]
-    nominal = np.zeros((1, problem.axes))
-    found = residuals(problem, np.concatenate([nominal, prior.directions]), measured)
-    slopes = np.moveaxis(found[1:] - found[:1], 0, -1)
+    simulate = Evaluate(problem, measured, np.ones(1), np.zeros(1))
+    nominal = np.zeros(problem.axes)
+    (found,) = simulate.changes([nominal], simulate(nominal[None]), [prior.directions])
+    slopes = np.moveaxis(found.reshape(len(found), len(measured.run), -1, len(problem.cells)), 0, -1)
     which = np.repeat(np.arange(logs), len(train.run) // logs)
     coordinates, share = np.zeros((logs, len(prior.sd))), 1.0
     for number in range(_STEPS):
@@ -246,4 +246,4 @@ def _on_some(
         run=segments.run[chosen],
         regimes=segments.regimes[chosen],
     )
-    return partial(flat_residuals, problem, some, scale, shared[chosen])
+    return Evaluate(problem, some, scale, shared[chosen])

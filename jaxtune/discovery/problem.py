@@ -114,6 +114,8 @@ class Problem:
     trees: np.ndarray
     """[joints]: number of the kinematic tree that each joint is in; joints of different trees do not move each
     other."""
+    axis_trees: np.ndarray
+    """[axes]: number of the tree whose joints an axis moves; -1 where it may move several."""
     values: Callable[[np.ndarray], np.ndarray] = lambda vectors: vectors
     """Turns coordinates [n, axes] into what the simulator is given, [n, axes]."""
     push: Mapping[str, int] = field(default_factory=dict)
@@ -135,6 +137,12 @@ class Problem:
     def cells(self) -> list[tuple[str, str]]:
         """Signal and component (such as a joint) of every column of the residuals, in the columns' order."""
         return [(signal, part) for signal in sorted(self.components) for part in self.components[signal]]
+
+    @property
+    def cell_trees(self) -> np.ndarray:
+        """[cells] number of the tree of every column of the residuals; -1 for one that belongs to no joint."""
+        joints = self.components["q"]
+        return np.array([self.trees[joints.index(part)] if part in joints else -1 for _, part in self.cells])
 
     def is_nominal(self, hypothesis: Hypothesis) -> bool:
         """Says whether a hypothesis is about parameters that the nominal model has.

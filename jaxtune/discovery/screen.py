@@ -16,11 +16,10 @@ import numpy as np
 
 from jaxtune.discovery.fit import Fit, taken_over
 from jaxtune.discovery.noise_floor import Floor, Say
-from jaxtune.discovery.problem import Hypothesis, Problem, are_distinct
+from jaxtune.discovery.problem import Hypothesis, are_distinct
 from jaxtune.discovery.profile import Changes, Profile, profile_of
 
 _SEGMENTS = 40  # that are simulated: half of them spread over all, half with the largest residuals
-_BATCH = 32  # simulations between two reports of progress
 _BETWEEN = (0.0, 0.25, 0.5, 0.75)  # of the way from a size to the next, where costs are computed
 _VISIBLE = 4.0  # standard deviations
 _PARTNERS = 4  # of a hypothesis that are kept
@@ -81,11 +80,10 @@ class Screen:
     """[logs]: fall of the cost that the best hypothesis reaches on each null log."""
 
 
-def screen(problem: Problem, at: Floor, base: Fit, hypotheses: Sequence[Hypothesis], *, pairs: int, say: Say) -> Screen:
+def screen(at: Floor, base: Fit, hypotheses: Sequence[Hypothesis], *, pairs: int, say: Say) -> Screen:
     """Screens hypotheses beside a model.
 
     Args:
-      problem: the simulator.
       at: the floor at the main horizon.
       base: the model, fitted or nominal, with slopes of all that is free in it.
       hypotheses: what may join it.
@@ -94,7 +92,7 @@ def screen(problem: Problem, at: Floor, base: Fit, hypotheses: Sequence[Hypothes
     """
     chosen = spread_segments(at, base)
     some = on_segments(at, base, chosen)
-    curves = simulate_curves(problem, at, some, chosen, hypotheses, say)
+    curves = simulate_curves(at, some, chosen, hypotheses, say)
     say("answers of the nominal parameters")
     profile = profile_of(some, curves.changes)
     firsts = sorted((_best(profile, hypothesis, curves) for hypothesis in hypotheses), key=lambda lead: lead.cost)
@@ -127,16 +125,10 @@ def on_segments(at: Floor, fit: Fit, chosen: np.ndarray) -> Fit:
     return replace(fit, residual=residual, jacobian=jacobian)
 
 
-def simulate_curves(
-    problem: Problem, at: Floor, some: Fit, chosen: np.ndarray, hypotheses: Sequence[Hypothesis], say: Say
-) -> Curves:
+def simulate_curves(at: Floor, some: Fit, chosen: np.ndarray, hypotheses: Sequence[Hypothesis], say: Say) -> Curves:
     """Simulates every axis of the hypotheses alone, at a few sizes.
 
-    Joints of different kinematic trees do not move each other, since the base is fixed. So an axis of each tree is
-    simulated at a time.
-
     Args:
-      problem: the simulator.
       at: the floor at the main horizon.
       some: the model, on the chosen segments.
       chosen: indices of the segments of `train`.
@@ -146,35 +138,15 @@ def simulate_curves(
     Returns:
       Curves; zero where a simulation is not finite.
     """
-    evaluate, sizes = at.on_some(chosen), _sizes(hypotheses)
-    trees = _trees(problem, hypotheses)
-    parts = np.array([_part_tree(problem, part) for _, part in problem.cells])
-    queues: dict[int | None, list[tuple[int, float]]] = {}
-    for axis, values in sizes.items():
-        queues.setdefault(trees.get(axis), []).extend((axis, size) for size in values)
-    alone = [((None, key),) for key in queues.pop(None, [])]
-    longest = max((len(queue) for queue in queues.values()), default=0)
-    packed = [tuple((tree, queue[i]) for tree, queue in queues.items() if i < len(queue)) for i in range(longest)]
-    found: dict[tuple[int, float], np.ndarray] = {}
-    every = [*alone, *packed]
-    for start in range(0, len(every), _BATCH):
-        say(f"screen {start}/{len(every)}")
-        batch = every[start : start + _BATCH]
-        vectors = np.tile(some.vector, (len(batch), 1))
-        for row, keys in enumerate(batch):
-            for _, (axis, size) in keys:
-                vectors[row, axis] += size
-        moved = np.nan_to_num(evaluate(vectors) - some.residual, posinf=0.0, neginf=0.0).astype(np.float32)
-        for keys, change in zip(batch, moved, strict=True):
-            for tree, key in keys:
-                mine = np.ones(len(parts)) if tree is None else parts == tree
-                found[key] = (change.reshape(-1, len(parts)) * mine.astype(np.float32)).ravel()
-    nodes = {axis: np.array(sorted([0.0, *values])) for axis, values in sizes.items()}
+    nodes = {axis: np.array(sorted([0.0, *values])) for axis, values in _sizes(hypotheses).items()}
     keys = [(axis, size) for axis, values in nodes.items() for size in values]
-    changes = np.zeros((len(keys), len(some.residual)), np.float32)
-    for row, key in enumerate(keys):
-        if key in found:
-            changes[row] = found[key]
+    moves = np.zeros((len(keys), len(some.vector)))
+    for move, (axis, size) in zip(moves, keys, strict=True):
+        move[axis] = size
+    moved, changes = (moves != 0).any(axis=1), np.zeros((len(keys), len(some.residual)), np.float32)
+    (changes[moved],) = at.on_some(chosen).changes(
+        [some.vector], [some.residual], [moves[moved]], lambda done, count: say(f"screen {done}/{count}")
+    )
     firsts = np.cumsum([0, *(len(values) for values in nodes.values())]).tolist()
     return Curves(nodes, dict(zip(nodes, firsts, strict=False)), changes)
 
@@ -282,20 +254,3 @@ def _sizes(hypotheses: Sequence[Hypothesis]) -> dict[int, list[float]]:
         for axis, sizes in mine.items():
             found.setdefault(axis, sizes)
     return {axis: sorted(sizes) for axis, sizes in found.items()}
-
-
-def _trees(problem: Problem, hypotheses: Sequence[Hypothesis]) -> dict[int, int]:
-    """The kinematic tree of every axis whose effect stays within one; others are left out."""
-    found = {}
-    for hypothesis in hypotheses:
-        trees = {int(problem.trees[joint]) for joint in hypothesis.joints}
-        if len(hypothesis.places) == 1 and len(trees) == 1:
-            for axis in np.flatnonzero((hypothesis.directions != 0).any(axis=0)):
-                found[int(axis)] = next(iter(trees))
-    return found
-
-
-def _part_tree(problem: Problem, part: str) -> int:
-    """The kinematic tree of a component of a signal; -1 for one that belongs to no joint."""
-    joints = problem.components["q"]
-    return int(problem.trees[joints.index(part)]) if part in joints else -1

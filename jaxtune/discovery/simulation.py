@@ -1,7 +1,9 @@
 """Many simulations at once: residuals of many vectors on many segments, on all devices."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
+from itertools import zip_longest
 from typing import Any
 
 import jax
@@ -14,8 +16,89 @@ from jaxtune.discovery.problem import Problem, Segments, Simulate
 _WIDTH = 64  # simulations that a device runs side by side
 _CHUNKS = 16  # how many such chunks one call of the compiled program takes at most
 
-Evaluate = Callable[[np.ndarray], np.ndarray]
-"""`evaluate(vectors [n, axes]) -> residuals [n, features]`, in floor units. Features: (segment, bin, component)."""
+_BATCH = 32  # vectors between two reports of progress
+
+Progress = Callable[[int, int], None]
+"""Told how many of how many vectors were simulated."""
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Simulates vectors on some segments: `evaluate(vectors [n, axes])` returns residuals [n, features].
+
+    Residuals are in floor units. A feature is a (segment, bin, component).
+    """
+
+    problem: Problem
+    segments: Segments
+    scale: np.ndarray
+    """[bins, components] the noise floor that residuals are divided by."""
+    shared: np.ndarray
+    """[segments, bins, components] what a model that lacks nothing leaves, which is subtracted."""
+
+    def __call__(self, vectors: np.ndarray) -> np.ndarray:
+        """Simulates vectors; not finite where the simulation is not."""
+        found = residuals(self.problem, vectors, self.segments)
+        return ((found - self.shared) / self.scale).reshape(len(vectors), -1)
+
+    def changes(
+        self,
+        vectors: Sequence[np.ndarray],
+        residual: Sequence[np.ndarray],
+        moves: Sequence[np.ndarray],
+        progress: Progress = lambda done, count: None,
+    ) -> list[np.ndarray]:
+        """Simulates moves away from some vectors, each alone.
+
+        Moves of different kinematic trees are simulated at a time, since the base is fixed.
+
+        Args:
+          vectors: [axes] each.
+          residual: of the vectors, [features] each.
+          moves: [moves, axes] away from each vector.
+          progress: told after every batch.
+
+        Returns:
+          For every vector how its residuals change with each of its moves, [moves, features]; zero where the simulation
+          is not finite.
+        """
+        packs = [_packs(self.problem, mine) for mine in moves]
+        owner = np.repeat(np.arange(len(packs)), [len(mine) for mine in packs])
+        every = [pack for mine in packs for pack in mine]
+        parts = self.problem.cell_trees
+        found = [np.zeros((len(mine), len(one)), np.float32) for mine, one in zip(moves, residual, strict=True)]
+        while every:
+            broken = []
+            for start in range(0, len(every), _BATCH):
+                progress(start, len(every))
+                batch = range(start, min(start + _BATCH, len(every)))
+                simulated = self(np.stack([vectors[owner[i]] + moves[owner[i]][every[i]].sum(axis=0) for i in batch]))
+                for i, values in zip(batch, simulated, strict=True):
+                    if not np.isfinite(values).all():
+                        # One of them broke it; the others may not.
+                        broken += [(owner[i], [move]) for move in every[i] if len(every[i]) > 1]
+                        continue
+                    change = (values - residual[owner[i]]).reshape(-1, len(parts))
+                    for move in every[i]:
+                        tree = _tree_of(self.problem, moves[owner[i]][move])
+                        found[owner[i]][move] = np.where((parts == tree) | (tree < 0), change, 0.0).ravel()
+            owner, every = [one for one, _ in broken], [pack for _, pack in broken]
+        return found
+
+
+def _packs(problem: Problem, moves: np.ndarray) -> list[list[int]]:
+    """Numbers of moves [n, axes] that can be simulated together: one of each kinematic tree."""
+    queues: dict[int, list[int]] = {}
+    for number, move in enumerate(moves):
+        queues.setdefault(_tree_of(problem, move), []).append(number)
+    alone = [[number] for number in queues.pop(-1, [])]
+    return alone + [[n for n in row if n is not None] for row in zip_longest(*queues.values())]
+
+
+def _tree_of(problem: Problem, move: np.ndarray) -> int:
+    """The kinematic tree that a move [axes] stays within, or -1."""
+    trees = set(problem.axis_trees[move != 0].tolist())
+    return trees.pop() if len(trees) == 1 else -1
 
 
 def residuals(problem: Problem, vectors: np.ndarray, segments: Segments, width: int = _WIDTH) -> np.ndarray:
@@ -77,24 +160,6 @@ def paired_residuals(
         flat = np.asarray(predicted).reshape(once, *predicted.shape[2:])
         found.append(flat[:count, : measured.shape[1]])
     return measured[piece] - np.concatenate(found)
-
-
-def flat_residuals(
-    problem: Problem, segments: Segments, scale: np.ndarray, shared: np.ndarray, vectors: np.ndarray
-) -> np.ndarray:
-    """Simulates vectors and returns residuals over a scale, flat; with all but the vectors given it is an `Evaluate`.
-
-    Args:
-      problem: the simulator.
-      segments: what was measured.
-      scale: [bins, components] the noise floor that residuals are divided by.
-      shared: [segments, bins, components] what a model that lacks nothing leaves, which is subtracted.
-      vectors: [n, axes] coordinates.
-
-    Returns:
-      [n, features] in floor units.
-    """
-    return ((residuals(problem, vectors, segments) - shared) / scale).reshape(len(vectors), -1)
 
 
 def binned(signals: Mapping[str, Any], rows: int):

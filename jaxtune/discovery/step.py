@@ -68,7 +68,7 @@ def step(
         for h in problem.hypotheses
         if all(h.key != other.key and are_distinct(h, other) for other in state.best.hypotheses)
     ]
-    found = screen(problem, at, base, free, pairs=0 if state.screened else settings.firsts, say=say)
+    found = screen(at, base, free, pairs=0 if state.screened else settings.firsts, say=say)
     state = state.with_screen(settings, problem, found)
     leads = shortlist(settings, found, state.price)
     say(f"fit {len(leads)}")

@@ -102,6 +102,7 @@ def problem(truth, seed=0, hypotheses=HYPOTHESES):
         timing=np.zeros((0, len(AXES))),
         timing_bounds=np.zeros((0, 2)),
         trees=np.array([0]),
+        axis_trees=np.zeros(len(AXES), int),
         data={split: measured(truth, 10 * seed + i, i) for i, split in enumerate(splits)},
         null_logs=null_logs,
         bin_rows=2,

@@ -17,7 +17,7 @@ def screened(truth, pairs=0):
     asked = problem(truth)
     floor, begun = state.begin(asked, noise_floor.measure(asked, lambda text: None))
     at = floor[asked.main_horizon]
-    return screen(asked, at, begun.nominal, HYPOTHESES, pairs=pairs, say=lambda text: None)
+    return screen(at, begun.nominal, HYPOTHESES, pairs=pairs, say=lambda text: None)
 
 
 def test_the_best_lead_is_what_is_hidden_at_about_its_size():
