@@ -99,14 +99,15 @@ class Chain:
         motor = joint.at[0].add(self.ahead(memory)[0])
         memory, (torque, read) = self.drive(values, memory, motor, x, rotor * data.qacc[self.dof], rotor)
         now = self._now(x, joint, jnp.maximum(jnp.abs(torque), jnp.abs(bias)), model, data)
-        # Effects of friction and of forces from outside have no memory.
+        # Effects of friction and of forces from outside have no memory, but bristles have.
         friction, _ = self.stage("friction", values, model.dof_frictionloss[self.dof], now, memory)
         calm = Wrench(torque=jnp.zeros(len(self.dof)), force=jnp.zeros((len(self.bodies), 3)))
         wrench, _ = self.stage("wrench", values, calm, now, memory)
+        (friction, rubbing), memory = self.stage("bristle", values, jnp.stack([friction, wrench.torque]), now, memory)
         friction = jnp.maximum(friction, MIN_FRICTION_NM)
         moved = model.replace(dof_frictionloss=model.dof_frictionloss.at[self.dof].set(friction))
         data = data.replace(
-            qfrc_applied=data.qfrc_applied.at[self.dof].set(torque + wrench.torque),
+            qfrc_applied=data.qfrc_applied.at[self.dof].set(torque + rubbing),
             xfrc_applied=data.xfrc_applied.at[self.bodies, :3].set(wrench.force),
         )
         return mjx.step(moved, data), memory, read
@@ -175,6 +176,7 @@ class Chain:
         torque = self._law(x, x["target"] - state[0], state[1])
         # What reaches each of these stages in steady state, other effects left aside.
         signals = {"command": x["target"], "sensor": state, "torque": torque, "transmission": torque}
+        signals["bristle"] = jnp.zeros_like(state)
         memory = {"held": torque}
         for stage, signal in signals.items():
             for row in self.entering(stage):
@@ -216,6 +218,9 @@ class Chain:
         none = jnp.zeros_like(held)
         free = {"stiffness": none, "damping": none} if rotor is None else {"rotor": rotor}
         now = now.replace(carried=carried, measured=rotor is None, **free)
+        if rotor is None:
+            # Measured motion winds up the bristles as simulated motion does.
+            _, memory = self.stage("bristle", values, jnp.zeros_like(motor), now, memory)
         running = self.ahead(memory)[1]
         # Back electromotive force acts continuously, so it is not part of the held torque.
         torque, memory = self.stage("transmission", values, torque - x["emf"] * motor[1], now, memory)

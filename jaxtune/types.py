@@ -165,6 +165,16 @@ class Parameter:
         return value / scale
 
 
+@dataclass(frozen=True)
+class Form:
+    """Another form of an effect: one parameter more, which is free only after the effect was found."""
+
+    name: str
+    effect: str
+    """Row that has the parameter: the effect itself, or another one that acts beside it at the same places."""
+    parameter: str
+
+
 @dataclass(frozen=True, kw_only=True)
 class Effect:
     """A physical effect that a model may lack, such as friction, delay or play: one row of the discovery library.
@@ -182,7 +192,19 @@ class Effect:
     name: str
     family: str
     """Group of related effects, such as those of the actuator."""
-    enters: Literal["model", "command", "error", "torque", "transmission", "friction", "wrench", "sensor", "gravity"]
+    enters: Literal[
+        "model",
+        "command",
+        "error",
+        "speed",
+        "torque",
+        "transmission",
+        "friction",
+        "bristle",
+        "wrench",
+        "sensor",
+        "gravity",
+    ]
     """Stage at which it acts: the model, or a signal from the commanded target to the sensor."""
     on: Literal["joint", "body", "foot", "robot"]
     """Kind of place that has values of its own."""
@@ -202,5 +224,7 @@ class Effect:
     undo: Callable[..., Any] | None = None
     """For a sensor effect, `undo(values, readings, dt) -> truth`: recovers true positions and velocities from recorded
     ones, [time, 2, joints]."""
+    forms: tuple[Form, ...] = ()
+    """Other forms that it may have."""
     needs: Literal["", "free", "gravity"] = ""
     """What the log must offer: a robot with a free base, or a recorded gravity vector."""

@@ -7,7 +7,7 @@ a joint; `now` is `envs.chain.Now`. The stages act in the order of this drawing,
 of their rows:
 
     target -command-> -error-> controller -torque-> motor -transmission-> joint -sensor-> readings
-                                                   friction, wrench --^
+                                          friction, bristle, wrench --^
 
 Values of zero leave the signal unchanged, so an effect is absent where its values are zero. That is why limits and
 stiffnesses enter `act` as reciprocals, and ratios as logarithms.
@@ -18,6 +18,7 @@ name, or in units of its `scale` where it has one; logarithms for ratios, recipr
 
 from envs.effects import actuator, contact, external, inertia, joint_friction, nominal, sensing, transmission
 from envs.effects.learned import LEARNED
+from envs.effects.presliding import PRESLIDING
 
 LIBRARY = {
     row.name: row
@@ -29,5 +30,5 @@ LIBRARY = {
 NOMINAL = {row.name: row for row in nominal.ROWS}
 """Rows that are fitted under every hypothesis and cannot be named as missing, by name."""
 
-EVERY = {**NOMINAL, **LIBRARY, LEARNED.name: LEARNED}
+EVERY = {**NOMINAL, **LIBRARY, PRESLIDING.name: PRESLIDING, LEARNED.name: LEARNED}
 """All rows, in the order in which they act."""

@@ -8,7 +8,7 @@ separates it from the others.
 import jax.numpy as jnp
 
 from envs.effects.memory import as_it_is, delay_line, delayed, lagged
-from jaxtune.types import Effect, Parameter
+from jaxtune.types import Effect, Form, Parameter
 
 _ACTUATOR = {"family": "actuator", "on": "joint"}
 
@@ -20,11 +20,19 @@ def _torque_scale(values, torque, now, memory):
 
 
 def _torque_limit(values, torque, now, memory):
-    """torque' = clip(torque, -limit, limit); `values` hold 1 / limit, which is zero where there is none."""
+    """torque' = clip(torque, -limit, limit); `values` hold 1 / limit, which is zero where there is none.
+
+    A soft limit is torque / (1 + |torque / limit|^n)^(1 / n) with n = 1 / softness.
+    """
     del now
     # A reciprocal of zero becomes a limit that no motor reaches, without a division by zero.
     limit = 1.0 / jnp.maximum(values["torque_nm"], 1e-9)
-    return jnp.clip(torque, -limit, limit), memory
+    hard = jnp.clip(torque, -limit, limit)
+    softness = jnp.maximum(values["softness"], _HARDEST)
+    # Of the larger of both, so that no power overflows: with share = smaller / larger it is a factor next to one.
+    share = jnp.minimum(jnp.abs(torque), limit) / jnp.maximum(jnp.maximum(jnp.abs(torque), limit), 1e-9)
+    soft = hard * (1.0 + share ** (1.0 / softness)) ** -softness
+    return jnp.where(values["softness"] > 0, soft, hard), memory
 
 
 def _torque_speed(values, torque, now, memory):
@@ -69,6 +77,7 @@ def _torque_lag(values, torque, now, memory):
     return lagged(memory, torque, values["seconds"], now.dt)
 
 
+_HARDEST = 0.02  # softness below which powers leave single precision
 _SECONDS = Parameter(name="seconds", bounds=(0.0, 0.04), prior=0.01)  # `memory.LONGEST_S` at most
 
 # The order counts within a stage: targets are delayed before they are slewed, torques limited before they lag.
@@ -128,8 +137,12 @@ ROWS = (
     Effect(
         name="torque_limit",
         enters="torque",
-        parameters=(Parameter(name="torque_nm", form="reciprocal", scale="torque", bounds=(0.0, 3.0), prior=0.3),),
+        parameters=(
+            Parameter(name="torque_nm", form="reciprocal", scale="torque", bounds=(0.0, 3.0), prior=0.3),
+            Parameter(name="softness", bounds=(0.0, 1.0), prior=0.3),
+        ),
         sizes=(0.25, 0.6),
+        forms=(Form("soft", "torque_limit", "softness"),),
         act=_torque_limit,
         sentence="The motor's torque has a limit that the model does not know.",
         excited_by="saturating steps",

@@ -7,9 +7,12 @@ can stick, which a torque computed from its speed could not make it do.
 
 import jax.numpy as jnp
 
-from jaxtune.types import Effect, Parameter
+from jaxtune.types import Effect, Form, Parameter
 
 _JOINT_FRICTION = {"family": "joint_friction", "on": "joint"}
+_PRESLIDING = Form("presliding", "presliding", "travel_rad")
+# While a joint slides, friction that differs between directions is symmetric friction and a constant torque.
+_DIRECTION = Form("direction_dependent", "constant_push", "nm")
 
 
 def _coulomb(values, bound, now, memory):
@@ -35,6 +38,7 @@ ROWS = (
         parameters=(Parameter(name="torque_nm", scale="torque", bounds=(0.0, 5.0), prior=0.3),),
         sizes=(0.03, 0.3),
         act=_coulomb,
+        forms=(_PRESLIDING, _DIRECTION),
         sentence="The joint needs a fixed torque to start moving and loses the same torque while it moves.",
         excited_by="slow triangular reversals",
         **_JOINT_FRICTION,
@@ -46,6 +50,7 @@ ROWS = (
             Parameter(name="nm_s_per_rad", scale="damping", bounds=(-0.5, 5.0), prior=0.3, fields=("dof_damping",)),
         ),
         sizes=(0.03,),
+        forms=(Form("quadratic", "learned_torque", "square_nm_s2_per_rad2"),),
         sentence="The joint loses a torque in proportion to its speed.",
         excited_by="a motor-off swing, or chirps at two amplitudes",
         **_JOINT_FRICTION,
@@ -59,6 +64,7 @@ ROWS = (
         ),
         sizes=(0.05, 0.3),
         act=_stribeck,
+        forms=(_PRESLIDING, _DIRECTION),
         sentence="The joint sticks harder than it slides: friction falls as it starts to move.",
         excited_by="slow triangular reversals at several speeds",
         **_JOINT_FRICTION,
@@ -69,6 +75,7 @@ ROWS = (
         parameters=(Parameter(name="ratio", bounds=(0.0, 0.9), prior=0.2),),
         sizes=(0.03, 0.2),
         act=_load_friction,
+        forms=(_PRESLIDING,),
         sentence="Friction in the gears grows with the torque that they transmit.",
         excited_by="the same reversals in postures of low and of high gravity torque",
         **_JOINT_FRICTION,

@@ -18,7 +18,7 @@ offset in rad and its rate in rad/s, [2, joints].
 
 import jax.numpy as jnp
 
-from jaxtune.types import Effect, Parameter
+from jaxtune.types import Effect, Form, Parameter
 
 _SLOPE_S = 0.006  # over which the rate of a measured motor's offset is averaged
 _TRANSMISSION = {"family": "transmission", "on": "joint"}
@@ -84,6 +84,7 @@ ROWS = (
         sizes=(0.003, 0.02),
         act=_backlash,
         start=_taken_up,
+        forms=(Form("compliant", "compliance", "nm_per_rad"),),
         sentence="The gears have backlash: the motor turns a little before the joint does.",
         excited_by="slow triangular reversals through the posture without gravity torque",
         **_TRANSMISSION,

@@ -2,12 +2,13 @@
 
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from envs.axes import Axis
 from jaxtune.discovery.problem import Hypothesis
-from jaxtune.types import Effect
+from jaxtune.types import Effect, Parameter
 
 _LARGE = 0.7  # of the bounds: the largest size that is screened
 _BENT, _STRAIGHT = 5, 3  # sizes of an effect without a slope at zero, and of one with
@@ -30,6 +31,26 @@ def hypotheses(
     return tuple(
         _hypothesis(axes, index, row, chosen) for row in rows.values() for chosen in place_sets(places[row.on])
     )
+
+
+def forms(axes: Sequence[Axis], rows: Mapping[str, Effect], every: Sequence[Hypothesis]) -> tuple[Hypothesis, ...]:
+    """Lists the forms that hypotheses may have.
+
+    Args:
+      axes: coordinates of the rig.
+      rows: all rows of the rig, by name, those among them that only shape others.
+      every: the hypotheses.
+    """
+    index = {(axis.effect, axis.parameter, axis.place): number for number, axis in enumerate(axes)}
+    return tuple(
+        replace(_hypothesis(axes, index, rows[form.effect], one.places, form.parameter), **_named(one, form.name))
+        for one in every
+        for form in rows[one.name].forms
+    )
+
+
+def _named(hypothesis: Hypothesis, form: str) -> dict:
+    return {"name": hypothesis.name, "family": hypothesis.family, "form": form}
 
 
 _RIGHT = {"left": "right", "l": "r", "fl": "fr", "rl": "rr", "hl": "hr", "bl": "br"}
@@ -112,31 +133,36 @@ def learned_torque(axes: Sequence[Axis], row: Effect) -> Hypothesis:
     )
 
 
-def _hypothesis(axes: Sequence[Axis], index: Mapping, row: Effect, places: tuple[str, ...]) -> Hypothesis:
-    directions = np.zeros((len(row.parameters), len(axes)))
-    bounds = np.array([parameter.bounds for parameter in row.parameters], float)
-    for number, parameter in enumerate(row.parameters):
-        mine = [index[row.name, parameter.name, place] for place in places]
+def _hypothesis(
+    axes: Sequence[Axis], index: Mapping, row: Effect, places: tuple[str, ...], parameter: str | None = None
+) -> Hypothesis:
+    """Makes the hypothesis of an effect in its first form, or of one of its parameters alone."""
+    later = {form.parameter for form in row.forms if form.effect == row.name}
+    parameters = [one for one in row.parameters if (one.name == parameter if parameter else one.name not in later)]
+    directions = np.zeros((len(parameters), len(axes)))
+    bounds = np.array([one.bounds for one in parameters], float)
+    for number, one in enumerate(parameters):
+        mine = [index[row.name, one.name, place] for place in places]
         bounds[number, 0] = max(axes[axis].least for axis in mine)
         for axis in mine:
             # In single precision, as the physics has it.
             ratio = np.float32(axes[mine[0]].scale) / np.float32(axes[axis].scale)
-            factor = 1.0 / ratio if parameter.form == "reciprocal" else ratio
-            directions[number, axis] = 1.0 if parameter.form == "ratio" else factor
-    first = [index[row.name, row.parameters[0].name, place] for place in places]
+            factor = 1.0 / ratio if one.form == "reciprocal" else ratio
+            directions[number, axis] = 1.0 if one.form == "ratio" else factor
+    first = [index[row.name, parameters[0].name, place] for place in places]
     return Hypothesis(
         name=row.name,
         family=row.family,
         places=places,
         directions=directions,
-        probes=_probes(row, bounds[0, 0]),
+        probes=_probes(row.sizes, parameters, bounds[0, 0]),
         bounds=bounds,
-        prior=np.array([parameter.prior for parameter in row.parameters]),
+        prior=np.array([one.prior for one in parameters]),
         joints=tuple(sorted({joint for axis in first for joint in axes[axis].joints})),
     )
 
 
-def _probes(row: Effect, least: float) -> np.ndarray:
+def _probes(sizes: Sequence[float], parameters: Sequence[Parameter], least: float) -> np.ndarray:
     """Returns the coordinates [probes, parameters] at which the screen simulates an effect.
 
     Shape parameters, such as the speed scale of Stribeck friction, stay zero, since they mean nothing without a size.
@@ -144,20 +170,21 @@ def _probes(row: Effect, least: float) -> np.ndarray:
     effect is large; more of them where it has no slope at zero. What can be subtracted is tried with both signs.
 
     Args:
-      row: the effect.
+      sizes: of the effect, the smallest of interest first; several where it has no slope at zero.
+      parameters: that are free.
       least: smallest coordinate.
     """
-    free = [number for number, parameter in enumerate(row.parameters) if not parameter.shape]
+    free = [number for number, parameter in enumerate(parameters) if not parameter.shape]
     if len(free) > 1:
-        probes = np.zeros((len(free), len(row.parameters)))
-        probes[np.arange(len(free)), free] = row.sizes[0]
+        probes = np.zeros((len(free), len(parameters)))
+        probes[np.arange(len(free)), free] = sizes[0]
         return probes
-    most, bends = row.parameters[free[0]].bounds[1], len(row.sizes) > 1
-    sizes = np.geomspace(row.sizes[0], _LARGE * most, _BENT if bends else _STRAIGHT)
+    most, bends = parameters[free[0]].bounds[1], len(sizes) > 1
+    sizes = np.geomspace(sizes[0], _LARGE * most, _BENT if bends else _STRAIGHT)
     below = [-size for size in sizes if -size > _LARGE * least]
     # Armature and damping can be lowered by less than their smallest size of interest.
     below = below or ([0.5 * least] if least < 0 else [])
     values = np.array([*below, *sizes])
-    probes = np.zeros((len(values), len(row.parameters)))
+    probes = np.zeros((len(values), len(parameters)))
     probes[:, free[0]] = values
     return probes

@@ -24,7 +24,7 @@ from experiments.discovery.cutting import (
     split_in_time,
     told_alike,
 )
-from experiments.discovery.hypotheses import hypotheses, learned_torque, timing_directions
+from experiments.discovery.hypotheses import forms, hypotheses, learned_torque, timing_directions
 from jaxtune.discovery.problem import Problem
 
 __all__ = ["HORIZONS_S", "Question", "build_question", "drop_filtered", "read_logs", "without_sealed"]
@@ -164,6 +164,7 @@ def build_question(
         regimes=REGIMES,
         components={name: tuple("xyz") if name == "gravity" else rig.joints for name in signals},
         push={joint: axes["constant_push", joint] for joint in rig.joints},
+        forms=forms(rig.axes, rig.effects, every),
         residual=learned_torque(rig.axes, LEARNED),
     )
     names = {split: tuple(run.name for run in runs) for split, runs in splits(log).items()}

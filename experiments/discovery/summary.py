@@ -11,8 +11,7 @@ from envs.logs import Log
 from envs.rig import Rig
 from experiments.discovery.setup import Question
 from jaxtune.discovery.fit import Fit
-from jaxtune.discovery.problem import Hypothesis
-from jaxtune.discovery.result import Result
+from jaxtune.discovery.result import AcceptedTerm, Result
 
 _SHOWN = 12  # places with the largest gap that the summary lists
 
@@ -31,13 +30,13 @@ def summarise(question: Question, result: Result) -> dict:
     effects, changes = [], []
     for term in result.terms:
         group = changes if question.problem.is_nominal(term.hypothesis) else effects
-        group.append(_effect(question.rig, term.hypothesis, result.fit, result.errors, term.confusable_with))
+        group.append(_effect(question.rig, term, result.fit, result.errors))
     singles = {h.key: h for h in question.problem.hypotheses if len(h.places) == 1 and len(h.directions) == 1}
     for number in result.changed:
         axis = question.rig.axes[number]
         known = any(change["name"] == axis.effect and axis.place in change["places"] for change in changes)
         if not known and (hypothesis := singles.get(f"{axis.effect}@{axis.place}")) is not None:
-            changes.append(_effect(question.rig, hypothesis, result.fit, result.errors, ()))
+            changes.append(_effect(question.rig, AcceptedTerm(hypothesis, None, None, ()), result.fit, result.errors))
     not_there = [name for name in LIBRARY if name not in question.rig.effects]
     return {
         "verdict": result.verdict,
@@ -51,8 +50,13 @@ def summarise(question: Question, result: Result) -> dict:
         ],
         "gap": {"unit": "floor", **result.gap, "split": "sealed"},
         "suspects": [
-            {"name": hypothesis.name, "places": list(hypothesis.places), "form": None, "probability": probability}
-            for hypothesis, probability in result.suspects
+            {
+                "name": one.hypothesis.name,
+                "places": list(one.hypothesis.places),
+                "form": one.form,
+                "probability": one.probability,
+            }
+            for one in result.suspects
         ],
         "withdrawn": result.withdrawn,
         "explained_share": result.explained_share,
@@ -60,14 +64,16 @@ def summarise(question: Question, result: Result) -> dict:
     }
 
 
-def _effect(rig: Rig, hypothesis: Hypothesis, fit: Fit, errors: np.ndarray, others: Sequence[str]) -> dict:
+def _effect(rig: Rig, term: AcceptedTerm, fit: Fit, errors: np.ndarray) -> dict:
     """Describes a fitted effect: physical values with 95 % intervals, and what would distinguish it from its rivals."""
-    row = rig.effects[hypothesis.name]
-    parameters = {}
-    for parameter, direction in zip(row.parameters, hypothesis.directions, strict=True):
+    hypothesis, parameters = term.hypothesis, {}
+    directions = [*hypothesis.directions, *(term.form.directions if term.form else ())]
+    for direction in directions:
         mine = [i for i, free in enumerate(fit.free.directions) if ((free != 0) & (direction != 0)).any()]
         number = int(np.flatnonzero(direction)[0])
-        value, scale = fit.vector[number], rig.axes[number].scale
+        axis, value = rig.axes[number], fit.vector[number]
+        scale, rows = axis.scale, rig.effects[axis.effect].parameters
+        parameter = next(one for one in rows if one.name == axis.parameter)
         # Standard errors of the directions through this coordinate add up in quadrature; 1.96 makes it a 95 % interval.
         error = 1.96 * float(np.sqrt(sum((errors[i] * fit.free.directions[i][number]) ** 2 for i in mine)))
         # A limit or a stiffness that may as well not be there has no upper end.
@@ -79,8 +85,9 @@ def _effect(rig: Rig, hypothesis: Hypothesis, fit: Fit, errors: np.ndarray, othe
         "family": hypothesis.family,
         "places": list(hypothesis.places),
         "parameters": parameters,
-        "confusable_with": list(others),
-        "split_by": f"{row.excited_by} on {', '.join(hypothesis.places)}",
+        "form": term.form.form if term.form else None,
+        "confusable_with": list(term.confusable_with),
+        "split_by": f"{rig.effects[hypothesis.name].excited_by} on {', '.join(hypothesis.places)}",
     }
 
 
@@ -153,6 +160,7 @@ def details(question: Question, result: Result, free: dict) -> dict:
                 "hypothesis": term.hypothesis.key,
                 "evidence": term.evidence,
                 "thresholds": term.thresholds,
+                "form": term.form.form if term.form else None,
                 "confusable_with": term.confusable_with,
             }
             for term in result.terms

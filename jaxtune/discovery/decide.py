@@ -14,7 +14,7 @@ from jaxtune.discovery.fit import Fit, refine, without
 from jaxtune.discovery.noise_floor import Floor, NoiseFloor
 from jaxtune.discovery.problem import Hypothesis, Problem
 from jaxtune.discovery.resample import standard_errors, times_drawn, units
-from jaxtune.discovery.result import Settings
+from jaxtune.discovery.result import Settings, Suspect
 
 _ABLATION_ROUNDS = 3
 
@@ -33,6 +33,15 @@ class Candidate:
     def key(self) -> str:
         """The keys of its effects in one word, such as `coulomb@elbow + payload@forearm`; `null` without any."""
         return key_of(self.hypotheses)
+
+    @property
+    def effects(self) -> tuple[Hypothesis, ...]:
+        """Its effects without their forms."""
+        return tuple(hypothesis for hypothesis in self.hypotheses if not hypothesis.form)
+
+    def price(self, of_effect: float) -> float:
+        """Returns what its hypotheses cost; a form costs half, as there are few to choose from."""
+        return of_effect * (len(self.hypotheses) + len(self.effects)) / 2
 
 
 def key_of(hypotheses: Sequence[Hypothesis]) -> str:
@@ -77,7 +86,7 @@ def squares(at: Floor, candidate: Candidate) -> np.ndarray:
 def total_cost(at: Floor, candidate: Candidate, price: float) -> float:
     """Returns the cost of a candidate on `train` and `select`, with its prior and a price for every effect."""
     of_segments = squares(at, candidate)
-    return _cost(at, of_segments) + candidate.fit.penalty + price * len(candidate.hypotheses)
+    return _cost(at, of_segments) + candidate.fit.penalty + candidate.price(price)
 
 
 def posterior(problem: Problem, at: Floor, candidates: Sequence[Candidate], price: float, seed: int = 0) -> np.ndarray:
@@ -96,7 +105,7 @@ def posterior(problem: Problem, at: Floor, candidates: Sequence[Candidate], pric
     costs = []
     for candidate, mine in zip(candidates, all_squares, strict=True):
         mean_squares = times @ np.nan_to_num(mine, nan=1e9, posinf=1e9) / rows
-        costs.append(at.counts.cost(mean_squares, rows) + candidate.fit.penalty + price * len(candidate.hypotheses))
+        costs.append(at.counts.cost(mean_squares, rows) + candidate.fit.penalty + candidate.price(price))
     weights = np.exp(-0.5 * (np.array(costs) - np.min(costs, axis=0)))
     return (weights / weights.sum(axis=0)).mean(axis=1)
 
@@ -169,7 +178,7 @@ def passes(evidence: Evidence, thresholds: Thresholds) -> dict[str, bool]:
 
 
 def ablate(at: Floor, candidate: Candidate, hypothesis: Hypothesis, fitted: Mapping[str, Candidate]) -> Candidate:
-    """Takes an effect out of a candidate and fits everything else again, unless that model was fitted already.
+    """Takes an effect with its form out of a candidate and fits the rest again, unless that model was fitted already.
 
     Args:
       at: the floor at the main horizon.
@@ -177,24 +186,31 @@ def ablate(at: Floor, candidate: Candidate, hypothesis: Hypothesis, fitted: Mapp
       hypothesis: the effect.
       fitted: models by key.
     """
-    others = tuple(other for other in candidate.hypotheses if other is not hypothesis)
+    gone = [other for other in candidate.hypotheses if other is hypothesis or other.shapes(hypothesis)]
+    others = tuple(other for other in candidate.hypotheses if other not in gone)
     if key_of(others) in fitted:
         return fitted[key_of(others)]
-    start = without(candidate.fit, hypothesis, at.prior, at.slopes)
-    evaluate = at.residuals["train"]
+    start, evaluate = candidate.fit, at.residuals["train"]
+    for one in gone:
+        start = without(start, one, at.prior, at.slopes)
     start = replace(start, residual=evaluate(start.vector[None])[0])
     (fit,) = refine([start], evaluate, _ABLATION_ROUNDS)
     return Candidate(others, fit, at.residuals["select"](fit.vector[None])[0])
 
 
-def believed(candidates: Sequence[Candidate], probabilities: np.ndarray) -> list[tuple[Hypothesis, float]]:
-    """Lists every effect of the candidates with the probability that it is there, most likely first."""
-    found: dict[str, tuple[Hypothesis, float]] = {}
-    for candidate, probability in zip(candidates, probabilities, strict=True):
-        for hypothesis in candidate.hypotheses:
-            before = found.get(hypothesis.key, (hypothesis, 0.0))[1]
-            found[hypothesis.key] = (hypothesis, before + float(probability))
-    return sorted(found.values(), key=lambda pair: -pair[1])
+def believed(candidates: Sequence[Candidate], probabilities: np.ndarray) -> list[Suspect]:
+    """Lists every effect of the candidates with the probability that it is there, most likely first.
+
+    Its form is that of the most likely model that has it.
+    """
+    found: dict[str, Suspect] = {}
+    for index in np.argsort(-probabilities, kind="stable"):
+        candidate, probability = candidates[index], float(probabilities[index])
+        for hypothesis in candidate.effects:
+            forms = [other.form for other in candidate.hypotheses if other.shapes(hypothesis)]
+            known = found.get(hypothesis.key, Suspect(hypothesis, forms[0] if forms else None, 0.0))
+            found[hypothesis.key] = replace(known, probability=known.probability + probability)
+    return sorted(found.values(), key=lambda one: -one.probability)
 
 
 def rivals(
@@ -223,14 +239,15 @@ def rivals(
     """
     others = {other.key for other in best.hypotheses if other is not hypothesis}
     nothing = max(total_cost(at, one, 0.0) for one in candidates if not one.hypotheses)
-    most = nothing - total_cost(at, best, 0.0)
+    # The others were fitted without forms.
+    plain = next((one for one in candidates if one.key == key_of(best.effects)), best)
+    most = nothing - total_cost(at, plain, 0.0)
     found: dict[str, float] = {}
     for candidate, probability in zip(candidates, probabilities, strict=True):
-        names = [h.name for h in candidate.hypotheses]
-        if hypothesis.name in names or len(candidate.hypotheses) > len(best.hypotheses):
+        if hypothesis.name in [h.name for h in candidate.effects] or len(candidate.effects) > len(best.effects):
             continue
         explained = (nothing - total_cost(at, candidate, 0.0)) / max(most, 1e-9)
-        for other in candidate.hypotheses:
+        for other in candidate.effects:
             if other.key not in others and explained > settings.same:
                 found[other.name] = max(found.get(other.name, 0.0), explained)
             elif other.key not in others and probability > settings.possible:

@@ -46,16 +46,26 @@ class Hypothesis:
     """[parameters]: standard deviation of the coordinates before anything was measured."""
     joints: tuple[int, ...]
     """Components of the signals in which the effect shows first; empty where it may show in any."""
+    form: str = ""
+    """Empty for an effect. Else the hypothesis is that the effect of this name, at the same places, has this form: it
+    frees one parameter more, is tried only beside the effect, and is no name of its own."""
 
     @property
     def key(self) -> str:
-        """Name and places as one word, such as `coulomb@elbow`; it identifies the hypothesis in messages and files."""
-        return f"{self.name}@{'+'.join(self.places)}"
+        """Name and places as one word, such as `coulomb@elbow`; it identifies the hypothesis in messages and files.
+
+        A form's is such as `coulomb(presliding)@elbow`.
+        """
+        return f"{self.name}{f'({self.form})' if self.form else ''}@{'+'.join(self.places)}"
+
+    def shapes(self, other: "Hypothesis") -> bool:
+        """Says whether this is a form of another hypothesis."""
+        return bool(self.form) and not other.form and (self.name, self.places) == (other.name, other.places)
 
 
 def are_distinct(one: Hypothesis, two: Hypothesis) -> bool:
-    """Says whether two hypotheses may form a pair: they have other names, or share no place."""
-    return one.name != two.name or not set(one.places) & set(two.places)
+    """Says whether two hypotheses may stand side by side: no axis is moved by both."""
+    return not ((one.directions != 0).any(axis=0) & (two.directions != 0).any(axis=0)).any()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,6 +130,8 @@ class Problem:
     """Turns coordinates [n, axes] into what the simulator is given, [n, axes]."""
     push: Mapping[str, int] = field(default_factory=dict)
     """Axis of a constant torque by joint, with which `localise` asks where a torque is missing; empty to skip that."""
+    forms: Sequence[Hypothesis] = ()
+    """Forms that effects may have, at all places of `hypotheses`."""
     residual: Hypothesis | None = None
     """A learned torque at all joints that names nothing; it bounds what is explainable, and is the fallback."""
 

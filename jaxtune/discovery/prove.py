@@ -21,9 +21,9 @@ from jaxtune.discovery.decide import (
 from jaxtune.discovery.evaluate import position_gap, rms
 from jaxtune.discovery.fit import Fit, begin, polish, refine
 from jaxtune.discovery.noise_floor import Floor, NoiseFloor, Say
-from jaxtune.discovery.problem import Hypothesis, Problem
+from jaxtune.discovery.problem import Problem
 from jaxtune.discovery.resample import standard_errors
-from jaxtune.discovery.result import AcceptedTerm, Result, Settings
+from jaxtune.discovery.result import AcceptedTerm, Result, Settings, Suspect
 from jaxtune.discovery.state import State
 
 _PERFECT = 1.0  # floor units
@@ -42,7 +42,7 @@ class Conclusion:
     ablated: Mapping[str, np.ndarray]
     """The model [axes] without each of the terms, by key."""
     errors: np.ndarray
-    suspects: tuple[tuple[Hypothesis, float], ...]
+    suspects: tuple[Suspect, ...]
     explained_share: float
     models: Mapping[str, np.ndarray]
     """Vectors [axes] that may become the corrected model, by what they are; the chosen one is first."""
@@ -206,11 +206,15 @@ def _proved(
     """The cheapest model without the effects that do not pass, which are taken out one by one, the weakest first."""
     at, failed = floor[problem.main_horizon], []
     (fit,) = polish([state.best.fit], at.residuals["train"], 0)
-    best, thresholds = replace(state.best, fit=fit), Thresholds(gain=state.price)
+    best = replace(state.best, fit=fit)
+    of_effect, of_form = Thresholds(gain=state.price), Thresholds(gain=0.5 * state.price, floors=0.0, horizons=1)
     fitted = {one.key: one for one in state.candidates}
     while True:
         weighed = {h.key: (h, *weigh_evidence(problem, floor, best, h, fitted)) for h in best.hypotheses}
-        tests = {key: passes(evidence, thresholds) for key, (_, evidence, _) in weighed.items()}
+        tests = {
+            key: passes(evidence, of_form if hypothesis.form else of_effect)
+            for key, (hypothesis, evidence, _) in weighed.items()
+        }
         wrong = [key for key, passed in tests.items() if not all(passed.values())]
         if not wrong:
             break
@@ -224,8 +228,11 @@ def _proved(
         (fit,) = polish([best.fit], at.residuals["train"], 0)
         best = replace(best, fit=fit)
     # What explains most is named first.
-    ranked = sorted(weighed.values(), key=lambda row: -row[1].gain)
-    terms = tuple(AcceptedTerm(h, evidence, thresholds, ()) for h, evidence, _ in ranked)
+    ranked = sorted((row for row in weighed.values() if not row[0].form), key=lambda row: -row[1].gain)
+    terms = tuple(
+        AcceptedTerm(h, evidence, of_effect, (), next((one for one in best.hypotheses if one.shapes(h)), None))
+        for h, evidence, _ in ranked
+    )
     return best, terms, {h.key: ablated.fit.vector for h, _, ablated in ranked}, failed
 
 

@@ -59,6 +59,19 @@ class AcceptedTerm:
     """The `decide.Thresholds` that it passed."""
     confusable_with: tuple[str, ...]
     """Names of other effects that these logs cannot distinguish from it, or that explain nearly as much."""
+    form: Any = None
+    """A `problem.Hypothesis` about its form, or None where its first form is as good."""
+
+
+@dataclass(frozen=True)
+class Suspect:
+    """An effect that may be part of the truth."""
+
+    hypothesis: Any
+    """A `problem.Hypothesis`."""
+    form: str | None
+    """Its form in the most likely model that has it; None for its first form."""
+    probability: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,8 +93,8 @@ class Result:
     `after`."""
     model_is: str
     """What the corrected model is: `nominal`, `null`, `effects`, or `learned` (effects and a learned torque)."""
-    suspects: tuple[tuple[Any, float], ...]
-    """Hypotheses with the probability that each is part of the truth, most likely first, whatever the verdict."""
+    suspects: tuple[Suspect, ...]
+    """Effects that may be part of the truth, most likely first, whatever the verdict."""
     explained_share: float
     """Share of the explainable gap that the reported effects explain, on `train` and `select`; see
     `prove.explained`."""

@@ -133,7 +133,7 @@ def to_json(state: State) -> dict[str, Any]:
 
 def from_json(problem: Problem, floor: NoiseFloor, begun: State, saved: Mapping[str, Any]) -> State:
     """Restores the state that `to_json` turned into `saved`, for the same problem and noise floor."""
-    by_key = {hypothesis.key: hypothesis for hypothesis in problem.hypotheses}
+    by_key = {hypothesis.key: hypothesis for hypothesis in (*problem.hypotheses, *problem.forms)}
     at = floor[problem.main_horizon]
     frees = [Free(**{name: np.array(values) for name, values in one["free"].items()}) for one in saved["candidates"]]
     points = [np.array(one["coordinates"]) for one in saved["candidates"]]

@@ -57,17 +57,13 @@ def step(
       The next state, and what was tried.
     """
     at, best = floor[problem.main_horizon], state.best
-    if state.screened and (len(best.hypotheses) >= settings.most or worst(at, best) <= settings.at_floor):
+    free = _free(settings, problem, at, state)
+    if not free:
         return replace(state, finished=True), Info()
     (fit,) = polish([best.fit], at.residuals["train"], 0 if state.screened else settings.rounds)
     state = state.replaced(best, replace(best, fit=fit))
     base = fit if state.screened else state.nominal
     state = localise(problem, at, state, fit)
-    free = [
-        h
-        for h in problem.hypotheses
-        if all(h.key != other.key and are_distinct(h, other) for other in state.best.hypotheses)
-    ]
     found = screen(at, base, free, pairs=0 if state.screened else settings.firsts, say=say)
     state = state.with_screen(settings, problem, found)
     leads = shortlist(settings, found, state.price)
@@ -81,6 +77,19 @@ def step(
     ranked = tuple(sorted(((one.key, cost[one.key]) for one in fitted), key=lambda pair: pair[1]))
     ranked = (*ranked[:5], ("before", total_cost(at, best, state.price)), ("price", state.price))
     return replace(state, best=least, finished=not improved), Info(ranked, improved)
+
+
+def _free(settings: Settings, problem: Problem, at: Floor, state: State) -> list[Hypothesis]:
+    """Lists what may join the best model: forms of its effects, and other effects unless it is at the floor or full."""
+    best = state.best
+    full = state.screened and (len(best.effects) >= settings.most or worst(at, best) <= settings.at_floor)
+    unshaped = [h for h in best.effects if not any(other.shapes(h) for other in best.hypotheses)]
+    forms = [form for form in problem.forms if any(form.shapes(h) for h in unshaped)]
+    return [
+        h
+        for h in (*forms, *(() if full else problem.hypotheses))
+        if all(are_distinct(h, other) for other in best.hypotheses)
+    ]
 
 
 def shortlist(settings: Settings, found: Screen, price: float) -> list[Lead]:

@@ -15,8 +15,9 @@ from experiments.discovery.blind_bench import Bench
 from experiments.discovery.blind_cases import ARM, SIZE_BOUNDS, SIZES
 from experiments.discovery.blind_robots import OUTSIDE, Truth, record
 from experiments.discovery.excitation import excitation
-from experiments.discovery.hypotheses import hypotheses, place_sets
+from experiments.discovery.hypotheses import forms, hypotheses, place_sets
 from experiments.discovery.setup import build_question, drop_filtered, read_logs
+from jaxtune.discovery.problem import are_distinct
 
 JOINTS = ("shoulder", "elbow")
 GAINS = {"kp": np.array([40.0, 20.0]), "kd": np.array([2.0, 0.8]), "torque_limit_nm": np.array([15.0, 15.0])}
@@ -167,7 +168,8 @@ def test_a_size_at_two_places_is_the_same_physical_size(spec, plain):
     rows = {name: rig.effects[name] for name in ("coulomb", "torque_limit", "torque_scale")}
     for hypothesis in hypotheses(rig.axes, rig.places, rows):
         row = rig.effects[hypothesis.name]
-        (parameter,), (direction,) = row.parameters, hypothesis.directions
+        # A form's parameter is not among its directions.
+        parameter, (direction,) = row.parameters[0], hypothesis.directions
         values = [
             float(parameter.value(0.5 * direction[number], rig.scale(row, parameter)[axis.index]))
             for number, axis in enumerate(rig.axes)
@@ -175,6 +177,23 @@ def test_a_size_at_two_places_is_the_same_physical_size(spec, plain):
         ]
         assert len(values) == len(hypothesis.places)
         np.testing.assert_allclose(values, values[0], rtol=1e-5)
+
+
+def test_every_form_moves_the_axes_of_its_parameter_at_the_places_of_its_effect(spec):
+    from envs.effects import LIBRARY
+    from envs.rig import Rig
+
+    rig = Rig(spec, JOINTS, 1000.0)
+    every = hypotheses(rig.axes, rig.places, {name: LIBRARY[name] for name in rig.effects if name in LIBRARY})
+    found = forms(rig.axes, rig.effects, every)
+    assert {(one.name, one.form) for one in found} >= {("coulomb", "presliding"), ("torque_limit", "soft")}
+    for one in found:
+        (parent,) = [other for other in every if one.shapes(other)]
+        (mine,) = [form for form in LIBRARY[one.name].forms if form.name == one.form]
+        moved = [axis for axis, move in zip(rig.axes, one.directions[0], strict=True) if move]
+        assert [(axis.effect, axis.parameter) for axis in moved] == [(mine.effect, mine.parameter)] * len(parent.places)
+        assert [axis.place for axis in moved] == list(parent.places)
+        assert are_distinct(one, parent) and one.key != parent.key
 
 
 def test_sizes_hide_what_the_library_has_and_what_it_has_not():

@@ -9,12 +9,12 @@ import rigs
 
 from envs import effects, models, sensing
 from envs.chain import Now, Wrench
-from envs.effects import LEARNED, LIBRARY, NOMINAL
+from envs.effects import EVERY, LEARNED, LIBRARY, NOMINAL
 from envs.effects.memory import LONGEST_S, delay_line, delayed
 from envs.rig import Rig
 
 DT = 0.001
-ROWS = (*NOMINAL.values(), *LIBRARY.values(), LEARNED)
+ROWS = tuple(EVERY.values())
 PARAMETERS = [
     pytest.param(parameter, id=f"{row.name}.{parameter.name}") for row in ROWS for parameter in row.parameters
 ]
@@ -42,7 +42,7 @@ def now(speed=0.0, **fields):
 
 def signal_of(row, rng):
     """Some signal of the stage that a row enters."""
-    shape = {"sensor": (2, JOINTS), "gravity": (3,)}.get(row.enters, (JOINTS,))
+    shape = {"sensor": (2, JOINTS), "bristle": (2, JOINTS), "gravity": (3,)}.get(row.enters, (JOINTS,))
     if row.enters == "wrench":
         return Wrench(torque=draw(rng, (JOINTS,)), force=draw(rng, (JOINTS, 3)))
     return draw(rng, shape)
@@ -56,7 +56,8 @@ def values_of(row, **physical):
     """What `act` is given for physical values, each for all places or one per place."""
     values = {}
     for parameter in row.parameters:
-        each = np.broadcast_to(physical[parameter.name], JOINTS)
+        # What only a form has is zero where nothing is said of it.
+        each = np.broadcast_to(physical.get(parameter.name, 0.0), JOINTS)
         inner = [parameter.inner(parameter.coordinate(float(value), 1.0), 1.0) for value in each]
         values[parameter.name] = jnp.asarray(inner, jnp.float32)
     return values
@@ -64,13 +65,13 @@ def values_of(row, **physical):
 
 def act(name, signal, memory=None, at=None, **physical):
     """One step of one effect."""
-    row = LIBRARY[name]
+    row = EVERY[name]
     return row.act(values_of(row, **physical), jnp.asarray(signal, jnp.float32), at or now(), memory)[0]
 
 
 def series(name, signals, at=None, **physical):
     """What becomes of signals [time, ...] one after the other, of one that has always been the first."""
-    row, at = LIBRARY[name], at or now()
+    row, at = EVERY[name], at or now()
     values, signals = values_of(row, **physical), jnp.asarray(signals, jnp.float32)
 
     def step(memory, signal):
@@ -258,6 +259,23 @@ def test_a_ratio_multiplies(name):
 def test_a_torque_is_limited_both_ways():
     np.testing.assert_allclose(act("torque_limit", [2.0, -3.0], torque_nm=[1.5, 2.5]), [1.5, -2.5], rtol=1e-6)
     np.testing.assert_allclose(act("torque_limit", [2.0, -3.0], torque_nm=4.0), [2.0, -3.0], rtol=1e-6)
+
+
+@pytest.mark.parametrize("softness", [0.02, 0.1, 0.25, 0.5, 1.0])
+def test_a_soft_limit_is_the_usual_one_of_some_power(softness):
+    torque, power = np.array([1.0, -3.0]), 1.0 / softness
+    expected = torque / (1.0 + np.abs(torque / 2.0) ** power) ** softness
+    np.testing.assert_allclose(act("torque_limit", torque, torque_nm=2.0, softness=softness), expected, rtol=1e-4)
+
+
+def test_bristles_give_way_and_then_slide():
+    # 0.1 rad/s for 20 ms is 2 mrad: bristles of 1 mrad slide after half of that; without travel nothing changes.
+    friction = np.tile([[[0.4, 0.4], [0.1, 0.1]]], (21, 1, 1))
+    got = series("presliding", friction, at=now(speed=0.1), travel_rad=[0.001, 0.0])
+    wound = np.minimum(0.1 * DT * np.arange(1, 22) / 0.001, 1.0)
+    np.testing.assert_allclose(got[:, 0, 0], 0.0)
+    np.testing.assert_allclose(got[:, 1, 0], 0.1 - 0.4 * wound, atol=1e-6)
+    np.testing.assert_allclose(got[:, :, 1], friction[:, :, 1], atol=1e-7)
 
 
 def test_a_motor_gives_less_the_faster_it_turns():

@@ -47,7 +47,7 @@ def test_models_that_are_equal_are_believed_alike(stepped):
     candidates = [found.best, twin, found.null]
     probabilities = posterior(asked, at, candidates, found.price)
     np.testing.assert_allclose(probabilities, [0.5, 0.5, 0.0], atol=1e-6)
-    assert {hypothesis.name: p for hypothesis, p in believed(candidates, probabilities)} == {
+    assert {one.hypothesis.name: one.probability for one in believed(candidates, probabilities)} == {
         "coulomb": pytest.approx(0.5),
         "twin": pytest.approx(0.5),
     }

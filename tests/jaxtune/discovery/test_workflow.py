@@ -104,8 +104,8 @@ def test_a_model_that_held_out_runs_contradict_is_withdrawn():
 
 def test_suspects_are_ranked_by_probability_whatever_the_verdict():
     result = discover({"coulomb": 0.5})
-    names = [hypothesis.name for hypothesis, _ in result.suspects]
-    probabilities = [probability for _, probability in result.suspects]
+    names = [one.hypothesis.name for one in result.suspects]
+    probabilities = [one.probability for one in result.suspects]
     assert names[0] == "coulomb"
     assert probabilities == sorted(probabilities, reverse=True)
     assert probabilities[0] > 0.9

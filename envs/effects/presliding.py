@@ -1,0 +1,39 @@
+"""Dry friction of bristles, which give way a little before they slide: a form of friction, and no effect of its own.
+
+The signal is [2, joints]: the bound of dry friction in Nm, for which the engine solves, and a torque on the joint in
+Nm. Where bristles are, they take the bound over.
+"""
+
+import jax.numpy as jnp
+
+from jaxtune.types import Effect, Parameter
+
+
+def _presliding(values, friction, now, memory):
+    """torque' = torque - bound z with d z / dt = speed / travel, |z| <= 1 (Dahl friction with a sharp knee)."""
+    bound, torque = friction
+    travel = values["travel_rad"]
+    # The memory is z, the deflection of the bristles in shares of that at which they slide.
+    wound = jnp.clip(memory + now.dt * now.speed / jnp.maximum(travel, 1e-9), -1.0, 1.0)
+    there = travel > 0
+    return jnp.stack([jnp.where(there, 0.0, bound), torque - jnp.where(there, bound * wound, 0.0)]), wound
+
+
+def _slack(values, friction, dt):
+    """Starts with bristles that stand upright; the history of a segment winds them up."""
+    del values, dt
+    return jnp.zeros_like(friction[0])
+
+
+PRESLIDING = Effect(
+    name="presliding",
+    family="joint_friction",
+    on="joint",
+    enters="bristle",
+    parameters=(Parameter(name="travel_rad", bounds=(0.0, 0.05), prior=0.005),),
+    sizes=(0.0005, 0.005),
+    act=_presliding,
+    start=_slack,
+    sentence="Friction sets in over a small travel instead of at once.",
+    excited_by="slow triangular reversals of a few milliradians",
+)
