@@ -24,7 +24,7 @@ ROWS = (
     Effect(
         name="drag",
         on="body",
-        parameters=(Parameter(name="n_s_per_m", scale="drag", bounds=(0.0, 5.0), prior=0.3),),
+        parameters=(Parameter(name="n_s_per_m", scale="drag", bounds=(0.0, 15.0), prior=0.3),),
         sizes=(0.05,),
         act=_drag,
         sentence="A cable or the air drags on the link in proportion to its speed.",

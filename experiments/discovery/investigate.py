@@ -71,7 +71,7 @@ def investigate(
     )
     free = free_runs(log, question, result)
     stamp = {"seconds": time.monotonic() - began, "versions": checkpoint.versions()}
-    summary = summarise(question, result) | stamp
+    summary = summarise(question, log, result) | stamp
     write_json(out / "summary.json", summary)
     write_json(out / "details.json", details(question, result, free))
     corrected.save(out / "model", spec, question.rig, result.model)

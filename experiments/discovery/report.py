@@ -99,6 +99,8 @@ def show(console: Console, question: Question, summary: dict, free: dict) -> Non
     suspects = [f"{one['name']} at {', '.join(one['places'])} {one['probability']:.2f}" for one in summary["suspects"]]
     if suspects:
         console.print(f"suspects: {'; '.join(suspects[:_SHOWN])}")
+    if summary["next_experiment"]:
+        console.print(f"to decide between them: {summary['next_experiment']}", highlight=False, markup=False)
     if summary["withdrawn"]:
         console.print("the corrected model was withdrawn: on held-out runs it was worse than the one that is saved")
     if summary["not_testable"]:

@@ -39,6 +39,8 @@ class Question:
 
     problem: Problem
     """What `jaxtune.discovery` works on; it knows numbers, but no robot."""
+    spec: mujoco.MjSpec
+    """The nominal model."""
     rig: Rig
     """The simulator with every effect built in, which gives coordinates their names and units."""
     splits: Mapping[str, tuple[str, ...]]
@@ -168,7 +170,7 @@ def build_question(
         residual=learned_torque(rig.axes, LEARNED),
     )
     names = {split: tuple(run.name for run in runs) for split, runs in splits(log).items()}
-    return Question(problem, rig, names, (*log.notes, *notes, *_stale_notes(unsealed)))
+    return Question(problem, spec, rig, names, (*log.notes, *notes, *_stale_notes(unsealed)))
 
 
 def _one_tree(trees: np.ndarray) -> int:

@@ -2,25 +2,26 @@
 
 from collections.abc import Mapping, Sequence
 
-import jax
 import numpy as np
 
-from envs import segments
 from envs.effects import LIBRARY
 from envs.logs import Log
 from envs.rig import Rig
+from experiments.discovery.next_experiment import deciding_experiment
 from experiments.discovery.setup import Question
+from experiments.discovery.whole_runs import simulate_runs
 from jaxtune.discovery.fit import Fit
 from jaxtune.discovery.result import AcceptedTerm, Result
 
 _SHOWN = 12  # places with the largest gap that the summary lists
 
 
-def summarise(question: Question, result: Result) -> dict:
+def summarise(question: Question, log: Log, result: Result) -> dict:
     """Returns the content of `summary.json`, except for times and versions.
 
     Args:
       question: the problem that discovery worked on.
+      log: what was measured.
       result: what was found.
 
     Returns:
@@ -58,6 +59,7 @@ def summarise(question: Question, result: Result) -> dict:
             }
             for one in result.suspects
         ],
+        "next_experiment": deciding_experiment(question, log, result),
         "withdrawn": result.withdrawn,
         "explained_share": result.explained_share,
         "model_is": result.model_is,
@@ -106,34 +108,23 @@ def free_runs(log: Log, question: Question, result: Result) -> dict:
       `runs`: name, split, time in s, positions in rad [rows, joints] (`measured`, `before`, `null`, `after`) and their
       mean absolute errors; `error_rad`: means of these errors by split and model.
     """
-    rig = question.rig
-    cut = segments.whole(log.runs, rig.dt)
-    play = jax.jit(jax.vmap(lambda value, inputs: rig.simulate(rig.tree(value), inputs)["q"], (None, 0)))
-    # All three models are simulated by one compiled program, which takes their coordinates as an argument.
-    vectors = {
-        "before": np.zeros(len(rig.axes)),
-        "null": result.null.vector,
-        "after": result.model,
-    }
-    values = np.asarray(rig.inner(np.stack(list(vectors.values()))), np.float32)
-    found = {name: np.asarray(play(value, cut.segments)) for name, value in zip(vectors, values, strict=True)}
+    vectors = {"before": np.zeros(len(question.rig.axes)), "null": result.null.vector, "after": result.model}
+    rows, simulated = simulate_runs(question, log.runs, np.stack(list(vectors.values())))
     splits = {name: split for split, names in question.splits.items() for name in names}
     runs = []
-    for piece, recorded in enumerate(log.runs):
-        rows = np.unique(cut.row[piece])
-        measured = recorded.signals["q"][rows]
-        simulated = {name: values[piece][: len(rows)] for name, values in found.items()}
+    for recorded, own, positions in zip(log.runs, rows, simulated, strict=True):
+        measured, found = recorded.signals["q"][own], dict(zip(vectors, positions, strict=True))
         runs.append(
             {
                 "run": recorded.name,
                 "split": splits[recorded.name],
-                "time": recorded.time[rows] - recorded.time[rows[0]],
+                "time": recorded.time[own] - recorded.time[own[0]],
                 "measured": measured,
-                **simulated,
-                "error_rad": {name: float(np.abs(values - measured).mean()) for name, values in simulated.items()},
+                **found,
+                "error_rad": {name: float(np.abs(values - measured).mean()) for name, values in found.items()},
             }
         )
-    return {"runs": runs, "error_rad": _mean_errors(runs, list(found))}
+    return {"runs": runs, "error_rad": _mean_errors(runs, list(vectors))}
 
 
 def _mean_errors(runs: Sequence[Mapping], names: Sequence[str]) -> dict[str, dict[str, float]]:

@@ -56,15 +56,17 @@ class Evidence:
     gain: float
     """Fall of the cost on `train` and `select`."""
     confirmed: float
-    """Fall of the cost on `select` alone, where nothing was fitted."""
+    """Fall of the cost on `select` alone, where nothing was fitted, prior included."""
     floors: float
     """Root of the largest fall of a single component's mean square on `select`, in floor units."""
+    relief: float
+    """Fall of what the prior says against the other coordinates: without the effect they imitate it."""
     interval: tuple[float, float]
     """95 % interval of the coordinate that is clearest of zero."""
     inside: bool
     """True if all coordinates are inside their bounds."""
     horizons: int
-    """Number of horizons at which `select` is explained better with it."""
+    """Number of horizons at which `select` costs less with it, prior included."""
 
 
 @dataclass(frozen=True)
@@ -74,6 +76,8 @@ class Thresholds:
     gain: float
     """Fall of the cost that the best hypothesis reaches on null logs with probability `Settings.level`."""
     floors: float = 1.0
+    relief: float = 9.0
+    """In the place of `floors`: a parameter that need not be three deviations off."""
     horizons: int = 2
 
 
@@ -146,17 +150,19 @@ def weigh_evidence(
     # A parameter without a probe of its own means nothing alone.
     distance = np.where((hypothesis.probes != 0).any(axis=0), np.abs(values) / errors, 0.0)
     clearest = int(distance.argmax())
+    relief = ablated.fit.penalty - candidate.fit.penalty
     mean = lambda one: one[held_out:].mean(axis=0) / len(at.scale["train"])  # noqa: E731
     evidence = Evidence(
         gain=total_cost(at, ablated, 0.0) - total_cost(at, candidate, 0.0),
-        confirmed=_cost(at, before[held_out:]) - _cost(at, now[held_out:]),
+        confirmed=_cost(at, before[held_out:]) - _cost(at, now[held_out:]) + relief,
         floors=float(np.sqrt(max((mean(before) - mean(now)).max(), 0.0))),
+        relief=relief,
         interval=(
             float(values[clearest] - 1.96 * errors[clearest]),
             float(values[clearest] + 1.96 * errors[clearest]),
         ),
         inside=bool(((low < values) & (values < high)).all()),
-        horizons=_horizons_better(floor, candidate.fit.vector, ablated.fit.vector),
+        horizons=_horizons_better(floor, candidate.fit, ablated.fit),
     )
     return evidence, ablated
 
@@ -168,7 +174,8 @@ def passes(evidence: Evidence, thresholds: Thresholds) -> dict[str, bool]:
         # With thousands of residuals every mimic of an engine gap is significant; null logs say what chance gains.
         "beyond_chance": evidence.gain > thresholds.gain,
         "confirmed": evidence.confirmed > 0.0,
-        "floor_unit": evidence.floors >= thresholds.floors,
+        # What nominal parameters can imitate shows in how far they must go, and not in the residuals.
+        "matters": evidence.floors >= thresholds.floors or evidence.relief >= thresholds.relief,
         # A fit that ran into a bound stands in for another effect.
         "inside_bounds": evidence.inside,
         "clear_of_zero": low > 0 or high < 0,
@@ -187,7 +194,7 @@ def ablate(at: Floor, candidate: Candidate, hypothesis: Hypothesis, fitted: Mapp
       fitted: models by key.
     """
     gone = [other for other in candidate.hypotheses if other is hypothesis or other.shapes(hypothesis)]
-    others = tuple(other for other in candidate.hypotheses if other not in gone)
+    others = tuple(other for other in candidate.hypotheses if all(other is not one for one in gone))
     if key_of(others) in fitted:
         return fitted[key_of(others)]
     start, evaluate = candidate.fit, at.residuals["train"]
@@ -263,11 +270,11 @@ def _cost(at: Floor, of_segments: np.ndarray) -> float:
     return float(at.counts.cost(of_segments.sum(axis=0) / rows, rows))
 
 
-def _horizons_better(floor: NoiseFloor, vector: np.ndarray, other: np.ndarray) -> int:
-    """Number of horizons at which `select` costs less with a vector than with the other one."""
+def _horizons_better(floor: NoiseFloor, fit: Fit, other: Fit) -> int:
+    """Number of horizons at which `select` costs less with a model than with the other one."""
     better = 0
     for at in floor.values():
-        now, before = at.residuals["select"](np.stack([vector, other]))
+        now, before = at.residuals["select"](np.stack([fit.vector, other.vector]))
         costs = [_cost(at, (at.unflatten(one) ** 2).sum(axis=1)) for one in (now, before)]
-        better += costs[0] < costs[1]
+        better += costs[0] + fit.penalty < costs[1] + other.penalty
     return better

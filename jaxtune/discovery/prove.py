@@ -10,6 +10,7 @@ from jaxtune.discovery.decide import (
     Candidate,
     Thresholds,
     believed,
+    key_of,
     passes,
     posterior,
     rivals,
@@ -43,6 +44,7 @@ class Conclusion:
     """The model [axes] without each of the terms, by key."""
     errors: np.ndarray
     suspects: tuple[Suspect, ...]
+    rivals: tuple[tuple[str, np.ndarray], ...]
     explained_share: float
     models: Mapping[str, np.ndarray]
     """Vectors [axes] that may become the corrected model, by what they are; the chosen one is first."""
@@ -94,6 +96,7 @@ def conclude(settings: Settings, problem: Problem, floor: NoiseFloor, state: Sta
         ablated=ablated,
         errors=standard_errors(best.fit, unit),
         suspects=tuple(believed(candidates, probabilities)[:_SUSPECTS]),
+        rivals=_rivals(candidates, probabilities),
         explained_share=explained(null, after, min(bound, after)),
         models=models if verdict == "unnamed" else _effects_first(models),
         changed=changed,
@@ -104,6 +107,15 @@ def conclude(settings: Settings, problem: Problem, floor: NoiseFloor, state: Sta
             for one, probability in zip(candidates, probabilities, strict=True)
         },
     )
+
+
+def _rivals(candidates: Sequence[Candidate], probabilities: np.ndarray) -> tuple[tuple[str, np.ndarray], ...]:
+    """The two models that are most believed, of those with effects; best first."""
+    found: dict[str, np.ndarray] = {}
+    for index in np.argsort(-probabilities, kind="stable"):
+        if candidates[index].effects:
+            found.setdefault(key_of(candidates[index].effects), candidates[index].fit.vector)
+    return tuple(found.items())[:2]
 
 
 def explained(null: float, after: float, bound: float) -> float:
@@ -184,6 +196,7 @@ def prove(settings: Settings, problem: Problem, floor: NoiseFloor, state: State,
         model=model,
         model_is=model_is,
         suspects=conclusion.suspects,
+        rivals=conclusion.rivals,
         explained_share=conclusion.explained_share,
         withdrawn=bool(withdrawn),
         where=state.where,

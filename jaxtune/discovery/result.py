@@ -20,6 +20,8 @@ class Settings:
     """How many of the best hypotheses are screened with every other one as a pair."""
     pairs: int = 8
     """How many of the best pairs are fitted."""
+    shaped: int = 4
+    """How many of the best hypotheses are fitted in all their forms as well."""
     finalists: int = 4
     """How many of those are fitted on with fresh slopes."""
     most: int = 4
@@ -95,6 +97,9 @@ class Result:
     """What the corrected model is: `nominal`, `null`, `effects`, or `learned` (effects and a learned torque)."""
     suspects: tuple[Suspect, ...]
     """Effects that may be part of the truth, most likely first, whatever the verdict."""
+    rivals: tuple[tuple[str, np.ndarray], ...]
+    """Keys and vectors [axes] of the two models that are most believed, of those with effects; their effects differ in
+    more than form."""
     explained_share: float
     """Share of the explainable gap that the reported effects explain, on `train` and `select`; see
     `prove.explained`."""

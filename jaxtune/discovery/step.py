@@ -67,6 +67,7 @@ def step(
     found = screen(at, base, free, pairs=0 if state.screened else settings.firsts, say=say)
     state = state.with_screen(settings, problem, found)
     leads = shortlist(settings, found, state.price)
+    leads += shaped(problem, leads[: settings.shaped])
     say(f"fit {len(leads)}")
     fitted = fit_leads(settings, at, base, state.best.hypotheses, leads)
     broken = {key_of((*state.best.hypotheses, *lead.hypotheses)) for lead in leads} - {one.key for one in fitted}
@@ -108,6 +109,20 @@ def shortlist(settings: Settings, found: Screen, price: float) -> list[Lead]:
     least = found.leads[0].cost if found.leads else found.cost
     pairs = [pair for pair in found.pairs if least - pair.cost > settings.promising * price]
     return chosen + pairs[: settings.pairs]
+
+
+def shaped(problem: Problem, leads: Sequence[Lead]) -> list[Lead]:
+    """Adds to leads of one effect each of the forms that it may have.
+
+    Else what another form of the right effect leaves would be explained by a second effect.
+    """
+    found = []
+    for lead in leads:
+        for form in (form for form in problem.forms if form.shapes(lead.hypotheses[0])):
+            # The least size may be too small to have a slope.
+            point = np.concatenate([lead.point, form.probes[1]])
+            found.append(Lead((*lead.hypotheses, form), point, lead.start, lead.cost))
+    return found
 
 
 def fit_leads(

@@ -1,0 +1,62 @@
+"""The experiment that would decide between the two models that are most believed: both play every motion."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from envs import segments
+from envs.logs import Log, Run
+from experiments.discovery.excitation import Decision, TargetRun, deciding, scaled
+from experiments.discovery.setup import Question
+from experiments.discovery.whole_runs import simulate_runs
+from jaxtune.discovery.result import Result
+
+_RUNS, _SECONDS, _RATE_HZ = 4, 3.0, 200.0
+
+
+def deciding_experiment(question: Question, log: Log, result: Result) -> str | None:
+    """Says which motion of `excite` would decide between the two models that are most believed, and by how much.
+
+    Args:
+      question: the problem that discovery worked on.
+      log: what was measured; its controller plays the motions.
+      result: with the two models.
+
+    Returns:
+      A sentence with the command that writes the targets; None where there are no two models with an effect.
+    """
+    if len(result.rivals) < 2:
+        return None
+    (one, other), vectors = (key for key, _ in result.rivals), np.stack([vector for _, vector in result.rivals])
+
+    def score(motion: Sequence[TargetRun]) -> float:
+        _, simulated = simulate_runs(question, [_as_run(log, run) for run in motion], vectors)
+        # Of the joint in which they differ most.
+        return float(np.sqrt(np.mean([(a - b) ** 2 for a, b in simulated], axis=(0, 1)).max()))
+
+    found: Decision = deciding(question.spec, log.joints, score, runs=_RUNS, seconds=_SECONDS, rate_hz=_RATE_HZ, seed=0)
+    return (
+        f"python -m experiments.excite --robot {log.robot} --motion {found.name} --runs {_RUNS} --seconds {_SECONDS:g} "
+        f"--rate-hz {_RATE_HZ:g} (with this robot's gains): there {one} and {other} differ by "
+        f"{1e3 * found.scores[found.name]:.2g} mrad (rms)"
+    )
+
+
+def _as_run(log: Log, motion: TargetRun) -> Run:
+    """The motion as a run that begins at rest in its first target, long enough before it moves to have a history."""
+    first = log.runs[0]
+    rows = round(segments.HISTORY_S * _RATE_HZ) + 2
+    still = np.repeat(motion.target[:1], rows, axis=0)
+    target = np.concatenate([still, motion.target])
+    return Run(
+        name=motion.name,
+        condition=motion.condition,
+        split=motion.split,
+        controller=scaled(first.controller, motion.gain),
+        time=np.arange(len(target)) / _RATE_HZ,
+        signals={
+            "q": np.broadcast_to(motion.target[0], target.shape),
+            "target": target,
+            "enabled": np.concatenate([np.ones(rows), motion.enabled]),
+        },
+    )
