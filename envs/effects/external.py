@@ -3,14 +3,18 @@
 The signal is an `envs.chain.Wrench`, which starts at zero; every effect adds its force or torque.
 """
 
-from jaxtune.types import Effect, Parameter
+import jax.numpy as jnp
 
+from jaxtune.types import Effect, Form, Parameter
+
+_REST = 1e-6  # m/s, where the root would have no derivative
 _EXTERNAL = {"family": "external", "enters": "wrench"}
 
 
 def _drag(values, wrench, now, memory):
-    """force = -c v at every link's centre of mass, v its velocity."""
-    force = -values["n_s_per_m"][:, None] * now.body_velocity
+    """force = -(c + c2 |v|) v at every link's centre of mass, v its velocity."""
+    speed = jnp.sqrt((now.body_velocity**2).sum(axis=1) + _REST**2)
+    force = -(values["n_s_per_m"] + values["n_s2_per_m2"] * speed)[:, None] * now.body_velocity
     return wrench.replace(force=wrench.force + force), memory
 
 
@@ -24,8 +28,12 @@ ROWS = (
     Effect(
         name="drag",
         on="body",
-        parameters=(Parameter(name="n_s_per_m", scale="drag", bounds=(0.0, 15.0), prior=0.3),),
+        parameters=(
+            Parameter(name="n_s_per_m", scale="drag", bounds=(0.0, 15.0), prior=0.3),
+            Parameter(name="n_s2_per_m2", scale="drag", bounds=(-15.0, 15.0), prior=0.3),
+        ),
         sizes=(0.05,),
+        forms=(Form("quadratic", "drag", "n_s2_per_m2"),),
         act=_drag,
         sentence="A cable or the air drags on the link in proportion to its speed.",
         excited_by="a motor-off swing and fast motion of several joints at once",

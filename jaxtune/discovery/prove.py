@@ -79,8 +79,10 @@ def conclude(settings: Settings, problem: Problem, floor: NoiseFloor, state: Sta
     learned = learn(settings, problem, at, best)
     models = _by_select(at, state, best, learned)
     null, after, bound = (_open_gap(problem, at, one) for one in (state.null, best, learned))
-    explains = _explains(settings, bool(terms), null, after)
-    changed = _at_bounds(problem, best.fit) if explains else {}
+    share = explained(null, after, min(bound, after))
+    enough = share >= settings.share and explained(null, after, _PERFECT) >= settings.least
+    explains = after <= settings.at_floor or (bool(terms) and enough)
+    changed = _at_bounds(problem, best.fit, state.price) if explains else {}
     if not explains:
         verdict = "unnamed"
     elif any(not problem.is_nominal(term.hypothesis) for term in terms):
@@ -97,7 +99,7 @@ def conclude(settings: Settings, problem: Problem, floor: NoiseFloor, state: Sta
         errors=standard_errors(best.fit, unit),
         suspects=tuple(believed(candidates, probabilities)[:_SUSPECTS]),
         rivals=_rivals(candidates, probabilities),
-        explained_share=explained(null, after, min(bound, after)),
+        explained_share=share,
         models=models if verdict == "unnamed" else _effects_first(models),
         changed=changed,
         dropped=tuple(key for key, _ in failed),
@@ -269,32 +271,36 @@ def _effects_first(models: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     return {"effects": models["effects"], **models}
 
 
-def _explains(settings: Settings, named: bool, null: float, after: float) -> bool:
-    """Whether a model explains the logs: it is at the floor, or its effects explain enough of the null's gap.
-
-    With the null's gap n and the model's m in floor units, the share explained is (n^2 - m^2) / (n^2 - 1).
-    """
-    unexplained = after > settings.at_floor
-    if named and null > _PERFECT:
-        unexplained &= (null**2 - after**2) / (null**2 - _PERFECT) < settings.share
-    return not unexplained
-
-
 def _open_gap(problem: Problem, at: Floor, candidate: Candidate) -> float:
     """Gap of the worst position on `train` and `select`."""
     return position_gap(problem, rms(at, np.concatenate([candidate.fit.residual, candidate.select])))
 
 
-def _at_bounds(problem: Problem, fit: Fit) -> dict[int, float]:
-    """Nominal axes that went as far as they may, and how far that is in prior standard deviations."""
+def _at_bounds(problem: Problem, fit: Fit, price: float) -> dict[int, float]:
+    """Nominal axes that went as far as they may, and how far that is in prior standard deviations.
+
+    Those are left out without which, at their nominal value, the model would cost hardly more.
+    """
     low, high = fit.free.bounds.T
     edge = np.minimum(fit.coordinates - low, high - fit.coordinates) < _BOUND * (high - low)
     found = {}
-    for row, coordinate in zip(fit.free.directions[edge], fit.coordinates[edge], strict=True):
+    for number in np.flatnonzero(edge):
+        row = fit.free.directions[number]
         for axis in np.flatnonzero(row):
-            if problem.prior[axis] > 0 and problem.prior[axis] == row[axis]:
-                found[int(axis)] = float(coordinate)
+            if problem.prior[axis] > 0 and problem.prior[axis] == row[axis] and _worth(fit, number, edge) > price:
+                found[int(axis)] = float(fit.coordinates[number])
     return found
+
+
+def _worth(fit: Fit, number: int, edge: np.ndarray) -> float:
+    """What a model costs more, to first order, with a coordinate at zero; others answer unless they are at an edge."""
+    value, slope = fit.linear.rows()
+    free = ~edge
+    step = np.zeros(len(fit.coordinates))
+    step[number] = -fit.coordinates[number]
+    moved = value + slope @ step
+    step[free] = np.linalg.lstsq(slope[:, free], -moved, rcond=None)[0]
+    return float(((value + slope @ step) ** 2).sum() - (value**2).sum())
 
 
 def _placebos(state: State, conclusion: Conclusion) -> dict[str, np.ndarray]:

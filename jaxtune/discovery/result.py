@@ -22,15 +22,19 @@ class Settings:
     """How many of the best pairs are fitted."""
     shaped: int = 4
     """How many of the best hypotheses are fitted in all their forms as well."""
+    swaps: int = 4
+    """How many hypotheses are fitted in the place of an effect."""
     finalists: int = 4
     """How many of those are fitted on with fresh slopes."""
     most: int = 4
     """Largest number of effects that are accepted."""
     level: float = 0.05
     """Probability of naming something where nothing is missing, which the thresholds allow."""
-    share: float = 0.5
-    """Share of the energy above the floor that the accepted effects must explain together; with less the verdict is
-    `unnamed`."""
+    share: float = 0.8
+    """Share of the explainable gap that the accepted effects must explain together; with less the verdict is
+    `unnamed`. See `prove.explained`."""
+    least: float = 0.3
+    """The same share of the whole gap above the floor: a learned torque cannot explain everything either."""
     at_floor: float = 1.5
     """Gap in floor units that counts as none. No further effect is looked for once every signal is below it."""
     promising: float = 0.3

@@ -34,6 +34,8 @@ class State:
     """All models that were fitted, the null among them."""
     finished: bool = False
     """True where no further step is to be taken."""
+    tried: tuple[str, ...] = ()
+    """Keys of the models beside which others were looked for."""
     screened: bool = False
     """True once the library was screened, and the fields below are settled."""
     price: float = 0.0
@@ -122,6 +124,7 @@ def to_json(state: State) -> dict[str, Any]:
         ],
         "best": state.best.key,
         "finished": state.finished,
+        "tried": list(state.tried),
         "price": state.price,
         "penalty": state.penalty,
         "not_testable": list(state.not_testable),
@@ -153,6 +156,7 @@ def from_json(problem: Problem, floor: NoiseFloor, begun: State, saved: Mapping[
         null=next(one for one in candidates if not one.hypotheses),
         best=next(one for one in candidates if one.key == saved["best"]),
         finished=saved["finished"],
+        tried=tuple(saved["tried"]),
         screened=True,
         price=saved["price"],
         penalty=saved["penalty"],

@@ -4,7 +4,7 @@
 
 The first step starts from the nominal model, not from the null: nominal parameters that were fitted alone have moved to
 imitate what is missing, and a search from there would have to lead them back. It tries pairs as well, since the gap of
-one effect may hide another.
+one effect may hide another. Where nothing joins the best model any more, each of its effects is replaced in turn.
 """
 
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from jaxtune.discovery.decide import Candidate, key_of, total_cost
+from jaxtune.discovery.decide import Candidate, ablate, key_of, total_cost
 from jaxtune.discovery.evaluate import worst
 from jaxtune.discovery.fit import Fit, begin, polish, refine
 from jaxtune.discovery.localise import localise
@@ -56,40 +56,64 @@ def step(
     Returns:
       The next state, and what was tried.
     """
-    at, best = floor[problem.main_horizon], state.best
-    free = _free(settings, problem, at, state)
-    if not free:
+    at = floor[problem.main_horizon]
+    base = _next_base(at, state)
+    if base is None:
         return replace(state, finished=True), Info()
-    (fit,) = polish([best.fit], at.residuals["train"], 0 if state.screened else settings.rounds)
-    state = state.replaced(best, replace(best, fit=fit))
-    base = fit if state.screened else state.nominal
-    state = localise(problem, at, state, fit)
-    found = screen(at, base, free, pairs=0 if state.screened else settings.firsts, say=say)
+    free, swapping = _free(settings, problem, at, base, state), base is not state.best
+    state = replace(state, tried=(*state.tried, base.key))
+    if not free:
+        return state, Info()
+    (fit,) = polish([base.fit], at.residuals["train"], 0 if state.screened else settings.rounds)
+    fresh = replace(base, fit=fit)
+    if not swapping:
+        state = localise(problem, at, state.replaced(base, fresh), fit)
+    # Nominal parameters of the null have moved to imitate what is missing.
+    base, best = fresh if state.screened else replace(fresh, fit=state.nominal), state.best
+    found = screen(at, base.fit, free, pairs=0 if state.screened else settings.firsts, say=say)
     state = state.with_screen(settings, problem, found)
     leads = shortlist(settings, found, state.price)
-    leads += shaped(problem, leads[: settings.shaped])
+    leads = leads[: settings.swaps] if swapping else leads + shaped(problem, leads[: settings.shaped])
     say(f"fit {len(leads)}")
-    fitted = fit_leads(settings, at, base, state.best.hypotheses, leads)
-    broken = {key_of((*state.best.hypotheses, *lead.hypotheses)) for lead in leads} - {one.key for one in fitted}
+    fitted = fit_leads(settings, at, base.fit, base.hypotheses, leads)
+    broken = {key_of((*base.hypotheses, *lead.hypotheses)) for lead in leads} - {one.key for one in fitted}
     state = replace(state.with_candidates(fitted), not_finite=(*state.not_finite, *sorted(broken)))
     cost = {one.key: total_cost(at, one, state.price) for one in (*fitted, best)}
     least = min(state.candidates, key=lambda one: total_cost(at, one, state.price))
-    improved = least.key != best.key
     ranked = tuple(sorted(((one.key, cost[one.key]) for one in fitted), key=lambda pair: pair[1]))
     ranked = (*ranked[:5], ("before", total_cost(at, best, state.price)), ("price", state.price))
-    return replace(state, best=least, finished=not improved), Info(ranked, improved)
+    return replace(state, best=least), Info(ranked, least.key != best.key)
 
 
-def _free(settings: Settings, problem: Problem, at: Floor, state: State) -> list[Hypothesis]:
-    """Lists what may join the best model: forms of its effects, and other effects unless it is at the floor or full."""
+def _next_base(at: Floor, state: State) -> Candidate | None:
+    """The model beside which to look next; None where all that make sense were tried.
+
+    It is the best one. Where nothing joins that, it is the best one without one of its effects, the weakest first:
+    another may stand in its place better.
+    """
     best = state.best
-    full = state.screened and (len(best.effects) >= settings.most or worst(at, best) <= settings.at_floor)
-    unshaped = [h for h in best.effects if not any(other.shapes(h) for other in best.hypotheses)]
+    if best.key not in state.tried:
+        return best
+    if len(best.effects) < 2:
+        return None
+    fitted = {one.key: one for one in state.candidates}
+    without = [ablate(at, best, effect, fitted) for effect in best.effects]
+    without = [one for one in without if one.key not in state.tried]
+    if not without:
+        return None
+    return min(without, key=lambda one: total_cost(at, one, state.price))
+
+
+def _free(settings: Settings, problem: Problem, at: Floor, base: Candidate, state: State) -> list[Hypothesis]:
+    """Lists what may join a model: forms of its effects, and other effects unless it is at the floor or full."""
+    full = state.screened and (len(base.effects) >= settings.most or worst(at, base) <= settings.at_floor)
+    unshaped = [h for h in base.effects if not any(other.shapes(h) for other in base.hypotheses)]
     forms = [form for form in problem.forms if any(form.shapes(h) for h in unshaped)]
+    left_out = {h.key for h in state.best.hypotheses} - {h.key for h in base.hypotheses}
     return [
         h
         for h in (*forms, *(() if full else problem.hypotheses))
-        if all(are_distinct(h, other) for other in best.hypotheses)
+        if h.key not in left_out and all(are_distinct(h, other) for other in base.hypotheses)
     ]
 
 

@@ -1,5 +1,7 @@
 """A slider whose truth is known: mass, damping, and whatever is hidden in it."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -84,7 +86,11 @@ def measured(truth, seed, split=0, count=40, motion=None):
     return found
 
 
-def problem(truth, seed=0, hypotheses=HYPOTHESES):
+# While the slider slides, friction that differs between directions is friction and a push.
+DIRECTION = replace(HYPOTHESES[3], name="coulomb", family="friction", form="direction_dependent")
+
+
+def problem(truth, seed=0, hypotheses=HYPOTHESES, forms=()):
     prior = np.array([0.1, 0.1, 0.0, 0.0, 0.0, 0.0, 0.0])
     # Nobody knows the nominal parameters better than to a tenth.
     drawn = [{"mass": 0.1 * m, "damping": 0.1 * d} for m, d in DRAWS]
@@ -98,6 +104,7 @@ def problem(truth, seed=0, hypotheses=HYPOTHESES):
         system=np.float32(1.0),
         axes=len(AXES),
         hypotheses=hypotheses,
+        forms=forms,
         prior=prior,
         timing=np.zeros((0, len(AXES))),
         timing_bounds=np.zeros((0, 2)),

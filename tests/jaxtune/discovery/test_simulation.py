@@ -1,65 +1,52 @@
-"""Many simulations at once are what each is alone, compiled once, on any number of devices."""
-
-import os
-import subprocess
-import sys
-from dataclasses import replace
-from pathlib import Path
+"""Moves of different kinematic trees are simulated at a time, and found as if each were simulated alone."""
 
 import jax.numpy as jnp
 import numpy as np
-from slider import AXES, play, problem, simulate
+from slider import problem
 
-from jaxtune.discovery.simulation import residuals
-
-
-def test_residuals_compile_once_for_any_number_of_vectors_and_segments():
-    traces = []
-    asked = problem({})
-
-    def counted(*args):
-        traces.append(1)
-        return simulate(*args)
-
-    asked = replace(asked, simulate=counted)
-    segments = asked.data["train"][0.2]
-    few = replace(
-        segments,
-        inputs={name: value[:7] for name, value in segments.inputs.items()},
-        signals={name: value[:7] for name, value in segments.signals.items()},
-        run=segments.run[:7],
-    )
-    vectors = 0.1 * np.random.default_rng(0).standard_normal((5, len(AXES))) * (np.arange(len(AXES)) < 6)
-    many = residuals(asked, vectors, segments, width=16)
-    count = len(traces)
-    assert residuals(asked, vectors[2:3], few, width=16).shape == (1, 7, 10, 2)
-    # Other lengths of segments and other robots need no other program either.
-    assert residuals(asked, vectors[:2], asked.data["train"][0.1], width=16).shape == (2, 40, 5, 2)
-    heavier = residuals(replace(asked, system=np.float32(2.0)), vectors, segments, width=16)
-    assert np.abs(heavier - many).max() > 0.01
-    assert len(traces) == count
-    # Each pair is what it is alone: binned means of measured less simulated, signals in the order of their names.
-    alone = play(jnp.asarray(vectors[3], jnp.float32), segments.inputs)
-    expected = np.concatenate([segments.signals[name] - np.asarray(alone[name]) for name in ("dq", "q")], axis=-1)
-    np.testing.assert_allclose(many[3], expected.reshape(40, 10, 2, 2).mean(axis=2), atol=1e-5)
+from jaxtune.discovery.problem import Problem, Segments
+from jaxtune.discovery.simulation import Evaluate
 
 
-def test_devices_share_the_work():
-    code = (
-        "import jax, numpy as np, slider as toy\n"
-        "from jaxtune.discovery.simulation import residuals\n"
-        "problem = toy.problem({'coulomb': 0.5})\n"
-        "vectors = np.random.default_rng(0).uniform(0, 0.3, (7, len(toy.AXES))) * (np.arange(len(toy.AXES)) < 6)\n"
-        "found = residuals(problem, vectors, problem.data['train'][0.1], width=16)\n"
-        "print(len(jax.devices()), *found.shape, *found.ravel())\n"
-    )
-    said = []
-    for devices in (1, 2):
-        flags = f"--xla_force_host_platform_device_count={devices}"
-        path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
-        environment = os.environ | {"XLA_FLAGS": flags, "PYTHONPATH": path, "JAX_PLATFORMS": "cpu"}
-        done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
-        said.append(done.stdout.split())
-    assert [line[0] for line in said] == ["1", "2"]
-    assert len(said[0]) > 1000
-    np.testing.assert_allclose(*(np.array(line[1:], float) for line in said), rtol=1e-4, atol=1e-6)
+def simulate(system, vector, segment, steps):
+    """Two joints of two trees: axes 0 and 1 move a joint each, axis 2 both; beyond 1 the first breaks everything."""
+    del steps
+    own = system * segment["x"][:, None] * jnp.stack([vector[0] ** 2, vector[1]]) + vector[2]
+    return {"q": own + jnp.where(vector[0] > 1.0, jnp.nan, 0.0)}
+
+
+def two_trees() -> tuple[Problem, Segments]:
+    x = np.random.default_rng(0).normal(size=(3, 4)).astype(np.float32)
+    none = np.zeros((3, 4, 2))
+    segments = Segments(inputs={"x": x}, signals={"q": none}, steps=4, run=np.arange(3), regimes=none.astype(int))
+    fields = {name: value for name, value in vars(problem({})).items() if name not in ("data", "components")}
+    fields |= {"simulate": simulate, "axes": 3, "bin_rows": 2, "trees": np.array([0, 1])}
+    fields |= {"axis_trees": np.array([0, 1, -1]), "components": {"q": ("one", "two")}}
+    return Problem(**fields, data={"train": dict.fromkeys((0.1, 0.2, 0.4), segments)}), segments
+
+
+def evaluation() -> Evaluate:
+    asked, segments = two_trees()
+    return Evaluate(asked, segments, np.full((2, 2), 0.5), np.zeros((3, 2, 2)))
+
+
+def test_moves_are_found_as_if_each_were_alone_with_fewer_simulations():
+    evaluate, counted = evaluation(), []
+    vectors = [np.zeros(3), np.array([0.2, -0.1, 0.3])]
+    residuals = list(evaluate(np.stack(vectors)))
+    moves = [np.diag([0.5, 0.7, 0.1]), np.array([[0.0, 0.4, 0.0], [0.3, 0.0, 0.0], [0.3, 0.4, 0.0]])]
+    found = evaluate.changes(vectors, residuals, moves, lambda done, count: counted.append(count))
+    for vector, residual, mine, changes in zip(vectors, residuals, moves, found, strict=True):
+        np.testing.assert_allclose(changes, evaluate(vector + mine) - residual, atol=1e-5)
+        assert (changes != 0).any(axis=1).all()
+    # Of six moves two pairs go together.
+    assert counted == [4]
+
+
+def test_a_move_that_breaks_the_simulation_takes_no_other_with_it():
+    evaluate = evaluation()
+    residual = evaluate(np.zeros((1, 3)))
+    (found,) = evaluate.changes([np.zeros(3)], residual, [np.array([[2.0, 0.0, 0.0], [0.0, 0.7, 0.0]])])
+    np.testing.assert_array_equal(found[0], 0.0)
+    np.testing.assert_allclose(found[1], evaluate(np.array([[0.0, 0.7, 0.0]]))[0] - residual[0], atol=1e-6)
+    assert np.abs(found[1]).max() > 0.1
