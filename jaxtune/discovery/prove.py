@@ -78,10 +78,10 @@ def conclude(settings: Settings, problem: Problem, floor: NoiseFloor, state: Sta
     say("learned torque")
     learned = learn(settings, problem, at, best)
     models = _by_select(at, state, best, learned)
-    null, after, bound = (_open_gap(problem, at, one) for one in (state.null, best, learned))
-    share = explained(null, after, min(bound, after))
-    enough = share >= settings.share and explained(null, after, _PERFECT) >= settings.least
-    explains = after <= settings.at_floor or (bool(terms) and enough)
+    null, after, bound = (_open_gaps(problem, at, one) for one in (state.null, best, learned))
+    share = explained(null, after, np.minimum(bound, after))
+    enough = share >= settings.share and explained(null, after, np.ones(len(null))) >= settings.least
+    explains = after.max() <= settings.at_floor or (bool(terms) and enough)
     changed = _at_bounds(problem, best.fit, state.price) if explains else {}
     if not explains:
         verdict = "unnamed"
@@ -120,16 +120,19 @@ def _rivals(candidates: Sequence[Candidate], probabilities: np.ndarray) -> tuple
     return tuple(found.items())[:2]
 
 
-def explained(null: float, after: float, bound: float) -> float:
-    """The share of the explainable gap that is explained: (null^2 - after^2) / (null^2 - bound^2), from 0 to 1.
+def explained(null: np.ndarray, after: np.ndarray, bound: np.ndarray) -> float:
+    """The share of the explainable gap that is explained: (E(null) - E(after)) / (E(null) - E(bound)), from 0 to 1.
+
+    E is the energy above the floor, summed over positions: max(gap^2 - 1, 0).
 
     Args:
-      null: gap of the model without effects, in floor units.
-      after: gap of the model with them.
-      bound: gap of the model with a learned torque too; what that leaves, no effect of a joint explains either.
+      null: [positions] gaps of the model without effects, in floor units.
+      after: [positions] of the model with them.
+      bound: [positions] with a learned torque too; what that leaves, no effect of a joint explains either.
     """
-    room = null**2 - max(bound, _PERFECT) ** 2
-    return float(np.clip((null**2 - max(after, _PERFECT) ** 2) / room, 0.0, 1.0)) if room > 1e-6 else 1.0
+    energy = [float(np.maximum(gaps**2 - _PERFECT, 0.0).sum()) for gaps in (null, after, bound)]
+    room = energy[0] - energy[2]
+    return float(np.clip((energy[0] - energy[1]) / room, 0.0, 1.0)) if room > 1e-6 else 1.0
 
 
 def learn(settings: Settings, problem: Problem, at: Floor, best: Candidate) -> Candidate:
@@ -271,9 +274,10 @@ def _effects_first(models: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     return {"effects": models["effects"], **models}
 
 
-def _open_gap(problem: Problem, at: Floor, candidate: Candidate) -> float:
-    """Gap of the worst position on `train` and `select`."""
-    return position_gap(problem, rms(at, np.concatenate([candidate.fit.residual, candidate.select])))
+def _open_gaps(problem: Problem, at: Floor, candidate: Candidate) -> np.ndarray:
+    """Gaps of all positions on `train` and `select`, [positions]."""
+    found = rms(at, np.concatenate([candidate.fit.residual, candidate.select]))
+    return found[[signal == "q" for signal, _ in problem.cells]]
 
 
 def _at_bounds(problem: Problem, fit: Fit, price: float) -> dict[int, float]:
