@@ -32,7 +32,7 @@ class Settings:
     """Probability of naming something where nothing is missing, which the thresholds allow."""
     share: float = 0.8
     """Share of the explainable gap that the accepted effects must explain together; with less the verdict is
-    `unnamed`. See `prove.explained`."""
+    `unnamed`. See `conclude.explained`."""
     least: float = 0.3
     """The same share of the whole gap above the floor: a learned torque cannot explain everything either."""
     at_floor: float = 1.5
@@ -106,7 +106,7 @@ class Result:
     more than form."""
     explained_share: float
     """Share of the explainable gap that the reported effects explain, on `train` and `select`; see
-    `prove.explained`."""
+    `conclude.explained`."""
     withdrawn: bool
     """True if the corrected model was worse on `sealed` than the better of the nominal model and the null; then `model`
     is that one."""

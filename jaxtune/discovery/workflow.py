@@ -10,9 +10,10 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from jaxtune.discovery import noise_floor, state
+from jaxtune.discovery.conclude import conclude
 from jaxtune.discovery.noise_floor import Say
 from jaxtune.discovery.problem import Problem
-from jaxtune.discovery.prove import conclude, prove
+from jaxtune.discovery.prove import prove
 from jaxtune.discovery.result import DEFAULTS, Result, Settings
 from jaxtune.discovery.step import step
 
@@ -52,4 +53,4 @@ def discover(
         save(state.to_json(found))
     conclusion = conclude(settings, problem, floor, found, say)
     say("proof on the sealed runs")
-    return prove(settings, problem, floor, found, conclusion)
+    return prove(problem, floor, found, conclusion)

@@ -552,7 +552,8 @@ def test_a_push_is_a_torque_that_is_applied(arm, swing):
     check(arm, swing, expected, constant_push={"elbow": {"nm": -0.4}})
 
 
-def test_drag_is_a_force_against_the_velocity_of_a_links_centre(arm, swing):
+@pytest.mark.parametrize(("linear", "square"), [(2.0, 0.0), (0.5, 1.5)])
+def test_drag_is_a_force_against_the_velocity_of_a_links_centre(arm, swing, linear, square):
     model = rigs.compiled(rigs.ARM, arm.rig)
     lower = model.body("lower").id
 
@@ -560,9 +561,10 @@ def test_drag_is_a_force_against_the_velocity_of_a_links_centre(arm, swing):
         # Of the last step's kinematics, which both have at hand.
         velocity = np.zeros(6)
         mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, lower, velocity, 0)
-        data.xfrc_applied[lower, :3] = -2.0 * velocity[3:]
+        data.xfrc_applied[lower, :3] = -(linear + square * np.linalg.norm(velocity[3:])) * velocity[3:]
 
-    check(arm, swing, rigs.in_mujoco(arm.rig, model, swing, outside=drag), drag={"lower": {"n_s_per_m": 2.0}})
+    expected = rigs.in_mujoco(arm.rig, model, swing, outside=drag)
+    check(arm, swing, expected, drag={"lower": {"n_s_per_m": linear, "n_s2_per_m2": square}})
 
 
 def check(arm, segment, expected, **effect):

@@ -8,7 +8,9 @@ import pytest
 from slider import AXES, DIRECTION, HYPOTHESES, WILD, problem
 
 from jaxtune.discovery import noise_floor, state, step, workflow
+from jaxtune.discovery.conclude import explained
 from jaxtune.discovery.result import Settings
+from jaxtune.discovery.screen import Lead
 
 
 def discover(truth, seed=0, **kwargs):
@@ -170,6 +172,38 @@ def test_a_saved_state_is_the_state_that_was_saved():
     assert json.loads(json.dumps(state.to_json(loaded))) == saved
     for one, other in zip(found.candidates, loaded.candidates, strict=True):
         np.testing.assert_allclose(one.fit.residual, other.fit.residual, atol=1e-3)
+
+
+def test_an_effect_gives_way_to_another_that_stands_in_its_place_better():
+    asked = problem({"coulomb": 1.2, "push": 1.2})
+    floor, begun = state.begin(asked, measured_floor(asked))
+    first, _ = step.step(Settings(), asked, floor, begun)
+    at, wrong = floor[asked.main_horizon], (HYPOTHESES[2], HYPOTHESES[4])
+    lead = Lead(wrong, np.array([0.8, 0.1]), begun.nominal.coordinates, 0.0)
+    (bad,) = step.fit_leads(Settings(), at, begun.nominal, (), [lead])
+    alone = [one for one in first.candidates if len(one.hypotheses) < 2]
+    stuck = replace(first, best=bad, candidates=(*alone, bad), tried=("null", bad.key))
+    found, info = step.step(Settings(), asked, floor, stuck)
+    assert info.improved
+    assert {hypothesis.name for hypothesis in found.best.hypotheses} == {"coulomb", "push"}
+
+
+def test_where_nothing_joins_and_nothing_replaces_the_search_ends():
+    asked = problem({"coulomb": 0.6})
+    floor, found = state.begin(asked, measured_floor(asked))
+    for _ in range(10):
+        found, _ = step.step(Settings(), asked, floor, found)
+    assert found.finished
+    assert [hypothesis.name for hypothesis in found.best.hypotheses] == ["coulomb"]
+
+
+def test_the_explained_share_counts_all_positions_above_the_floor():
+    null, bound = np.array([3.0, 2.0]), np.array([1.0, 0.5])
+    assert explained(null, null, bound) == 0.0
+    assert explained(null, bound, bound) == 1.0
+    assert explained(null, np.array([1.0, 2.0]), bound) == pytest.approx(8.0 / 11.0)
+    # What no torque explains is not asked for; below the floor nothing is won.
+    assert explained(null, np.array([2.0, 1.0]), np.array([2.0, 0.1])) == 1.0
 
 
 def test_an_effect_costs_what_chance_gains_on_null_logs():

@@ -1,0 +1,243 @@
+"""The verdict, from open segments: which effects stay, how far each is believed, and what they explain (step 9)."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from jaxtune.discovery.decide import (
+    Candidate,
+    Thresholds,
+    believed,
+    key_of,
+    passes,
+    posterior,
+    rivals,
+    squares,
+    total_cost,
+    units_of,
+    weigh_evidence,
+)
+from jaxtune.discovery.evaluate import rms
+from jaxtune.discovery.fit import Fit, begin, polish, refine
+from jaxtune.discovery.noise_floor import Floor, NoiseFloor, Say
+from jaxtune.discovery.problem import Problem
+from jaxtune.discovery.resample import standard_errors
+from jaxtune.discovery.result import AcceptedTerm, Settings, Suspect
+from jaxtune.discovery.state import State
+
+_PERFECT = 1.0  # floor units
+_SUSPECTS = 8
+_BOUND = 1e-6  # of the width of the bounds: how near to one a coordinate is at it
+
+
+@dataclass(frozen=True)
+class Conclusion:
+    """The verdict and what it stands on, before any sealed segment was looked at; the fields are those of `Result`."""
+
+    verdict: str
+    best: Candidate
+    terms: tuple[AcceptedTerm, ...]
+    ablated: Mapping[str, np.ndarray]
+    """The model [axes] without each of the terms, by key."""
+    errors: np.ndarray
+    suspects: tuple[Suspect, ...]
+    rivals: tuple[tuple[str, np.ndarray], ...]
+    explained_share: float
+    models: Mapping[str, np.ndarray]
+    """Vectors [axes] that may become the corrected model, by what they are; the chosen one is first."""
+    changed: Mapping[int, float]
+    dropped: tuple[str, ...]
+    rejected: Mapping[str, Any]
+    details: Mapping[str, Any]
+
+
+def conclude(settings: Settings, problem: Problem, floor: NoiseFloor, state: State, say: Say) -> Conclusion:
+    """Reaches the verdict from `train` and `select` together.
+
+    Args:
+      settings: what counts as explained.
+      problem: the hypotheses, and the torque that stands in where none fits.
+      floor: the noise floor.
+      state: after the last step.
+      say: receives a line of text about progress.
+    """
+    at = floor[problem.main_horizon]
+    say("evidence")
+    best, terms, ablated, failed = _proved(settings, problem, floor, state)
+    candidates = sorted(
+        {one.key: one for one in (best, *state.candidates)}.values(), key=lambda one: total_cost(at, one, state.price)
+    )
+    probabilities = posterior(problem, at, candidates, state.price)
+    terms = tuple(
+        replace(term, confusable_with=rivals(at, candidates, probabilities, best, term.hypothesis, settings))
+        for term in terms
+    )
+    say("learned torque")
+    learned = learn(settings, problem, at, best)
+    models = _by_select(at, state, best, learned)
+    null, after, bound = (_open_gaps(problem, at, one) for one in (state.null, best, learned))
+    share = explained(null, after, np.minimum(bound, after))
+    enough = share >= settings.share and explained(null, after, np.ones(len(null))) >= settings.least
+    explains = after.max() <= settings.at_floor or (bool(terms) and enough)
+    changed = _at_bounds(problem, best.fit, state.price) if explains else {}
+    if not explains:
+        verdict = "unnamed"
+    elif any(not problem.is_nominal(term.hypothesis) for term in terms):
+        # A term about a nominal parameter is a change, however large: the model has the parameter.
+        verdict = "named"
+    else:
+        verdict = "parameter_change" if changed or terms else "no_missing_effect"
+    unit = units_of(problem, at, squares(at, best))[: len(problem.data["train"][at.horizon].run)]
+    return Conclusion(
+        verdict=verdict,
+        best=best,
+        terms=terms,
+        ablated=ablated,
+        errors=standard_errors(best.fit, unit),
+        suspects=tuple(believed(candidates, probabilities)[:_SUSPECTS]),
+        rivals=_rivals(candidates, probabilities),
+        explained_share=share,
+        models=models if verdict == "unnamed" else _effects_first(models),
+        changed=changed,
+        dropped=tuple(key for key, _ in failed),
+        rejected=failed[0][1] if failed else {},
+        details={
+            one.key: {"cost": total_cost(at, one, state.price), "probability": float(probability)}
+            for one, probability in zip(candidates, probabilities, strict=True)
+        },
+    )
+
+
+def _rivals(candidates: Sequence[Candidate], probabilities: np.ndarray) -> tuple[tuple[str, np.ndarray], ...]:
+    """The two models that are most believed, of those with effects; best first."""
+    found: dict[str, np.ndarray] = {}
+    for index in np.argsort(-probabilities, kind="stable"):
+        if candidates[index].effects:
+            found.setdefault(key_of(candidates[index].effects), candidates[index].fit.vector)
+    return tuple(found.items())[:2]
+
+
+def explained(null: np.ndarray, after: np.ndarray, bound: np.ndarray) -> float:
+    """The share of the explainable gap that is explained: (E(null) - E(after)) / (E(null) - E(bound)), from 0 to 1.
+
+    E is the energy above the floor, summed over positions: max(gap^2 - 1, 0).
+
+    Args:
+      null: [positions] gaps of the model without effects, in floor units.
+      after: [positions] of the model with them.
+      bound: [positions] with a learned torque too; what that leaves, no effect of a joint explains either.
+    """
+    energy = [float(np.maximum(gaps**2 - _PERFECT, 0.0).sum()) for gaps in (null, after, bound)]
+    room = energy[0] - energy[2]
+    return float(np.clip((energy[0] - energy[1]) / room, 0.0, 1.0)) if room > 1e-6 else 1.0
+
+
+def learn(settings: Settings, problem: Problem, at: Floor, best: Candidate) -> Candidate:
+    """Fits a learned torque at all joints beside a model: a bound of what is explainable, and a fallback without name.
+
+    Args:
+      settings: rounds of the fit.
+      problem: has the learned torque, or None.
+      at: the floor at the main horizon.
+      best: the model.
+
+    Returns:
+      The model with the torque, or the model itself where there is none.
+    """
+    if problem.residual is None:
+        return best
+    evaluate, point = at.residuals["train"], np.zeros(len(problem.residual.directions))
+    (begun,) = begin(best.fit, [(problem.residual,)], [point], [best.fit.coordinates], evaluate)
+    (fit,) = refine([begun], evaluate, 2 * settings.rounds)
+    return Candidate(best.hypotheses, fit, at.residuals["select"](fit.vector[None])[0])
+
+
+def _proved(
+    settings: Settings, problem: Problem, floor: NoiseFloor, state: State
+) -> tuple[Candidate, tuple[AcceptedTerm, ...], dict[str, np.ndarray], list[tuple[str, dict]]]:
+    """The cheapest model without the effects that do not pass, which are taken out one by one, the weakest first."""
+    at, failed = floor[problem.main_horizon], []
+    (fit,) = polish([state.best.fit], at.residuals["train"], 0)
+    best = replace(state.best, fit=fit)
+    of_effect, of_form = Thresholds(gain=state.price), Thresholds(gain=0.5 * state.price, floors=0.0, horizons=1)
+    fitted = {one.key: one for one in state.candidates}
+    while True:
+        weighed = {h.key: (h, *weigh_evidence(problem, floor, best, h, fitted)) for h in best.hypotheses}
+        tests = {
+            key: passes(evidence, of_form if hypothesis.form else of_effect)
+            for key, (hypothesis, evidence, _) in weighed.items()
+        }
+        wrong = [key for key, passed in tests.items() if not all(passed.values())]
+        if not wrong:
+            break
+        weakest = min(wrong, key=lambda key: weighed[key][1].gain)
+        failed.append((weakest, {"hypothesis": weakest, "tests": tests[weakest], "evidence": weighed[weakest][1]}))
+        best = weighed[weakest][2]
+        (fit,) = polish([best.fit], at.residuals["train"], 1)
+        best = replace(best, fit=fit, select=at.residuals["select"](fit.vector[None])[0])
+    if not best.hypotheses:
+        best = state.null
+        (fit,) = polish([best.fit], at.residuals["train"], 0)
+        best = replace(best, fit=fit)
+    # What explains most is named first.
+    ranked = sorted((row for row in weighed.values() if not row[0].form), key=lambda row: -row[1].gain)
+    terms = tuple(
+        AcceptedTerm(h, evidence, of_effect, (), next((one for one in best.hypotheses if one.shapes(h)), None))
+        for h, evidence, _ in ranked
+    )
+    return best, terms, {h.key: ablated.fit.vector for h, _, ablated in ranked}, failed
+
+
+def _by_select(at: Floor, state: State, best: Candidate, learned: Candidate) -> dict[str, np.ndarray]:
+    """Models by what they are, the one that is best on `select` first."""
+    fits = {"null": state.null, "effects": best, "learned": learned}
+    models = {"nominal": np.zeros_like(best.fit.vector)} | {name: one.fit.vector for name, one in fits.items()}
+    costs = {name: _gap_on_select(at, one.select) for name, one in fits.items()}
+    costs["nominal"] = _gap_on_select(at, at.residuals["select"](models["nominal"][None])[0])
+    return {name: models[name] for name in sorted(models, key=lambda name: costs[name])}
+
+
+def _gap_on_select(at: Floor, residual: np.ndarray) -> float:
+    """Rms of the worst component on `select`; infinite where the model breaks."""
+    found = float(rms(at, residual).max())
+    return found if np.isfinite(found) else np.inf
+
+
+def _effects_first(models: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Puts the model with the named effects first: a name is worth nothing if the model that is saved has not it."""
+    return {"effects": models["effects"], **models}
+
+
+def _open_gaps(problem: Problem, at: Floor, candidate: Candidate) -> np.ndarray:
+    """Gaps of all positions on `train` and `select`, [positions]."""
+    found = rms(at, np.concatenate([candidate.fit.residual, candidate.select]))
+    return found[[signal == "q" for signal, _ in problem.cells]]
+
+
+def _at_bounds(problem: Problem, fit: Fit, price: float) -> dict[int, float]:
+    """Nominal axes that went as far as they may, and how far that is in prior standard deviations.
+
+    Those are left out without which, at their nominal value, the model would cost hardly more.
+    """
+    low, high = fit.free.bounds.T
+    edge = np.minimum(fit.coordinates - low, high - fit.coordinates) < _BOUND * (high - low)
+    found = {}
+    for number in np.flatnonzero(edge):
+        row = fit.free.directions[number]
+        for axis in np.flatnonzero(row):
+            if problem.prior[axis] > 0 and problem.prior[axis] == row[axis] and _worth(fit, number, edge) > price:
+                found[int(axis)] = float(fit.coordinates[number])
+    return found
+
+
+def _worth(fit: Fit, number: int, edge: np.ndarray) -> float:
+    """What a model costs more, to first order, with a coordinate at zero; others answer unless they are at an edge."""
+    value, slope = fit.linear.rows()
+    free = ~edge
+    step = np.zeros(len(fit.coordinates))
+    step[number] = -fit.coordinates[number]
+    moved = value + slope @ step
+    step[free] = np.linalg.lstsq(slope[:, free], -moved, rcond=None)[0]
+    return float(((value + slope @ step) ** 2).sum() - (value**2).sum())
