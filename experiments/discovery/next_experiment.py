@@ -48,6 +48,8 @@ def _as_run(log: Log, motion: TargetRun) -> Run:
     rows = round(segments.HISTORY_S * _RATE_HZ) + 2
     still = np.repeat(motion.target[:1], rows, axis=0)
     target = np.concatenate([still, motion.target])
+    # A servo's gains depend on its supply.
+    supply = {"volts": np.full(len(target), np.median(first.signals["volts"]))} if "volts" in first.signals else {}
     return Run(
         name=motion.name,
         condition=motion.condition,
@@ -58,5 +60,6 @@ def _as_run(log: Log, motion: TargetRun) -> Run:
             "q": np.broadcast_to(motion.target[0], target.shape),
             "target": target,
             "enabled": np.concatenate([np.ones(rows), motion.enabled]),
+            **supply,
         },
     )
