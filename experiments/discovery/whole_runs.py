@@ -13,7 +13,6 @@ from envs.logs import Run
 from experiments.discovery.setup import Question
 
 _WIDTH = 16  # simulations side by side
-_ROOM = 1.3  # factor between the lengths that programs are compiled for
 
 
 def simulate_runs(
@@ -34,9 +33,8 @@ def simulate_runs(
     """
     rig, problem = question.rig, question.problem
     cut = segments.whole(runs, rig.dt)
-    rows = [np.unique(row) for row in cut.row]
     before = cut.segments.measured.shape[1] - 1 - round(LONGEST_S / rig.dt)
-    steps, inputs = cut.segments.sample.shape[1] - before, _padded(cut.segments)
+    steps, inputs = cut.segments.sample.shape[1] - before, _padded(cut.segments, before)
     values = np.asarray(rig.inner(vectors), np.float32)
     which, piece = (grid.ravel() for grid in np.indices((len(vectors), len(runs))))
     found = []
@@ -46,7 +44,13 @@ def simulate_runs(
         some = jax.tree.map(lambda leaf, mine=mine: leaf[piece[mine]], inputs)
         found.append(_play(problem.simulate, problem.system, values[which[mine]], some, steps))
     every = np.concatenate(found)[: len(which)].reshape(len(vectors), len(runs), *found[0].shape[1:])
-    return rows, [every[:, number, : len(own)] for number, own in enumerate(rows)]
+    rows = [np.unique(row) for row in cut.row]
+    return rows, [
+        _at_rows(every[:, number], step[: len(own)], share[: len(own)], steps)
+        for number, (own, step, share) in enumerate(
+            zip(rows, cut.segments.row_step, cut.segments.row_share, strict=True)
+        )
+    ]
 
 
 @partial(jax.jit, static_argnums=0)
@@ -54,14 +58,25 @@ def _play(simulate, system, values, inputs, steps):
     return jax.vmap(lambda value, one: simulate(system, value, one, steps)["q"])(values, inputs)
 
 
-def _padded(cut: segments.Segment) -> segments.Segment:
-    """Repeats the last step and the last row until their numbers are some that programs are compiled for."""
+def _padded(cut: segments.Segment, before: int) -> segments.Segment:
+    """Repeats the last step until their number after the start is a power of two, and reads at every step."""
+    length = cut.sample.shape[1]
+    wanted = before + 2 ** int(np.ceil(np.log2(length - before)))
 
     def longer(leaf: np.ndarray) -> np.ndarray:
-        length = leaf.shape[1]
-        wanted = int(np.ceil(_ROOM ** np.ceil(np.log(length) / np.log(_ROOM))))
         return np.pad(leaf, [(0, 0), (0, wanted - length), *[(0, 0)] * (leaf.ndim - 2)], mode="edge")
 
-    # The measured history has the same length in all runs.
-    names = [one.name for one in fields(cut) if one.name != "measured"]
-    return cut.replace(**{name: longer(getattr(cut, name)) for name in names})
+    # The measured history has the same length in all runs, and rows have many numbers.
+    names = [one.name for one in fields(cut) if one.name not in ("measured", "row_step", "row_share")]
+    every = np.tile(np.arange(wanted - before, dtype=np.int32), (len(cut.sample), 1))
+    return cut.replace(
+        **{name: longer(getattr(cut, name)) for name in names},
+        row_step=every,
+        row_share=np.zeros(every.shape, np.float32),
+    )
+
+
+def _at_rows(read: np.ndarray, step: np.ndarray, share: np.ndarray, steps: int) -> np.ndarray:
+    """Interpolates readings at all steps [..., steps, joints] at the rows' steps and shares, [rows] each."""
+    following = np.minimum(step + 1, steps - 1)
+    return read[:, step] + share[:, None] * (read[:, following] - read[:, step])
