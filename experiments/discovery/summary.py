@@ -11,6 +11,7 @@ from experiments.discovery.next_experiment import deciding_experiment
 from experiments.discovery.setup import Question
 from experiments.discovery.whole_runs import simulate_runs
 from jaxtune.discovery.fit import Fit
+from jaxtune.discovery.problem import Hypothesis
 from jaxtune.discovery.result import AcceptedTerm, Result
 
 _SHOWN = 12  # places with the largest gap that the summary lists
@@ -37,7 +38,7 @@ def summarise(question: Question, log: Log, result: Result) -> dict:
         axis = question.rig.axes[number]
         known = any(change["name"] == axis.effect and axis.place in change["places"] for change in changes)
         if not known and (hypothesis := singles.get(f"{axis.effect}@{axis.place}")) is not None:
-            changes.append(_effect(question.rig, AcceptedTerm(hypothesis, None, None, ()), result.fit, result.errors))
+            changes.append(_effect(question.rig, AcceptedTerm(hypothesis, None, None), result.fit, result.errors))
     not_there = [name for name in LIBRARY if name not in question.rig.effects]
     return {
         "verdict": result.verdict,
@@ -54,7 +55,7 @@ def summarise(question: Question, log: Log, result: Result) -> dict:
             {
                 "name": one.hypothesis.name,
                 "places": list(one.hypothesis.places),
-                "form": one.form,
+                "form": _names(one.forms),
                 "probability": one.probability,
             }
             for one in result.suspects
@@ -69,8 +70,7 @@ def summarise(question: Question, log: Log, result: Result) -> dict:
 def _effect(rig: Rig, term: AcceptedTerm, fit: Fit, errors: np.ndarray) -> dict:
     """Describes a fitted effect: physical values with 95 % intervals, and what would distinguish it from its rivals."""
     hypothesis, parameters = term.hypothesis, {}
-    directions = [*hypothesis.directions, *(term.form.directions if term.form else ())]
-    for direction in directions:
+    for direction in np.concatenate([one.directions for one in (hypothesis, *term.forms)]):
         mine = [i for i, free in enumerate(fit.free.directions) if ((free != 0) & (direction != 0)).any()]
         number = int(np.flatnonzero(direction)[0])
         axis, value = rig.axes[number], fit.vector[number]
@@ -87,10 +87,15 @@ def _effect(rig: Rig, term: AcceptedTerm, fit: Fit, errors: np.ndarray) -> dict:
         "family": hypothesis.family,
         "places": list(hypothesis.places),
         "parameters": parameters,
-        "form": term.form.form if term.form else None,
+        "form": _names(term.forms),
         "confusable_with": list(term.confusable_with),
         "split_by": f"{rig.effects[hypothesis.name].excited_by} on {', '.join(hypothesis.places)}",
     }
+
+
+def _names(forms: Sequence[Hypothesis]) -> str | None:
+    """The forms of an effect in one text; None for its first form."""
+    return ", ".join(form.form for form in forms) or None
 
 
 def free_runs(log: Log, question: Question, result: Result) -> dict:
@@ -151,7 +156,7 @@ def details(question: Question, result: Result, free: dict) -> dict:
                 "hypothesis": term.hypothesis.key,
                 "evidence": term.evidence,
                 "thresholds": term.thresholds,
-                "form": term.form.form if term.form else None,
+                "form": _names(term.forms),
                 "confusable_with": term.confusable_with,
             }
             for term in result.terms

@@ -183,10 +183,7 @@ def _proved(
         best = replace(best, fit=fit)
     # What explains most is named first.
     ranked = sorted((row for row in weighed.values() if not row[0].form), key=lambda row: -row[1].gain)
-    terms = tuple(
-        AcceptedTerm(h, evidence, of_effect, (), next((one for one in best.hypotheses if one.shapes(h)), None))
-        for h, evidence, _ in ranked
-    )
+    terms = tuple(AcceptedTerm(h, evidence, of_effect, forms=best.forms_of(h)) for h, evidence, _ in ranked)
     return best, terms, {h.key: ablated.fit.vector for h, _, ablated in ranked}, failed
 
 

@@ -39,6 +39,10 @@ class Candidate:
         """Its effects without their forms."""
         return tuple(hypothesis for hypothesis in self.hypotheses if not hypothesis.form)
 
+    def forms_of(self, effect: Hypothesis) -> tuple[Hypothesis, ...]:
+        """Its forms of one of its effects."""
+        return tuple(hypothesis for hypothesis in self.hypotheses if hypothesis.shapes(effect))
+
     def price(self, of_effect: float) -> float:
         """Returns what its hypotheses cost; a form costs half, as there are few to choose from."""
         return of_effect * (len(self.hypotheses) + len(self.effects)) / 2
@@ -185,7 +189,7 @@ def passes(evidence: Evidence, thresholds: Thresholds) -> dict[str, bool]:
 
 
 def ablate(at: Floor, candidate: Candidate, hypothesis: Hypothesis, fitted: Mapping[str, Candidate]) -> Candidate:
-    """Takes an effect with its form out of a candidate and fits the rest again, unless that model was fitted already.
+    """Takes an effect with its forms out of a candidate and fits the rest again, unless that model was fitted already.
 
     Args:
       at: the floor at the main horizon.
@@ -193,7 +197,7 @@ def ablate(at: Floor, candidate: Candidate, hypothesis: Hypothesis, fitted: Mapp
       hypothesis: the effect.
       fitted: models by key.
     """
-    gone = [other for other in candidate.hypotheses if other is hypothesis or other.shapes(hypothesis)]
+    gone = [hypothesis, *candidate.forms_of(hypothesis)]
     others = tuple(other for other in candidate.hypotheses if all(other is not one for one in gone))
     if key_of(others) in fitted:
         return fitted[key_of(others)]
@@ -208,14 +212,13 @@ def ablate(at: Floor, candidate: Candidate, hypothesis: Hypothesis, fitted: Mapp
 def believed(candidates: Sequence[Candidate], probabilities: np.ndarray) -> list[Suspect]:
     """Lists every effect of the candidates with the probability that it is there, most likely first.
 
-    Its form is that of the most likely model that has it.
+    Its forms are those of the most likely model that has it.
     """
     found: dict[str, Suspect] = {}
     for index in np.argsort(-probabilities, kind="stable"):
         candidate, probability = candidates[index], float(probabilities[index])
         for hypothesis in candidate.effects:
-            forms = [other.form for other in candidate.hypotheses if other.shapes(hypothesis)]
-            known = found.get(hypothesis.key, Suspect(hypothesis, forms[0] if forms else None, 0.0))
+            known = found.get(hypothesis.key, Suspect(hypothesis, candidate.forms_of(hypothesis), 0.0))
             found[hypothesis.key] = replace(known, probability=known.probability + probability)
     return sorted(found.values(), key=lambda one: -one.probability)
 

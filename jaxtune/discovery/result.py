@@ -63,10 +63,10 @@ class AcceptedTerm:
     """A `decide.Evidence`."""
     thresholds: Any
     """The `decide.Thresholds` that it passed."""
-    confusable_with: tuple[str, ...]
+    confusable_with: tuple[str, ...] = ()
     """Names of other effects that these logs cannot distinguish from it, or that explain nearly as much."""
-    form: Any = None
-    """A `problem.Hypothesis` about its form, or None where its first form is as good."""
+    forms: tuple[Any, ...] = ()
+    """Each a `problem.Hypothesis` about its form; none where its first form is as good."""
 
 
 @dataclass(frozen=True)
@@ -75,8 +75,8 @@ class Suspect:
 
     hypothesis: Any
     """A `problem.Hypothesis`."""
-    form: str | None
-    """Its form in the most likely model that has it; None for its first form."""
+    forms: tuple[Any, ...]
+    """Its forms in the most likely model that has it, as in `AcceptedTerm`."""
     probability: float
 
 

@@ -107,8 +107,7 @@ def _next_base(at: Floor, state: State) -> Candidate | None:
 def _free(settings: Settings, problem: Problem, at: Floor, base: Candidate, state: State) -> list[Hypothesis]:
     """Lists what may join a model: forms of its effects, and other effects unless it is at the floor or full."""
     full = state.screened and (len(base.effects) >= settings.most or worst(at, base) <= settings.at_floor)
-    unshaped = [h for h in base.effects if not any(other.shapes(h) for other in base.hypotheses)]
-    forms = [form for form in problem.forms if any(form.shapes(h) for h in unshaped)]
+    forms = [form for form in problem.forms if any(form.shapes(h) for h in base.effects)]
     left_out = {h.key for h in state.best.hypotheses} - {h.key for h in base.hypotheses}
     return [
         h

@@ -88,6 +88,8 @@ def measured(truth, seed, split=0, count=40, motion=None):
 
 # While the slider slides, friction that differs between directions is friction and a push.
 DIRECTION = replace(HYPOTHESES[3], name="coulomb", family="friction", form="direction_dependent")
+# Friction that grows away from the middle of the slide, as of a warped rail.
+WARPED = replace(hypothesis("cubic", (0.0, 30.0), [1.0, 10.0]), name="coulomb", form="warped")
 
 
 def problem(truth, seed=0, hypotheses=HYPOTHESES, forms=()):

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from slider import AXES, DIRECTION, HYPOTHESES, WILD, problem
+from slider import AXES, DIRECTION, HYPOTHESES, WARPED, WILD, problem
 
 from jaxtune.discovery import noise_floor, state, step, workflow
 from jaxtune.discovery.conclude import explained
@@ -61,17 +61,26 @@ def test_a_form_is_found_with_its_effect_and_is_no_name_of_its_own():
     result = discover({"coulomb": 1.2, "push": 0.6}, forms=(DIRECTION,))
     assert result.verdict == "named"
     (term,) = result.terms
-    assert (term.hypothesis.name, term.form.form) == ("coulomb", "direction_dependent")
+    assert (term.hypothesis.name, [form.form for form in term.forms]) == ("coulomb", ["direction_dependent"])
     assert result.fit.vector[AXES.index("push")] == pytest.approx(0.6, abs=0.05)
-    assert (result.suspects[0].hypothesis.name, result.suspects[0].form) == ("coulomb", "direction_dependent")
+    (form,) = result.suspects[0].forms
+    assert (result.suspects[0].hypothesis.name, form.form) == ("coulomb", "direction_dependent")
     # Without the effect its form is gone too.
     assert result.proof["others"]["without coulomb@slider"] > result.gap["after"] + 1.0
     assert result.gap["after"] < 1.3
 
 
+def test_an_effect_may_have_several_forms():
+    result = discover({"coulomb": 1.2, "push": 0.6, "cubic": 6.0}, forms=(DIRECTION, WARPED))
+    assert result.verdict == "named"
+    (term,) = result.terms
+    assert {form.form for form in term.forms} == {"direction_dependent", "warped"}
+    assert result.gap["after"] < 1.3
+
+
 def test_an_effect_in_its_first_form_gets_no_other():
     result = discover({"coulomb": 1.2}, forms=(DIRECTION,))
-    assert [(term.hypothesis.name, term.form) for term in result.terms] == [("coulomb", None)]
+    assert [(term.hypothesis.name, term.forms) for term in result.terms] == [("coulomb", ())]
 
 
 def test_the_two_models_that_are_most_believed_differ_in_more_than_form():
