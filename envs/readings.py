@@ -14,6 +14,7 @@ from envs.logs import Run
 
 _LEAST_NOISE = 1e-6
 _STALE = 3.0  # a repetition is stale where the joint moved by more than this many quanta meanwhile
+_FLIPS = 1.5  # times as many repetitions, from which on those that differ by a bit count
 _STEADY = 0.6  # least ratio of the speeds of a joint that moves on
 
 
@@ -145,6 +146,16 @@ def read_later(run: Run, signal: str) -> np.ndarray:
     return np.nan_to_num(run.fact(signal, "offset_s")) - np.nan_to_num(delay)
 
 
+def _new(values: np.ndarray, within: float) -> np.ndarray:
+    """Rows whose value differs from the last new one, the first row among them."""
+    rows, last = [0], values[0]
+    for row, value in enumerate(values.tolist()):
+        if abs(value - last) > within:
+            rows.append(row)
+            last = value
+    return np.array(rows)
+
+
 def stale(run: Run, signal: str) -> np.ndarray:
     """Finds readings that only repeat the last one, because the bus or the sensor was slower than the log.
 
@@ -159,19 +170,28 @@ def stale(run: Run, signal: str) -> np.ndarray:
     Returns:
       [rows, columns], true where a reading is stale.
     """
-    values, found = run.signals[signal], np.zeros(run.signals[signal].shape, bool)
+    found = np.zeros(run.signals[signal].shape, bool)
     for column, quantum in enumerate(rounding_of(run, signal)):
-        # The first row of every new value, and the motion and speed from there to the next one.
-        new = np.append(0, 1 + np.flatnonzero(np.diff(values[:, column])))
-        if len(new) < 3:
-            continue
-        motion, rows = np.diff(values[new, column]), np.diff(new)
-        speed = motion / np.diff(run.time[new])
-        on = np.minimum(speed[1:] / speed[:-1], speed[:-1] / speed[1:]) > _STEADY
-        on = np.append(False, on) | np.append(on, False)
-        far = np.abs(motion) * (rows - 1) / rows > _STALE * quantum
-        for first, count in zip(new[:-1][on & far], rows[on & far], strict=True):
-            found[first + 1 : first + count, column] = True
+        values = run.signals[signal][:, column]
+        exact, about = (_stale(run.time, values, quantum, within) for within in (0.0, 1.01 * quantum))
+        # Noise flips the last bit of a value that is held. Where it does not, values that differ by a bit are new.
+        found[:, column] = about if about.sum() > _FLIPS * exact.sum() else exact
+    return found
+
+
+def _stale(time: np.ndarray, values: np.ndarray, quantum: float, within: float) -> np.ndarray:
+    """Finds stale readings [rows] of a column, in which a value repeats the last new one if it is as near as this."""
+    found, new = np.zeros(len(values), bool), _new(values, within)
+    if len(new) < 3:
+        return found
+    # From the first row of every new value to the next one.
+    motion, rows = np.diff(values[new]), np.diff(new)
+    speed = motion / np.diff(time[new])
+    on = np.minimum(speed[1:] / speed[:-1], speed[:-1] / speed[1:]) > _STEADY
+    on = np.append(False, on) | np.append(on, False)
+    far = np.abs(motion) * (rows - 1) / rows > _STALE * quantum
+    for first, count in zip(new[:-1][on & far], rows[on & far], strict=True):
+        found[first + 1 : first + count] = True
     return found
 
 

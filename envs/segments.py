@@ -193,7 +193,11 @@ def _of_run(run: Run, start: np.ndarray, rows: np.ndarray, after: int, dt: float
     at = (run.time[rows] - begin) / dt
     step = np.minimum(np.floor(at + 1e-6).astype(np.int32), after - 1)
     position, velocity = np.moveaxis(smoothed(run), 1, 0)
-    states = hermite(run.time, position, velocity, begin + dt * np.arange(-before, ahead + 1))
+    fine = begin + dt * np.arange(-before, ahead + 1)
+    # The slope of interpolated positions would have several times the noise of the velocities, but not at the rows: a
+    # delay of whole rows would then seem likelier than any other.
+    acceleration = np.gradient(velocity, run.time, axis=0)
+    states = [hermite(run.time, *pair, fine)[0] for pair in ((position, velocity), (velocity, acceleration))]
     return Segment(
         target=target,
         between=between,

@@ -181,6 +181,20 @@ def test_stale_readings_bias_nothing():
     assert (segments.noise(read)[0] > 0.005).all()
 
 
+def test_a_value_that_is_held_is_stale_though_noise_flips_its_last_bit():
+    time, exact, read = slow_bus()
+    quantum = 2 * np.pi / 4096
+    flipped = read + quantum * np.random.default_rng(3).integers(0, 2, read.shape)
+    mine = run(time, q=flipped)
+    fast = np.abs(np.gradient(exact, time, axis=0)) > 1.0
+    repeats = np.arange(len(time)) % 3 > 0
+    assert readings.stale(mine, "q")[repeats][fast[repeats]].mean() > 0.95
+    assert (readings.noise_of(mine, "q") < 0.002).all()
+    # Readings that are never held have none, whatever their noise.
+    own = slow_bus(every=1)[2] + quantum * np.random.default_rng(4).integers(0, 2, read.shape)
+    assert readings.stale(run(time, q=own), "q").mean() < 0.01
+
+
 def test_known_noise_counts_and_what_is_not_known_is_estimated_over_all_runs():
     time = times(4.0)
     moving = 0.3 * np.sin(5.0 * time)[:, None] * [1.0, 1.0] + 0.01 * np.random.default_rng(6).standard_normal((801, 2))
