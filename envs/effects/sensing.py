@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from envs.effects.memory import as_it_is, delay_line, delayed, lagged
-from jaxtune.types import Effect, Parameter
+from jaxtune.types import Effect, Form, Parameter
 
 _SENSING = {"family": "sensing"}
 
@@ -83,6 +83,7 @@ ROWS = (
         act=_sensor_delay,
         start=delay_line,
         undo=_undo_delay,
+        forms=(Form("filtered", "sensor_lag", "seconds"),),
         sentence="Positions and velocities are read late.",
         excited_by="a chirp to 10 Hz at two controller gains",
         **_SENSING,
@@ -96,6 +97,7 @@ ROWS = (
         act=_sensor_lag,
         start=as_it_is,
         undo=_undo_lag,
+        forms=(Form("delayed", "sensor_delay", "seconds"),),
         sentence="Positions and velocities are read through a low-pass filter.",
         excited_by="a chirp to 10 Hz at two controller gains",
         **_SENSING,

@@ -52,11 +52,12 @@ def _backlash(values, torque, now, memory):
 
 
 def _compliance(values, torque, now, memory):
-    """A spring of stiffness k = 1 / softness: o' = softness (pressing + R o) / (1 + softness R)."""
+    """A spring of stiffness k = 1 / softness that may harden: o' (1 + h o'^2) = softness (pressing + R (o - o'))."""
     offset, rate = memory
     softness = values["nm_per_rad"]
     resistance = _resistance(now)
-    following = softness * (_pressing(torque, now, rate) + resistance * offset) / (1.0 + softness * resistance)
+    wound = softness * (_pressing(torque, now, rate) + resistance * offset)
+    following = _root(1.0 + softness * resistance, values["hardening_per_rad2"], wound)
     fresh = (following - offset) / now.dt
     # The torque of a measured motor is known only row by row, so its slope is averaged over a few.
     rate = jnp.where(now.measured, rate + now.dt / _SLOPE_S * (fresh - rate), fresh)
@@ -71,9 +72,17 @@ def _taken_up(values, torque, dt):
 
 
 def _wound_up(values, torque, dt):
-    """Starts with the spring wound up by the motor's torque: o = softness torque."""
+    """Starts with the spring wound up by the motor's torque: o (1 + h o^2) = softness torque."""
     del dt
-    return jnp.stack([values["nm_per_rad"] * torque, jnp.zeros_like(torque)])
+    offset = _root(1.0, values["hardening_per_rad2"], values["nm_per_rad"] * torque)
+    return jnp.stack([offset, jnp.zeros_like(torque)])
+
+
+def _root(linear, cubic, value):
+    """The real x with linear x + cubic x^3 = value, for linear > 0 and cubic >= 0."""
+    share = jnp.sqrt(3.0 * jnp.maximum(cubic, 1e-6) / linear)
+    root = 2.0 / share * jnp.sinh(jnp.arcsinh(1.5 * share * value / linear) / 3.0)
+    return jnp.where(cubic > 0, root, value / linear)
 
 
 ROWS = (
@@ -92,10 +101,14 @@ ROWS = (
     Effect(
         name="compliance",
         enters="transmission",
-        parameters=(Parameter(name="nm_per_rad", form="reciprocal", scale="stiffness", bounds=(0.0, 20.0), prior=1.0),),
+        parameters=(
+            Parameter(name="nm_per_rad", form="reciprocal", scale="stiffness", bounds=(0.0, 20.0), prior=1.0),
+            Parameter(name="hardening_per_rad2", bounds=(0.0, 200.0), prior=30.0),
+        ),
         sizes=(0.2, 2.0),
         act=_compliance,
         start=_wound_up,
+        forms=(Form("hardening", "compliance", "hardening_per_rad2"),),
         sentence="A spring sits between motor and joint.",
         excited_by="a chirp through its resonance, and postures of high gravity torque",
         **_TRANSMISSION,

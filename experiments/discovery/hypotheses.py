@@ -43,14 +43,15 @@ def forms(axes: Sequence[Axis], rows: Mapping[str, Effect], every: Sequence[Hypo
     """
     index = {(axis.effect, axis.parameter, axis.place): number for number, axis in enumerate(axes)}
     return tuple(
-        replace(_hypothesis(axes, index, rows[form.effect], one.places, form.parameter), **_named(one, form.name))
+        _as_form(_hypothesis(axes, index, rows[form.effect], one.places, form.parameter), one, form.name)
         for one in every
         for form in rows[one.name].forms
     )
 
 
-def _named(hypothesis: Hypothesis, form: str) -> dict:
-    return {"name": hypothesis.name, "family": hypothesis.family, "form": form}
+def _as_form(shape: Hypothesis, effect: Hypothesis, form: str) -> Hypothesis:
+    # Where two effects may each be a form of the other, the larger part gives the name.
+    return replace(shape, name=effect.name, family=effect.family, form=form, prior=0.5 * shape.prior)
 
 
 _RIGHT = {"left": "right", "l": "r", "fl": "fr", "rl": "rr", "hl": "hr", "bl": "br"}
@@ -181,7 +182,7 @@ def _probes(sizes: Sequence[float], parameters: Sequence[Parameter], least: floa
         return probes
     most, bends = parameters[free[0]].bounds[1], len(sizes) > 1
     sizes = np.geomspace(sizes[0], _LARGE * most, _BENT if bends else _STRAIGHT)
-    below = [-size for size in sizes if -size > _LARGE * least]
+    below = [-size for size in sizes if -size >= _LARGE * least - 1e-9]
     # Armature and damping can be lowered by less than their smallest size of interest.
     below = below or ([0.5 * least] if least < 0 else [])
     values = np.array([*below, *sizes])

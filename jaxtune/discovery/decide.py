@@ -63,6 +63,8 @@ class Evidence:
     """Fall of the cost on `select` alone, where nothing was fitted, prior included."""
     floors: float
     """Root of the largest fall of a single component's mean square on `select`, in floor units."""
+    left: float
+    """Rms of the worst component on `select` with the effect, in floor units."""
     relief: float
     """Fall of what the prior says against the other coordinates: without the effect they imitate it."""
     interval: tuple[float, float]
@@ -80,6 +82,9 @@ class Thresholds:
     gain: float
     """Fall of the cost that the best hypothesis reaches on null logs with probability `Settings.level`."""
     floors: float = 1.0
+    of_left: float = 0.5
+    """What `floors` has to reach as a share of `left`: where much is left, a small gain is of another form of an effect
+    that is there already."""
     relief: float = 9.0
     """In the place of `floors`: a parameter that need not be three deviations off."""
     horizons: int = 2
@@ -155,11 +160,12 @@ def weigh_evidence(
     distance = np.where((hypothesis.probes != 0).any(axis=0), np.abs(values) / errors, 0.0)
     clearest = int(distance.argmax())
     relief = ablated.fit.penalty - candidate.fit.penalty
-    mean = lambda one: one[held_out:].mean(axis=0) / len(at.scale["train"])  # noqa: E731
+    mean_squares = [(at.in_floors(one.select) ** 2).mean(axis=(0, 1)) for one in (ablated, candidate)]
     evidence = Evidence(
         gain=total_cost(at, ablated, 0.0) - total_cost(at, candidate, 0.0),
         confirmed=_cost(at, before[held_out:]) - _cost(at, now[held_out:]) + relief,
-        floors=float(np.sqrt(max((mean(before) - mean(now)).max(), 0.0))),
+        floors=float(np.sqrt(max((mean_squares[0] - mean_squares[1]).max(), 0.0))),
+        left=float(np.sqrt(mean_squares[1].max())),
         relief=relief,
         interval=(
             float(values[clearest] - 1.96 * errors[clearest]),
@@ -179,7 +185,8 @@ def passes(evidence: Evidence, thresholds: Thresholds) -> dict[str, bool]:
         "beyond_chance": evidence.gain > thresholds.gain,
         "confirmed": evidence.confirmed > 0.0,
         # What nominal parameters can imitate shows in how far they must go, and not in the residuals.
-        "matters": evidence.floors >= thresholds.floors or evidence.relief >= thresholds.relief,
+        "matters": evidence.floors >= max(thresholds.floors, thresholds.of_left * evidence.left)
+        or evidence.relief >= thresholds.relief,
         # A fit that ran into a bound stands in for another effect.
         "inside_bounds": evidence.inside,
         "clear_of_zero": low > 0 or high < 0,

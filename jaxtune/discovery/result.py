@@ -18,6 +18,8 @@ class Settings:
     """Hypotheses that are fitted, beside the best of each family."""
     firsts: int = 12
     """How many of the best hypotheses are screened with every other one as a pair."""
+    again: int = 24
+    """How many of the best hypotheses are screened again beside a model that has effects."""
     pairs: int = 8
     """How many of the best pairs are fitted."""
     shaped: int = 4

@@ -80,7 +80,51 @@ class Screen:
     """[logs]: fall of the cost that the best hypothesis reaches on each null log."""
 
 
-def screen(at: Floor, base: Fit, hypotheses: Sequence[Hypothesis], *, pairs: int, say: Say) -> Screen:
+@dataclass(frozen=True)
+class Library:
+    """How the nominal model changes with every axis, from the first screen."""
+
+    segments: np.ndarray
+    """Indices of those of `train` that were simulated."""
+    curves: Curves
+
+
+def simulate_library(at: Floor, nominal: Fit, hypotheses: Sequence[Hypothesis], say: Say) -> Library:
+    """Simulates every axis of the hypotheses alone, from the nominal model.
+
+    Args:
+      at: the floor at the main horizon.
+      nominal: the nominal model.
+      hypotheses: all of them.
+      say: receives a line of text about progress.
+    """
+    chosen = spread_segments(at, nominal)
+    return Library(chosen, simulate_curves(at, on_segments(at, nominal, chosen), chosen, hypotheses, say))
+
+
+def promising(at: Floor, base: Fit, hypotheses: Sequence[Hypothesis], library: Library, count: int) -> list[Hypothesis]:
+    """Picks the hypotheses that would lower the cost of a model most, if it changed as the nominal model does.
+
+    Args:
+      at: the floor at the main horizon.
+      base: the model, with slopes of all that is free in it.
+      hypotheses: of which to pick.
+      library: of the nominal model.
+      count: how many.
+    """
+    profile = profile_of(on_segments(at, base, library.segments), library.curves.changes)
+    return sorted(hypotheses, key=lambda one: _best(profile, one, library.curves).cost)[:count]
+
+
+def screen(
+    at: Floor,
+    base: Fit,
+    hypotheses: Sequence[Hypothesis],
+    *,
+    pairs: int,
+    library: Library | None = None,
+    say: Say = lambda text: None,
+) -> Screen:
     """Screens hypotheses beside a model.
 
     Args:
@@ -88,11 +132,12 @@ def screen(at: Floor, base: Fit, hypotheses: Sequence[Hypothesis], *, pairs: int
       base: the model, fitted or nominal, with slopes of all that is free in it.
       hypotheses: what may join it.
       pairs: how many of the best hypotheses are tried with every other one.
+      library: how the axes change this very model, where that is known.
       say: receives a line of text about progress.
     """
-    chosen = spread_segments(at, base)
+    library = library or simulate_library(at, base, hypotheses, say)
+    chosen, curves = library.segments, library.curves
     some = on_segments(at, base, chosen)
-    curves = simulate_curves(at, some, chosen, hypotheses, say)
     say("answers of the nominal parameters")
     profile = profile_of(some, curves.changes)
     firsts = sorted((_best(profile, hypothesis, curves) for hypothesis in hypotheses), key=lambda lead: lead.cost)

@@ -15,7 +15,7 @@ from jaxtune.discovery.fit import Fit, Free, refine
 from jaxtune.discovery.noise_floor import NoiseFloor, with_systematic_share
 from jaxtune.discovery.problem import Problem
 from jaxtune.discovery.result import Settings
-from jaxtune.discovery.screen import Screen
+from jaxtune.discovery.screen import Library, Screen
 
 _NULL_ROUNDS = 8
 
@@ -52,6 +52,8 @@ class State:
     in floor units; zero where the joint needs none."""
     not_finite: tuple[str, ...] = ()
     """Keys of models that broke the simulation."""
+    library: Library | None = None
+    """How the nominal model changes with every effect; it is not saved, but simulated again."""
 
     def replaced(self, old: Candidate, new: Candidate) -> "State":
         """Puts a better fit of the same model in the place of the old one."""

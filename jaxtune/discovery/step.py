@@ -19,10 +19,22 @@ from jaxtune.discovery.localise import localise
 from jaxtune.discovery.noise_floor import Floor, NoiseFloor, Say
 from jaxtune.discovery.problem import Hypothesis, Problem, are_distinct
 from jaxtune.discovery.result import Settings
-from jaxtune.discovery.screen import Lead, Screen, on_segments, screen, spread_segments
+from jaxtune.discovery.screen import (
+    Lead,
+    Library,
+    Screen,
+    on_segments,
+    promising,
+    screen,
+    simulate_library,
+    spread_segments,
+)
 from jaxtune.discovery.state import State
 
 _MOST_PLACES = 3  # of one name among the leads that are fitted: they tell where; more would crowd out other names
+
+
+_REACH = 0.5  # share of the best fit's gain that another one needs for fresh slopes
 
 
 @dataclass(frozen=True)
@@ -70,7 +82,12 @@ def step(
         state = localise(problem, at, state.replaced(base, fresh), fit)
     # Nominal parameters of the null have moved to imitate what is missing.
     base, best = fresh if state.screened else replace(fresh, fit=state.nominal), state.best
-    found = screen(at, base.fit, free, pairs=0 if state.screened else settings.firsts, say=say)
+    library = state.library or simulate_library(at, state.nominal, problem.hypotheses, say)
+    state = replace(state, library=library)
+    if state.screened:
+        found = screen(at, base.fit, _again(settings, at, base.fit, free, library), pairs=0, say=say)
+    else:
+        found = screen(at, base.fit, free, pairs=settings.firsts, library=library, say=say)
     state = state.with_screen(settings, problem, found)
     leads = shortlist(settings, found, state.price)
     leads = leads[: settings.swaps] if swapping else leads + shaped(problem, leads[: settings.shaped])
@@ -114,6 +131,13 @@ def _free(settings: Settings, problem: Problem, at: Floor, base: Candidate, stat
         for h in (*forms, *(() if full else problem.hypotheses))
         if h.key not in left_out and all(are_distinct(h, other) for other in base.hypotheses)
     ]
+
+
+def _again(settings: Settings, at: Floor, base: Fit, free: Sequence[Hypothesis], library: Library) -> list[Hypothesis]:
+    """Picks what is screened again beside a model that has effects: all forms, and the other effects that would lower
+    its cost most if they changed it as they change the nominal model."""
+    forms = [h for h in free if h.form]
+    return forms + promising(at, base, [h for h in free if not h.form], library, settings.again)
 
 
 def shortlist(settings: Settings, found: Screen, price: float) -> list[Lead]:
@@ -174,8 +198,10 @@ def fit_leads(
         return []
     whole = _on_all(at, [fits[index] for index in order])
     whole.sort(key=lambda pair: pair[1].cost)
-    best = polish([fit for _, fit in whole[: settings.finalists]], at.residuals["train"], settings.rounds)
-    every = [*best, *(fit for _, fit in whole[settings.finalists :])]
+    least, before = whole[0][1].cost, base.cost
+    finalists = [fit for _, fit in whole[: settings.finalists] if before - fit.cost >= _REACH * (before - least)]
+    best = polish(finalists, at.residuals["train"], settings.rounds)
+    every = [*best, *(fit for _, fit in whole[len(finalists) :])]
     select = at.residuals["select"](np.stack([fit.vector for fit in every]))
     return [
         Candidate((*present, *groups[order[index]]), fit, residual)

@@ -389,6 +389,13 @@ def test_a_spring_winds_up_by_torque_over_stiffness():
     np.testing.assert_allclose(torque / offset, 60.0, rtol=1e-5)
 
 
+@pytest.mark.parametrize("hardening", [0.5, 40.0, 200.0])
+def test_a_hardening_spring_balances_its_controller(hardening):
+    torque, offset = wound("compliance", np.full(5, 0.5), nm_per_rad=10.0, hardening_per_rad2=hardening)
+    np.testing.assert_allclose(torque, 20.0 * (0.5 - offset), rtol=1e-5)
+    np.testing.assert_allclose(torque, 10.0 * offset * (1.0 + hardening * offset**2), rtol=1e-4)
+
+
 def test_a_spring_winds_up_as_slowly_as_its_controller_lets_it():
     # 0.8 Nm s/rad against 20 + 60 Nm/rad: a time constant of 10 ms. Steps are taken by their end, so a step of 1 ms
     # leaves 1 / 1.1.

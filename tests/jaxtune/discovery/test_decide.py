@@ -11,7 +11,9 @@ from jaxtune.discovery.decide import Evidence, Thresholds, believed, passes, pos
 from jaxtune.discovery.resample import correlation_length, times_drawn, units
 from jaxtune.discovery.result import Settings
 
-GOOD = Evidence(gain=50.0, confirmed=20.0, floors=2.0, relief=0.0, interval=(0.1, 0.2), inside=True, horizons=3)
+GOOD = Evidence(
+    gain=50.0, confirmed=20.0, floors=2.0, left=1.1, relief=0.0, interval=(0.1, 0.2), inside=True, horizons=3
+)
 
 
 @pytest.fixture(scope="module")
@@ -28,6 +30,8 @@ def stepped():
         ("beyond_chance", {"gain": 9.0}),
         ("confirmed", {"confirmed": -0.1}),
         ("matters", {"floors": 0.9}),
+        # Much is left: another form of what is there already would do the same.
+        ("matters", {"left": 4.5}),
         ("clear_of_zero", {"interval": (-0.1, 0.2)}),
         ("inside_bounds", {"inside": False}),
         ("horizons", {"horizons": 1}),
