@@ -265,7 +265,8 @@ def rivals(
             continue
         explained = (nothing - total_cost(at, candidate, 0.0)) / max(most, 1e-9)
         for other in candidate.effects:
-            if other.key not in others and explained > settings.same:
+            kin = other.family == hypothesis.family and set(other.places) & set(hypothesis.places)
+            if other.key not in others and explained > (settings.akin if kin else settings.same):
                 found[other.name] = max(found.get(other.name, 0.0), explained)
             elif other.key not in others and probability > settings.possible:
                 found[other.name] = max(found.get(other.name, 0.0), float(probability))

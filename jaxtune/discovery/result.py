@@ -44,6 +44,8 @@ class Settings:
     same: float = 0.9
     """Share of the best explanation from which on another name may as well be right, since effects have more functional
     forms than the one in the library."""
+    akin: float = 0.6
+    """The same for a name of the same family at the same place, as a low-pass filter is beside a delay."""
     possible: float = 0.05
     """Probability from which on another name may as well be right."""
     rivals: int = 3
