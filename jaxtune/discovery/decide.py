@@ -160,7 +160,7 @@ def weigh_evidence(
     distance = np.where((hypothesis.probes != 0).any(axis=0), np.abs(values) / errors, 0.0)
     clearest = int(distance.argmax())
     relief = ablated.fit.penalty - candidate.fit.penalty
-    mean_squares = [(at.in_floors(one.select) ** 2).mean(axis=(0, 1)) for one in (ablated, candidate)]
+    mean_squares = [one[held_out:].mean(axis=0) / len(at.scale["train"]) for one in (before, now)]
     evidence = Evidence(
         gain=total_cost(at, ablated, 0.0) - total_cost(at, candidate, 0.0),
         confirmed=_cost(at, before[held_out:]) - _cost(at, now[held_out:]) + relief,

@@ -8,8 +8,8 @@ from jaxtune.discovery.problem import Problem
 
 
 def rms(at: Floor, residual: np.ndarray) -> np.ndarray:
-    """Root mean squares [components] of whitened residuals [features], in floor units; a perfect model has ones."""
-    return np.sqrt((at.in_floors(residual) ** 2).mean(axis=(0, 1)))
+    """Root mean squares [components] of residuals [features] in floor units; one is what a perfect model would have."""
+    return np.sqrt((at.unflatten(residual) ** 2).mean(axis=(0, 1)))
 
 
 def worst(at: Floor, candidate: Candidate) -> float:

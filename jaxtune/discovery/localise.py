@@ -30,11 +30,11 @@ def localise(problem: Problem, at: Floor, state: State, fit: Fit) -> State:
     Returns:
       The state with `where`, `needs_torque` and `penalty`.
     """
-    residual = at.in_floors(fit.residual)
+    residual = at.unflatten(fit.residual)
     if problem.push:
         slopes = torque_slopes(problem, at, fit)
         penalty = state.penalty or null_penalty(at.null_residuals, slopes)
-        need = free_torque(fit.residual.reshape(len(residual), -1), slopes, penalty)
+        need = free_torque(residual.reshape(len(residual), -1), slopes, penalty)
         needs_torque = dict(zip(problem.push, need.tolist(), strict=True))
         state = replace(state, penalty=penalty, needs_torque=needs_torque)
     if state.where:

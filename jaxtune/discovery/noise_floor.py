@@ -4,11 +4,8 @@ It is measured on simulated null logs: another engine moves the nominal robot, w
 the measured log's noise. Their nominal parameters are fitted. The residuals that are left hold noise, rounding, the
 error of the state that a segment starts from, and the gap between engines. What all logs leave alike is subtracted from
 the measured residuals too. The rms of the rest, for every component of every signal and every moment of a segment, is
-the floor. A residual of one floor unit is as large as that rms, which even a model in which nothing is missing leaves.
-
-What is left at one moment of a segment goes together with what is left later: an error of the start grows, and a wrong
-velocity is a ramp. So models are compared by whitened residuals, which a model that lacks nothing leaves independent of
-each other (generalised least squares). What an error of the start looks like counts for little there.
+the floor. All other modules work on residuals divided by it: a residual of one
+floor unit is as large as that rms, which even a model in which nothing is missing leaves.
 """
 
 from collections.abc import Callable, Mapping
@@ -49,16 +46,14 @@ class Floor:
     further off in some postures than in others."""
     counts: Counts
     """How many independent numbers residuals are worth."""
-    white: np.ndarray
-    """[components, bins, bins] what whitens the residuals of a component in floor units."""
     residuals: Mapping[str, Evaluate]
-    """By split: simulates vectors [n, axes] and returns residuals [n, features] in floor units, whitened."""
+    """By split: simulates vectors [n, axes] and returns residuals [n, features] in floor units."""
     on_some: Callable[[np.ndarray], Evaluate]
     """The same of `train` on some of its segments, by their indices."""
     prior: Free
     """The prior directions, which are free under every hypothesis."""
     null_residuals: np.ndarray
-    """[logs, features]: what fits of the prior directions leave of the null logs' `train`, in floor units, whitened."""
+    """[logs, features]: what fits of the prior directions leave of the null logs' `train`, in floor units."""
     null_coordinates: np.ndarray
     """[logs, directions]: where these fits stand."""
 
@@ -73,10 +68,6 @@ class Floor:
     def unflatten(self, flat: np.ndarray) -> np.ndarray:
         """Reshapes flat residuals [features, ...], which fits work on, to [segments, bins, components, ...]."""
         return flat.reshape(-1, *self.scale["train"].shape, *flat.shape[1:])
-
-    def in_floors(self, flat: np.ndarray) -> np.ndarray:
-        """Turns whitened residuals [features] into floor units, [segments, bins, components]."""
-        return whitened(np.linalg.inv(self.white), self.unflatten(flat))
 
 
 NoiseFloor = Mapping[float, Floor]
@@ -110,7 +101,7 @@ def measure(problem: Problem, say: Say) -> NoiseFloor:
     """
     prior, main = prior_directions(problem), problem.main_horizon
     say(f"noise floor at {main:g} s")
-    coordinates = _fit_null_logs(problem, prior)
+    coordinates, unit = _fit_null_logs(problem, prior)
     fits = coordinates @ prior.directions
     found = {}
     for horizon in problem.horizons:
@@ -121,20 +112,18 @@ def measure(problem: Problem, say: Say) -> NoiseFloor:
         shared = {split: _shared(values) for split, values in left.items()}
         left = {split: values - shared[split] for split, values in left.items()}
         scale = {split: _rms_floor(values) for split, values in left.items()}
-        white = whitening(left["train"] / scale["train"])
-        in_units = whitened(white, left["train"] / scale["train"])
-        units = {split: Units(shared[split], scale[split], white) for split in problem.data}
+        in_units = left["train"] / scale["train"]
         segments = {split: data[horizon] for split, data in problem.data.items()}
         found[horizon] = Floor(
             horizon=horizon,
             scale=scale,
-            white=white,
             counts=Counts(
-                components=in_units.shape[-1],
-                independent=independent_share(in_units.reshape(-1, *in_units.shape[2:])),
+                components=unit.shape[-1], independent=independent_share(in_units.reshape(-1, *in_units.shape[2:]))
             ),
-            residuals={split: Evaluate(problem, segments[split], units[split]) for split in problem.data},
-            on_some=partial(_on_some, problem, segments["train"], units["train"]),
+            residuals={
+                split: Evaluate(problem, segments[split], scale[split], shared[split]) for split in problem.data
+            },
+            on_some=partial(_on_some, problem, segments["train"], scale["train"], shared["train"]),
             prior=prior,
             null_residuals=in_units.reshape(len(in_units), -1),
             null_coordinates=coordinates[: len(in_units)],
@@ -142,56 +131,15 @@ def measure(problem: Problem, say: Say) -> NoiseFloor:
     return found
 
 
-@dataclass(frozen=True)
-class Units:
-    """Turns residuals [n, segments, bins, components] into floor units, whitened."""
-
-    shared: np.ndarray
-    """[segments, bins, components] what models that lack nothing leave alike."""
-    scale: np.ndarray
-    """[bins, components] the rms of the rest."""
-    white: np.ndarray
-    """[components, bins, bins]"""
-
-    def __call__(self, residuals: np.ndarray) -> np.ndarray:
-        """Returns them in floor units, whitened; not finite where they are not."""
-        return whitened(self.white, (residuals - self.shared) / self.scale)
-
-    def only(self, chosen: np.ndarray) -> "Units":
-        """The same for some of the segments."""
-        return replace(self, shared=self.shared[chosen])
-
-
-def whitening(in_floors: np.ndarray) -> np.ndarray:
-    """Finds the inverse root [components, bins, bins] of the correlation between the bins of a segment.
-
-    Args:
-      in_floors: [logs, segments, bins, components] what fits left of null logs.
-    """
-    values = in_floors.reshape(-1, *in_floors.shape[2:])
-    size, basis = np.linalg.eigh(np.einsum("sic,sjc->cij", values, values) / len(values))
-    # What is nearly exact there must not decide: other engines differ by more.
-    gain = 1.0 / np.sqrt(np.maximum(size, _LEAST_SHARE**2))
-    return (basis * gain[:, None]) @ np.swapaxes(basis, 1, 2)
-
-
-def whitened(white: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Applies matrices [components, bins, bins] to values [..., bins, components]."""
-    return np.einsum("cij,...jc->...ic", white, values, optimize=True)
-
-
 def independent_share(residual: np.ndarray) -> float:
-    """Estimates how many independent numbers residuals [segments, bins, components] hold, as a share of all.
+    """Estimates independent bins of a segment as a share of all its bins, from residuals [segments, bins, components].
 
-    They are the degrees of freedom of their sum of squares (Satterthwaite, 1946): n = (tr C)^2 / tr(C^2), with the
-    covariance C of the features of a segment.
+    The mean of n independent bins has 1/n of their variance: n is found from how the means of segments scatter.
     """
-    scaled = residual / np.maximum(np.sqrt((residual**2).mean(axis=0)), 1e-12)
-    flat = scaled.reshape(len(scaled), -1)
-    features = flat.shape[1]
-    # Few segments show correlations where there are none.
-    square = ((flat.T @ flat / len(flat)) ** 2).sum() - features * (features - 1) / len(flat)
-    return float(np.clip(features / max(square, 1.0), 1.0 / features, 1.0))
+    whole = (residual**2).mean(axis=(0, 1))
+    of_means = (residual.mean(axis=1) ** 2).mean(axis=0)
+    least = 1.0 / residual.shape[1]
+    return float(np.clip((whole / np.maximum(of_means, 1e-12)).mean() * least, least, 1.0))
 
 
 def with_systematic_share(floor: NoiseFloor, at: Floor, residual: np.ndarray) -> NoiseFloor:
@@ -215,8 +163,8 @@ def with_systematic_share(floor: NoiseFloor, at: Floor, residual: np.ndarray) ->
     }
 
 
-def _fit_null_logs(problem: Problem, prior: Free) -> np.ndarray:
-    """Fits the prior directions to every null log, all side by side; returns coordinates [logs, directions].
+def _fit_null_logs(problem: Problem, prior: Free) -> tuple[np.ndarray, np.ndarray]:
+    """Fits the prior directions to every null log, all side by side; returns coordinates [logs, ...] and the unit.
 
     The unit in which a fit weighs residuals is the floor that is looked for, so both are found in turn.
     """
@@ -226,28 +174,27 @@ def _fit_null_logs(problem: Problem, prior: Free) -> np.ndarray:
     chosen = np.linspace(0, count - 1, min(_FITTED, count)).round().astype(int)
     measured = _some_of(measured, chosen)
     train = _some_of(train, (count * np.arange(logs)[:, None] + chosen).ravel())
-    simulate = Evaluate(problem, measured)
+    simulate = Evaluate(problem, measured, np.ones(1), np.zeros(1))
     nominal = np.zeros(problem.axes)
     (found,) = simulate.changes([nominal], simulate(nominal[None]), [prior.directions])
     slopes = np.moveaxis(found.reshape(len(found), len(measured.run), -1, len(problem.cells)), 0, -1)
     which = np.repeat(np.arange(logs), len(train.run) // logs)
-    coordinates, share, units = np.zeros((logs, len(prior.sd))), 1.0, None
+    coordinates, share = np.zeros((logs, len(prior.sd))), 1.0
     for number in range(_STEPS):
         raw = paired_residuals(problem, coordinates @ prior.directions, train, which, np.arange(len(which)))
         raw = raw.reshape(logs, -1, *raw.shape[1:])
-        if units is None:
-            once = np.tile(np.eye(raw.shape[2]), (raw.shape[3], 1, 1))
-            units = Units(np.zeros(raw.shape[1:]), np.sqrt((raw**2).mean(axis=(0, 1))), once)
+        unit = np.sqrt((raw**2).mean(axis=(0, 1)))
         # The first unit holds what the nominal parameters are off, which the second no longer does.
         for _ in range(2 if number == 0 else 1):
-            mine = np.moveaxis(units(np.moveaxis(slopes, -1, 0)), 0, -1)
-            steps = [_step(prior, point, log, mine, share) for point, log in zip(coordinates, units(raw), strict=True)]
+            steps = [
+                _step(prior, point, log / unit, slopes / unit[..., None], share)
+                for point, log in zip(coordinates, raw, strict=True)
+            ]
             left = np.stack([log + slopes @ step for log, step in zip(raw, steps, strict=True)])
-            scale = np.maximum(np.sqrt((left**2).mean(axis=(0, 1))), 1e-9)
-            units = replace(units, scale=scale, white=whitening(left / scale))
-            share = independent_share(units(left).reshape(-1, *scale.shape))
+            unit = np.maximum(np.sqrt((left**2).mean(axis=(0, 1))), 1e-9)
+            share = independent_share((left / unit).reshape(-1, *unit.shape))
         coordinates = np.clip(coordinates + np.stack(steps), *prior.bounds.T)
-    return coordinates
+    return coordinates, unit
 
 
 def _step(prior: Free, point: np.ndarray, residual: np.ndarray, slopes: np.ndarray, share: float) -> np.ndarray:
@@ -292,9 +239,11 @@ def _rms_floor(left: np.ndarray) -> np.ndarray:
     return np.maximum(fresh, _LEAST_SHARE * fresh.mean(axis=0))
 
 
-def _on_some(problem: Problem, segments: Segments, units: Units, chosen: np.ndarray) -> Evaluate:
+def _on_some(
+    problem: Problem, segments: Segments, scale: np.ndarray, shared: np.ndarray, chosen: np.ndarray
+) -> Evaluate:
     """Makes the function from vectors to residuals on the chosen segments."""
-    return Evaluate(problem, _some_of(segments, chosen), units.only(chosen))
+    return Evaluate(problem, _some_of(segments, chosen), scale, shared[chosen])
 
 
 def _some_of(segments: Segments, chosen: np.ndarray) -> Segments:

@@ -26,18 +26,20 @@ Progress = Callable[[int, int], None]
 class Evaluate:
     """Simulates vectors on some segments: `evaluate(vectors [n, axes])` returns residuals [n, features].
 
-    Residuals are in floor units, or raw. A feature is a (segment, bin, component).
+    Residuals are in floor units. A feature is a (segment, bin, component).
     """
 
     problem: Problem
     segments: Segments
-    units: Callable[[np.ndarray], np.ndarray] = lambda residuals: residuals
-    """Turns residuals [n, segments, bins, components] into floor units; it is linear but for a constant."""
+    scale: np.ndarray
+    """[bins, components] the noise floor that residuals are divided by."""
+    shared: np.ndarray
+    """[segments, bins, components] what a model that lacks nothing leaves, which is subtracted."""
 
     def __call__(self, vectors: np.ndarray) -> np.ndarray:
         """Simulates vectors; not finite where the simulation is not."""
         found = residuals(self.problem, vectors, self.segments)
-        return self.units(found).reshape(len(vectors), -1)
+        return ((found - self.shared) / self.scale).reshape(len(vectors), -1)
 
     def changes(
         self,

@@ -27,7 +27,7 @@ def two_trees() -> tuple[Problem, Segments]:
 
 def evaluation() -> Evaluate:
     asked, segments = two_trees()
-    return Evaluate(asked, segments, lambda residuals: residuals / 0.5)
+    return Evaluate(asked, segments, np.full((2, 2), 0.5), np.zeros((3, 2, 2)))
 
 
 def test_moves_are_found_as_if_each_were_alone_with_fewer_simulations():
