@@ -423,3 +423,17 @@ def test_whole_runs_are_of_equal_shape(moving):
     np.testing.assert_array_equal(cut.row[1], [*range(13, 81), *[80] * 120])
     np.testing.assert_allclose(cut.segments.row_step[1, 68:], 340)
     assert len(np.unique(cut.row[1])) == 68
+
+
+def test_velocities_between_rows_are_as_good_as_those_at_rows():
+    # Where they are worse, a delay of whole rows is the likeliest of all delays.
+    time = times(6.0)
+    speed = 0.3 * 8.0 * np.cos(8.0 * time)
+    noisy = 0.3 * np.sin(8.0 * time) + 1e-3 * np.random.default_rng(7).standard_normal(len(time))
+    cut = segments.cut([run(time, q=noisy[:, None] * [1.0, -1.0])], 0.1, DT)
+    start = time[cut.row[:, 0] - 1]
+    grid = start[:, None] + DT * np.arange(-BEFORE, AHEAD + 1)
+    there = grid <= time[-1] - 0.02
+    error = np.where(there, cut.segments.measured[:, :, 1, 0] - np.interp(grid, time, speed), 0.0)
+    by_phase = np.sqrt((error**2).mean(axis=0).reshape(-1)[: BEFORE + AHEAD].reshape(-1, 5).mean(axis=0))
+    assert by_phase.max() < 1.1 * by_phase[0]

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from slider import AXES, HYPOTHESES, problem
 
-from jaxtune.discovery import noise_floor, state
+from jaxtune.discovery import fit, noise_floor, state
 from jaxtune.discovery.fit import Fit, Free
 from jaxtune.discovery.least_squares import Counts
 from jaxtune.discovery.profile import Changes, profile_of
-from jaxtune.discovery.screen import screen
+from jaxtune.discovery.screen import promising, screen, simulate_library
 
 
 def screened(truth, pairs=0):
@@ -34,6 +34,17 @@ def test_two_that_hide_each_other_are_found_as_a_pair():
     found = screened({"coulomb": 0.8, "push": 0.8}, pairs=2)
     assert {hypothesis.name for hypothesis in found.pairs[0].hypotheses} == {"coulomb", "push"}
     assert found.pairs[0].cost < found.leads[0].cost
+
+
+def test_the_changes_of_the_nominal_model_find_what_to_screen_beside_another_model():
+    asked = problem({"coulomb": 0.8, "push": 0.8})
+    floor, begun = state.begin(asked, noise_floor.measure(asked, lambda text: None))
+    at, (coulomb,) = floor[asked.main_horizon], [h for h in HYPOTHESES if h.name == "coulomb"]
+    base = fit.begin(begun.nominal, [(coulomb,)], [np.array([0.8])], [begun.nominal.coordinates], at.residuals["train"])
+    library = simulate_library(at, begun.nominal, HYPOTHESES, lambda text: None)
+    others = [h for h in HYPOTHESES if h is not coulomb]
+    assert [h.name for h in promising(at, base[0], others, library, 1)] == ["push"]
+    assert len(promising(at, base[0], others, library, 3)) == 3
 
 
 def fit_of(rng, count=3, rows=60, parts=2):
