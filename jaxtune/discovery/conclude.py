@@ -161,10 +161,8 @@ def _proved(
     at, failed = floor[problem.main_horizon], []
     (fit,) = polish([state.best.fit], at.residuals["train"], 0)
     best = replace(state.best, fit=fit)
-    of_effect, of_form = (
-        Thresholds(gain=state.price),
-        Thresholds(0.5 * state.price, floors=0.0, of_left=0.0, horizons=1),
-    )
+    of_effect = Thresholds(state.price)
+    of_form = Thresholds(0.5 * state.price, floors=0.0, of_left=0.0, horizons=1)
     fitted = {one.key: one for one in state.candidates}
     while True:
         weighed = {h.key: (h, *weigh_evidence(problem, floor, best, h, fitted)) for h in best.hypotheses}

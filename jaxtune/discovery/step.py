@@ -136,8 +136,8 @@ def _free(settings: Settings, problem: Problem, at: Floor, base: Candidate, stat
 def _again(settings: Settings, at: Floor, base: Fit, free: Sequence[Hypothesis], library: Library) -> list[Hypothesis]:
     """Picks what is screened again beside a model that has effects: all forms, and the other effects that would lower
     its cost most if they changed it as they change the nominal model."""
-    forms = [h for h in free if h.form]
-    return forms + promising(at, base, [h for h in free if not h.form], library, settings.again)
+    forms, effects = ([h for h in free if bool(h.form) == shaping] for shaping in (True, False))
+    return forms + (promising(at, base, effects, library, settings.again) if effects else [])
 
 
 def shortlist(settings: Settings, found: Screen, price: float) -> list[Lead]:
