@@ -14,7 +14,7 @@ from envs.logs import Run
 
 _LEAST_NOISE = 1e-6
 _STALE = 3.0  # a repetition is stale where the joint moved by more than this many quanta meanwhile
-_FLIPS = 1.5  # times as many repetitions, from which on those that differ by a bit count
+_HELD = 0.25  # share of the rows of a fast joint that repeat another, from which on a bit does not count
 _STEADY = 0.6  # least ratio of the speeds of a joint that moves on
 
 
@@ -174,8 +174,11 @@ def stale(run: Run, signal: str) -> np.ndarray:
     for column, quantum in enumerate(rounding_of(run, signal)):
         values = run.signals[signal][:, column]
         exact, about = (_stale(run.time, values, quantum, within) for within in (0.0, 1.01 * quantum))
-        # Noise flips the last bit of a value that is held. Where it does not, values that differ by a bit are new.
-        found[:, column] = about if about.sum() > _FLIPS * exact.sum() else exact
+        # Noise flips the last bit of a value that is held. That counts only where values are held again and again as
+        # the joint moves: a joint at rest flips bits too, before it jumps.
+        fast = np.zeros(len(values), bool)
+        fast[2:-2] = np.abs(values[4:] - values[:-4]) > 4 * _STALE * quantum
+        found[:, column] = about if about[fast].sum() > max(_HELD * fast.sum(), exact[fast].sum()) else exact
     return found
 
 

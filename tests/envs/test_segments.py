@@ -193,6 +193,11 @@ def test_a_value_that_is_held_is_stale_though_noise_flips_its_last_bit():
     # Readings that are never held have none, whatever their noise.
     own = slow_bus(every=1)[2] + quantum * np.random.default_rng(4).integers(0, 2, read.shape)
     assert readings.stale(run(time, q=own), "q").mean() < 0.01
+    # At rest, then off at once, and to rest again.
+    jumps = np.repeat(0.3 * np.cos(np.arange(9) * np.pi), 89)[: len(time), None] * [1.0, -1.0]
+    jumps = np.apply_along_axis(lambda column: np.convolve(column, np.ones(8) / 8, "same"), 0, jumps)
+    jumps = np.round(jumps / quantum) * quantum + quantum * np.random.default_rng(5).integers(0, 2, jumps.shape)
+    assert not readings.stale(run(time[: len(jumps)], q=jumps), "q").any()
 
 
 def test_known_noise_counts_and_what_is_not_known_is_estimated_over_all_runs():
