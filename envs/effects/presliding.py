@@ -8,6 +8,8 @@ import jax.numpy as jnp
 
 from jaxtune.types import Effect, Parameter
 
+_LEAST_TRAVEL_RAD = 1e-4  # bristles that are stiffer would need shorter steps; the engine's own friction is as sharp
+
 
 def _presliding(values, friction, now, memory):
     """torque' = torque - bound z with d z / dt = speed / travel, |z| <= 1 (Dahl friction with a sharp knee)."""
@@ -15,7 +17,7 @@ def _presliding(values, friction, now, memory):
     travel = values["travel_rad"]
     # The memory is z, the deflection of the bristles in shares of that at which they slide.
     wound = jnp.clip(memory + now.dt * now.speed / jnp.maximum(travel, 1e-9), -1.0, 1.0)
-    there = travel > 0
+    there = travel > _LEAST_TRAVEL_RAD
     return jnp.stack([jnp.where(there, 0.0, bound), torque - jnp.where(there, bound * wound, 0.0)]), wound
 
 

@@ -24,7 +24,7 @@ from experiments.discovery.cutting import (
     split_in_time,
     told_alike,
 )
-from experiments.discovery.hypotheses import forms, hypotheses, learned_torque, timing_directions
+from experiments.discovery.hypotheses import forms, hypotheses, learned_torque, unknown_directions
 from jaxtune.discovery.problem import Problem
 
 __all__ = ["HORIZONS_S", "Question", "build_question", "drop_filtered", "read_logs", "without_sealed"]
@@ -145,7 +145,7 @@ def build_question(
     axes = {(axis.effect, axis.place): number for number, axis in enumerate(rig.axes)}
     library = {name: row for name, row in rig.effects.items() if name in LIBRARY}
     every = hypotheses(rig.axes, rig.places, library)
-    timing, timing_bounds = timing_directions(rig.axes, rig.control_hz)
+    unknowns, unknown_bounds = unknown_directions(rig.axes, rig.control_hz)
     measured = cut_log(log, rig.dt, signals, horizons)
     simulated = simulate_null_logs(log, spec, null_logs, seed)
     nulls = [told_alike(cut_log(one, rig.dt, signals, horizons), measured) for one in simulated]
@@ -156,8 +156,8 @@ def build_question(
         axes=len(rig.axes),
         hypotheses=every,
         prior=np.array([axis.prior_sd for axis in rig.axes]),
-        timing=timing,
-        timing_bounds=timing_bounds,
+        unknowns=unknowns,
+        unknown_bounds=unknown_bounds,
         trees=rig.trees,
         axis_trees=np.array([_one_tree(rig.trees[list(axis.joints)]) for axis in rig.axes]),
         data=measured,

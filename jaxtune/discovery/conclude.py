@@ -20,13 +20,14 @@ from jaxtune.discovery.decide import (
     weigh_evidence,
 )
 from jaxtune.discovery.evaluate import rms
-from jaxtune.discovery.fit import Fit, begin, polish, refine
+from jaxtune.discovery.fit import Fit, begin, polish, refine, taken_over
 from jaxtune.discovery.noise_floor import Floor, NoiseFloor, Say
-from jaxtune.discovery.problem import Problem
+from jaxtune.discovery.problem import Hypothesis, Problem
 from jaxtune.discovery.resample import standard_errors
 from jaxtune.discovery.result import AcceptedTerm, Settings, Suspect
 from jaxtune.discovery.state import State
 
+_CLEAR = 2.0  # standard errors
 _PERFECT = 1.0  # floor units
 _SUSPECTS = 8
 _BOUND = 1e-6  # of the width of the bounds: how near to one a coordinate is at it
@@ -90,12 +91,16 @@ def conclude(settings: Settings, problem: Problem, floor: NoiseFloor, state: Sta
     else:
         verdict = "parameter_change" if changed or terms else "no_missing_effect"
     unit = units_of(problem, at, squares(at, best))[: len(problem.data["train"][at.horizon].run)]
+    errors = standard_errors(best.fit, unit)
+    terms = tuple(
+        replace(term, forms=(*term.forms, *_moved(problem, best.fit, errors, term.hypothesis))) for term in terms
+    )
     return Conclusion(
         verdict=verdict,
         best=best,
         terms=terms,
         ablated=ablated,
-        errors=standard_errors(best.fit, unit),
+        errors=errors,
         suspects=tuple(believed(candidates, probabilities)[:_SUSPECTS]),
         rivals=_rivals(candidates, probabilities),
         explained_share=share,
@@ -108,6 +113,12 @@ def conclude(settings: Settings, problem: Problem, floor: NoiseFloor, state: Sta
             for one, probability in zip(candidates, probabilities, strict=True)
         },
     )
+
+
+def _moved(problem: Problem, fit: Fit, errors: np.ndarray, effect: Hypothesis) -> list[Hypothesis]:
+    """Forms of an effect that are free under every hypothesis, and clear of zero in the fit."""
+    clear = np.abs(fit.coordinates) > _CLEAR * errors
+    return [form for form in problem.forms if form.shapes(effect) and (taken_over(fit.free, form) & clear).any()]
 
 
 def _rivals(candidates: Sequence[Candidate], probabilities: np.ndarray) -> tuple[tuple[str, np.ndarray], ...]:

@@ -27,8 +27,8 @@ _SHORTEST = 0.03  # length of a step, in coordinates, below which rounding hides
 class Free:
     """The coordinates that a fit may move, and the vector they stand for: `vector = coordinates @ directions`.
 
-    The nominal parameters and the timing (the prior directions) come first; the coordinates of every accepted or tried
-    effect follow.
+    The nominal parameters and other unknowns (the prior directions) come first; the coordinates of every accepted or
+    tried effect follow.
     """
 
     directions: np.ndarray

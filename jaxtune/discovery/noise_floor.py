@@ -75,15 +75,15 @@ NoiseFloor = Mapping[float, Floor]
 
 
 def prior_directions(problem: Problem) -> Free:
-    """Lists what is free under every hypothesis: the nominal parameters, and the controller's timing.
+    """Lists what is free under every hypothesis: the nominal parameters, and what neither log nor model says.
 
     Every direction is one standard deviation of its prior. A null whose nominal parameters could not move would call
     every ordinary tolerance of a mass or a gain a missing effect.
     """
     # Entries of the prior that are zero are axes of effects, which the nominal model has not.
-    directions = np.concatenate([np.diag(problem.prior)[problem.prior > 0], problem.timing])
+    directions = np.concatenate([np.diag(problem.prior)[problem.prior > 0], problem.unknowns])
     bounds = np.concatenate(
-        [np.tile([-FURTHEST, FURTHEST], (np.count_nonzero(problem.prior), 1)), problem.timing_bounds]
+        [np.tile([-FURTHEST, FURTHEST], (np.count_nonzero(problem.prior), 1)), problem.unknown_bounds]
     )
     count = len(directions)
     return Free(directions, np.ones(count), bounds, np.ones(count, bool))

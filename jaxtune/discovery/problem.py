@@ -104,10 +104,11 @@ class Problem:
     hypotheses: Sequence[Hypothesis]
     prior: np.ndarray
     """[axes]: standard deviation of the nominal parameters, which are free under every hypothesis; zero elsewhere."""
-    timing: np.ndarray
+    unknowns: np.ndarray
     """[directions, axes]: one standard deviation along other unknowns that are free from the start: the delay with
-    which the controller reads its sensors and applies its commands, and how targets go on between rows."""
-    timing_bounds: np.ndarray
+    which the controller reads its sensors and applies its commands, how targets go on between rows, and the travel
+    over which dry friction sets in."""
+    unknown_bounds: np.ndarray
     """[directions, 2]: least and largest coordinate along each."""
     data: Mapping[str, Mapping[float, Segments]]
     """Measured segments by split and horizon (their length in s)."""

@@ -27,7 +27,7 @@ class State:
     nominal: Fit
     """The nominal model, with the slopes of the prior directions."""
     null: Candidate
-    """The nominal model with its nominal parameters and timing fitted, and no effect."""
+    """The nominal model with its nominal parameters and other unknowns fitted, and no effect."""
     best: Candidate
     """The model that costs least."""
     candidates: tuple[Candidate, ...]

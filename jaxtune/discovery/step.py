@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxtune.discovery.decide import Candidate, ablate, key_of, total_cost
 from jaxtune.discovery.evaluate import worst
-from jaxtune.discovery.fit import Fit, begin, polish, refine
+from jaxtune.discovery.fit import Fit, begin, polish, refine, taken_over
 from jaxtune.discovery.localise import localise
 from jaxtune.discovery.noise_floor import Floor, NoiseFloor, Say
 from jaxtune.discovery.problem import Hypothesis, Problem, are_distinct
@@ -90,7 +90,7 @@ def step(
         found = screen(at, base.fit, free, pairs=settings.firsts, library=library, say=say)
     state = state.with_screen(settings, problem, found)
     leads = shortlist(settings, found, state.price)
-    leads = leads[: settings.swaps] if swapping else leads + shaped(problem, leads[: settings.shaped])
+    leads = leads[: settings.swaps] if swapping else leads + shaped(_unfree(problem, at), leads[: settings.shaped])
     say(f"fit {len(leads)}")
     fitted = fit_leads(settings, at, base.fit, base.hypotheses, leads)
     broken = {key_of((*base.hypotheses, *lead.hypotheses)) for lead in leads} - {one.key for one in fitted}
@@ -124,7 +124,7 @@ def _next_base(at: Floor, state: State) -> Candidate | None:
 def _free(settings: Settings, problem: Problem, at: Floor, base: Candidate, state: State) -> list[Hypothesis]:
     """Lists what may join a model: forms of its effects, and other effects unless it is at the floor or full."""
     full = state.screened and (len(base.effects) >= settings.most or worst(at, base) <= settings.at_floor)
-    forms = [form for form in problem.forms if any(form.shapes(h) for h in base.effects)]
+    forms = [form for form in _unfree(problem, at) if any(form.shapes(h) for h in base.effects)]
     left_out = {h.key for h in state.best.hypotheses} - {h.key for h in base.hypotheses}
     return [
         h
@@ -158,14 +158,19 @@ def shortlist(settings: Settings, found: Screen, price: float) -> list[Lead]:
     return chosen + pairs[: settings.pairs]
 
 
-def shaped(problem: Problem, leads: Sequence[Lead]) -> list[Lead]:
+def _unfree(problem: Problem, at: Floor) -> list[Hypothesis]:
+    """Lists the forms that are not free under every hypothesis."""
+    return [form for form in problem.forms if not taken_over(at.prior, form).any()]
+
+
+def shaped(forms: Sequence[Hypothesis], leads: Sequence[Lead]) -> list[Lead]:
     """Adds to leads of one effect each of the forms that it may have.
 
     Else what another form of the right effect leaves would be explained by a second effect.
     """
     found = []
     for lead in leads:
-        for form in (form for form in problem.forms if form.shapes(lead.hypotheses[0])):
+        for form in (form for form in forms if form.shapes(lead.hypotheses[0])):
             # The least size may be too small to have a slope.
             point = np.concatenate([lead.point, form.probes[1]])
             found.append(Lead((*lead.hypotheses, form), point, lead.start, lead.cost))

@@ -2,7 +2,7 @@
 
     noise floor -> null -> step, until no model costs less -> conclude -> prove
 
-The null is the nominal model with its nominal parameters and the controller's timing fitted, and no effect added.
+The null is the nominal model with its nominal parameters and other unknowns fitted, and no effect added.
 `step` draws what a step does. The sealed segments are simulated by `prove` alone, once.
 """
 

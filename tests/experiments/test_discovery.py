@@ -15,7 +15,7 @@ from experiments.discovery.blind_bench import Bench
 from experiments.discovery.blind_cases import ARM, SIZE_BOUNDS, SIZES
 from experiments.discovery.blind_robots import OUTSIDE, Truth, record
 from experiments.discovery.excitation import excitation
-from experiments.discovery.hypotheses import forms, hypotheses, place_sets
+from experiments.discovery.hypotheses import forms, hypotheses, place_sets, unknown_directions
 from experiments.discovery.setup import build_question, drop_filtered, read_logs
 from jaxtune.discovery.problem import are_distinct
 
@@ -177,6 +177,19 @@ def test_a_size_at_two_places_is_the_same_physical_size(spec, plain):
         ]
         assert len(values) == len(hypothesis.places)
         np.testing.assert_allclose(values, values[0], rtol=1e-5)
+
+
+def test_the_travel_of_friction_is_unknown_where_the_model_has_friction(spec):
+    from envs.rig import Rig
+
+    spec = spec.copy()
+    spec.joint("elbow").frictionloss = 0.1
+    rig = Rig(spec, JOINTS, 1000.0)
+    directions, bounds = unknown_directions(rig.axes, 1000.0)
+    assert directions.shape == (4, len(rig.axes)) and bounds.shape == (4, 2)
+    (number,) = np.flatnonzero(directions[3])
+    assert (rig.axes[number].effect, rig.axes[number].place) == ("presliding", "elbow")
+    assert (bounds[:, 0] == 0).all()
 
 
 def test_every_form_moves_the_axes_of_its_parameter_at_the_places_of_its_effect(spec):
