@@ -159,9 +159,10 @@ def _new(values: np.ndarray, within: float) -> np.ndarray:
 def stale(run: Run, signal: str) -> np.ndarray:
     """Finds readings that only repeat the last one, because the bus or the sensor was slower than the log.
 
-    A repetition is stale where the next new value makes up for it: as if the joint had gone on at the speed before, or
-    at that after, over all the rows that say otherwise, and by more than three steps of rounding. A joint that stands
-    still for a while and goes on, or moves slowly, repeats itself too, but has nothing to make up for.
+    A repetition is stale where the next new value makes up for it: as if the joint had gone on at the speed before and
+    after, over all the rows that say otherwise, and by more than three steps of rounding. One of both speeds is enough
+    for a repetition that is no longer than another one. A joint that stands still for a while and goes on, or moves
+    slowly, repeats itself too, but has nothing to make up for.
 
     Args:
       run: with the signal.
@@ -191,9 +192,13 @@ def _stale(time: np.ndarray, values: np.ndarray, quantum: float, within: float) 
     motion, rows = np.diff(values[new]), np.diff(new)
     speed = motion / np.diff(time[new])
     on = np.minimum(speed[1:] / speed[:-1], speed[:-1] / speed[1:]) > _STEADY
-    on = np.append(False, on) | np.append(on, False)
+    before, after = np.append(False, on), np.append(on, False)
     far = np.abs(motion) * (rows - 1) / rows > _STALE * quantum
-    for first, count in zip(new[:-1][on & far], rows[on & far], strict=True):
+    # A joint that stuck and then jumps may well pass for one that had gone on at the slow speed before. Where it starts
+    # or turns, one side is enough, but a bus does not take longer there than elsewhere.
+    usual = rows[before & after & far].max(initial=0)
+    mine = (before | after) & far & (rows <= usual)
+    for first, count in zip(new[:-1][mine], rows[mine], strict=True):
         found[first + 1 : first + count] = True
     return found
 

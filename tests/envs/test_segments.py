@@ -170,6 +170,16 @@ def test_a_joint_that_stops_and_goes_on_is_not_stale(rows):
     assert not readings.stale(mine, "q").any()
 
 
+def test_a_joint_that_sticks_and_then_jumps_is_not_stale():
+    # It creeps by a step of rounding every six rows, sticks for 23 rows, and goes off by four steps and more.
+    creep, goes_on = np.tile([1, 0, 0, 0, 0, 0], 12), np.tile([1, 0, 2], 20)
+    steps = np.concatenate([creep, np.zeros(18), 4 * np.arange(1, 12), goes_on])
+    position = 0.0004 * np.cumsum(steps)[:, None]
+    mine = run(times(10.0, 250.0)[: len(steps)], q=position, known={"q": {"quantum": np.array([0.0004])}})
+    assert not readings.stale(mine, "q").any()
+    np.testing.assert_array_equal(readings.aligned(mine, "q"), position)
+
+
 def test_stale_readings_bias_nothing():
     time, exact, read = slow_bus()
     mine = run(time, q=read)
