@@ -25,7 +25,8 @@ ROWS = (
             Parameter(name=f"{axis}_m", bounds=(-0.1, 0.1), prior=0.01, fields=("body_ipos",), column=column)
             for column, axis in enumerate("xyz")
         ),
-        sizes=(0.005,),
+        # About an upright axis gravity does not feel it, and inertia grows with its square.
+        sizes=(0.005, 0.05),
         sentence="The link's centre of mass is not where the model has it.",
         excited_by="slow motion through postures on both sides of the vertical",
         **_INERTIA,

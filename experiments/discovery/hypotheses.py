@@ -176,8 +176,9 @@ def _probes(sizes: Sequence[float], parameters: Sequence[Parameter], least: floa
     """Returns the coordinates [probes, parameters] at which the screen simulates an effect.
 
     Shape parameters, such as the speed scale of Stribeck friction, stay zero, since they mean nothing without a size.
-    If an effect has several sizes (x, y, z), each is tried alone. Else sizes grow by a constant factor, to where the
-    effect is large; more of them where it has no slope at zero. What can be subtracted is tried with both signs.
+    If an effect has several parameters (x, y, z), each is tried alone at its sizes. Else sizes grow by a constant
+    factor, to where the effect is large; more of them where it has no slope at zero. What can be subtracted is tried
+    with both signs.
 
     Args:
       sizes: of the effect, the smallest of interest first; several where it has no slope at zero.
@@ -186,9 +187,7 @@ def _probes(sizes: Sequence[float], parameters: Sequence[Parameter], least: floa
     """
     free = [number for number, parameter in enumerate(parameters) if not parameter.shape]
     if len(free) > 1:
-        probes = np.zeros((len(free), len(parameters)))
-        probes[np.arange(len(free)), free] = sizes[0]
-        return probes
+        return np.concatenate([size * np.eye(len(parameters))[free] for size in sizes])
     most, bends = parameters[free[0]].bounds[1], len(sizes) > 1
     sizes = np.geomspace(sizes[0], _LARGE * most, _BENT if bends else _STRAIGHT)
     below = [-size for size in sizes if -size >= _LARGE * least - 1e-9]

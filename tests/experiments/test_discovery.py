@@ -179,6 +179,17 @@ def test_a_size_at_two_places_is_the_same_physical_size(spec, plain):
         np.testing.assert_allclose(values, values[0], rtol=1e-5)
 
 
+def test_a_centre_of_mass_is_tried_near_and_far_in_each_direction(spec):
+    # About an upright axis only a far one is felt, since inertia grows with its square.
+    from envs.rig import Rig
+
+    rig = Rig(spec, JOINTS, 1000.0)
+    for hypothesis in hypotheses(rig.axes, rig.places, {"com_offset": rig.effects["com_offset"]}):
+        near, far = hypothesis.probes[:3], hypothesis.probes[3:]
+        np.testing.assert_array_equal(near, 0.005 * np.eye(3))
+        np.testing.assert_array_equal(far, 0.05 * np.eye(3))
+
+
 def test_the_travel_of_friction_is_unknown_where_the_model_has_friction(spec):
     from envs.rig import Rig
 
