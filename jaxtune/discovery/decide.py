@@ -17,6 +17,7 @@ from jaxtune.discovery.resample import standard_errors, times_drawn, units
 from jaxtune.discovery.result import Settings, Suspect
 
 _ABLATION_ROUNDS = 3
+_FAR = 1e9  # sum of squares
 
 
 @dataclass(frozen=True)
@@ -62,9 +63,10 @@ class Evidence:
     confirmed: float
     """Fall of the cost on `select` alone, where nothing was fitted, prior included."""
     floors: float
-    """Root of the largest fall of a single component's mean square on `select`, in floor units."""
+    """Root of the largest fall of a single component's mean square on `select`, in floor units. It is that of all
+    segments or of typical ones (`Counts.variances`), where it is the larger share of what is left."""
     left: float
-    """Rms of the worst component on `select` with the effect, in floor units."""
+    """Rms of the worst component on `select` with the effect, in floor units, of the same segments."""
     relief: float
     """Fall of what the prior says against the other coordinates: without the effect they imitate it."""
     interval: tuple[float, float]
@@ -114,11 +116,10 @@ def posterior(problem: Problem, at: Floor, candidates: Sequence[Candidate], pric
     """
     all_squares = [squares(at, candidate) for candidate in candidates]
     times = times_drawn(units_of(problem, at, all_squares[0]), seed=seed)
-    rows = len(all_squares[0]) * len(at.scale["train"])
     costs = []
     for candidate, mine in zip(candidates, all_squares, strict=True):
-        mean_squares = times @ np.nan_to_num(mine, nan=1e9, posinf=1e9) / rows
-        costs.append(at.counts.cost(mean_squares, rows) + candidate.fit.penalty + candidate.price(price))
+        of_segments = at.counts.cost(_finite(mine) / at.counts.bins)
+        costs.append(times @ of_segments + candidate.fit.penalty + candidate.price(price))
     weights = np.exp(-0.5 * (np.array(costs) - np.min(costs, axis=0)))
     return (weights / weights.sum(axis=0)).mean(axis=1)
 
@@ -160,12 +161,15 @@ def weigh_evidence(
     distance = np.where((hypothesis.probes != 0).any(axis=0), np.abs(values) / errors, 0.0)
     clearest = int(distance.argmax())
     relief = ablated.fit.penalty - candidate.fit.penalty
-    mean_squares = [one[held_out:].mean(axis=0) / len(at.scale["train"]) for one in (before, now)]
+    mean_squares = [_finite(one[held_out:]) / at.counts.bins for one in (before, now)]
+    measures = [[one.mean(axis=0) for one in mean_squares], [at.counts.variances(one) for one in mean_squares]]
+    falls = [(np.sqrt(max((was - now).max(), 0.0)), np.sqrt(now.max())) for was, now in measures]
+    floors, left = max(falls, key=lambda pair: pair[0] / pair[1])
     evidence = Evidence(
         gain=total_cost(at, ablated, 0.0) - total_cost(at, candidate, 0.0),
         confirmed=_cost(at, before[held_out:]) - _cost(at, now[held_out:]) + relief,
-        floors=float(np.sqrt(max((mean_squares[0] - mean_squares[1]).max(), 0.0))),
-        left=float(np.sqrt(mean_squares[1].max())),
+        floors=float(floors),
+        left=float(left),
         relief=relief,
         interval=(
             float(values[clearest] - 1.96 * errors[clearest]),
@@ -273,12 +277,14 @@ def rivals(
     return tuple(sorted(found, key=lambda name: -found[name]))[: settings.rivals]
 
 
+def _finite(of_segments: np.ndarray) -> np.ndarray:
+    """Lets a segment whose simulation broke count as one that is far off."""
+    return np.nan_to_num(of_segments, nan=_FAR, posinf=_FAR)
+
+
 def _cost(at: Floor, of_segments: np.ndarray) -> float:
     """Cost of sums of squares [segments, components], without a prior."""
-    rows = len(of_segments) * len(at.scale["train"])
-    if not np.isfinite(of_segments).all():
-        return np.inf
-    return float(at.counts.cost(of_segments.sum(axis=0) / rows, rows))
+    return float(at.counts.cost(of_segments / at.counts.bins).sum()) if np.isfinite(of_segments).all() else np.inf
 
 
 def _horizons_better(floor: NoiseFloor, fit: Fit, other: Fit) -> int:

@@ -87,8 +87,7 @@ class Fit:
         """The cost of the model on `train`, prior included (`least_squares`); infinite where it is not finite."""
         if not np.isfinite(self.residual).all():
             return np.inf
-        rows = len(self.residual) // self.counts.components
-        return float(self.counts.cost(self.counts.mean_squares(self.residual), rows)) + self.penalty
+        return float(self.counts.cost(self.counts.mean_squares(self.residual)).sum()) + self.penalty
 
     def along(self, hypothesis: Hypothesis) -> np.ndarray:
         """Finds a hypothesis that is part of the model by its directions; a mask [coordinates]."""

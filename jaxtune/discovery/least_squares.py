@@ -1,19 +1,23 @@
 """Least squares with Gaussian priors, on residuals in floor units, whose variance may exceed the floor's.
 
-Even the right effect, in another functional form than the library's, leaves more than the noise floor. So the variance
-of every component of the residuals (such as the position of a joint) is unknown, and at least that of the floor. With
-its mean square m over n rows, the cost of a model is twice the negative logarithm of its posterior, with the variance
-at its maximum:
+Even the right effect, in another functional form than the library's, leaves more than the noise floor, and in a few
+segments much more than in the others: where a joint sticks or a state was estimated across a jump. So the residuals of
+every component (such as the position of a joint) have an unknown variance v, at least that of the floor, and a segment
+of them has a t distribution. With the mean square m of a component over a segment, which is worth n independent
+numbers, and f degrees of freedom, the cost of a model is twice the negative logarithm of its posterior, with v at its
+maximum:
 
-    C = sum over components of n (a min(m, 1) + b log max(m, 1)) + |c / s|^2,
+    C = sum over components and segments of n log v + (n + f) log(1 + n m / (f v)) + |c / s|^2,   v >= 1,
 
-with coordinates c, seen from the prior's centre, prior deviations s, and the shares a and b of rows that count as
-independent (`Counts`). A component that nothing explains yet is thus weighed by its own misfit, and cannot drown what
-the others and the prior say. Around a point the cost is least squares with weights w = a or b / m,
+with coordinates c, seen from the prior's centre, and prior deviations s. A component that nothing explains yet is thus
+weighed by its own misfit, and a segment that nothing explains counts by the logarithm of its own: neither can drown
+what the others and the prior say. Around a point the cost is least squares with weights w,
 
-    L(u) = w |r + J u|^2 + |(c + u) / s|^2,
+    L(u) = w |r + J u|^2 + |(c + u) / s|^2,   w = (n + f) / (f v + n m) a,
 
-which are computed anew after every step (iteratively reweighted least squares).
+with the share a of rows that count as independent (`Counts`). They are computed anew after every step (iteratively
+reweighted least squares). Many small changes of a model are compared in the limit of many degrees of freedom
+(`pooled_cost`), in which a component needs no more than its mean square.
 """
 
 from collections.abc import Callable
@@ -22,31 +26,63 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import lsq_linear
 
+_FREEDOM = 4.0  # degrees of freedom of the t distribution
+_ROUNDS, _SETTLED = 60, 1e-3  # rounds of expectation and maximisation at most; change of a variance that ends them
+
 
 @dataclass(frozen=True, kw_only=True)
 class Counts:
-    """How much independent evidence residuals [features] hold; the last dimension of a feature is its component."""
+    """How much independent evidence residuals hold, [features] = [segments, bins, components]."""
 
     components: int
+    bins: int
+    """Rows of every component in a segment."""
     independent: float
-    """Share of the rows that count as independent where a model is at the noise floor."""
-    systematic: float = 1.0
-    """The same where it is not; what a wrong model leaves goes together for longer than noise."""
+    """Share of the rows that count as independent."""
 
     def mean_squares(self, residual: np.ndarray) -> np.ndarray:
-        """Computes the mean square [components] of residuals [features]."""
-        return (residual.reshape(-1, self.components) ** 2).mean(axis=0)
+        """Computes the mean squares [segments, components] of residuals [features]."""
+        return (residual.reshape(-1, self.bins, self.components) ** 2).mean(axis=1)
 
-    def cost(self, mean_squares: np.ndarray, rows: int) -> np.ndarray:
-        """Computes C without the prior from mean squares [..., components] over some rows; returns [...]."""
-        near, beyond = np.minimum(mean_squares, 1.0), np.log(np.maximum(mean_squares, 1.0))
-        return rows * (self.independent * near + self.systematic * beyond).sum(axis=-1)
+    def cost(self, mean_squares: np.ndarray) -> np.ndarray:
+        """Computes C without the prior from mean squares [segments, components]; returns what each segment adds."""
+        count, variance = self.bins * self.independent, self.variances(mean_squares)
+        beyond = (count + _FREEDOM) * np.log1p(count * mean_squares / (_FREEDOM * variance))
+        return (count * np.log(variance) + beyond).sum(axis=1)
 
     def weights(self, residual: np.ndarray) -> np.ndarray:
         """Computes w for every feature, [features]."""
         mean_squares = self.mean_squares(residual)
-        weight = np.where(mean_squares > 1.0, self.systematic / np.maximum(mean_squares, 1.0), self.independent)
-        return np.tile(weight, len(residual) // self.components)
+        variance = self.variances(mean_squares)
+        weight = self.independent * self._shares(mean_squares, variance) / variance
+        return np.repeat(weight, self.bins, axis=0).ravel()
+
+    def pooled_cost(self, mean_squares: np.ndarray, rows: int) -> np.ndarray:
+        """Computes the limit of C for many degrees of freedom, from mean squares [..., components] over all `rows`."""
+        near, beyond = np.minimum(mean_squares, 1.0), np.log(np.maximum(mean_squares, 1.0))
+        return rows * self.independent * (near + beyond).sum(axis=-1)
+
+    def pooled_weights(self, mean_squares: np.ndarray) -> np.ndarray:
+        """Computes w in that limit; of the shape of the mean squares."""
+        return self.independent / np.maximum(mean_squares, 1.0)
+
+    def variances(self, mean_squares: np.ndarray) -> np.ndarray:
+        """Computes the v at which C is least, [components], from mean squares [segments, components].
+
+        A few segments hardly move it. Source: Lange, Little and Taylor (1989).
+        """
+        variance = np.maximum(mean_squares.mean(axis=0), 1.0)
+        for _ in range(_ROUNDS):
+            before, weighed = variance, self._shares(mean_squares, variance) * mean_squares
+            variance = np.maximum(weighed.mean(axis=0), 1.0)
+            if (np.abs(variance - before) < _SETTLED * before).all():
+                break
+        return variance
+
+    def _shares(self, mean_squares: np.ndarray, variance: np.ndarray) -> np.ndarray:
+        """How far a segment counts, [segments, components]; about one where it is as far off as the others."""
+        count = self.bins * self.independent
+        return (count + _FREEDOM) / (_FREEDOM + count * mean_squares / variance)
 
 
 @dataclass(frozen=True)

@@ -118,7 +118,9 @@ def measure(problem: Problem, say: Say) -> NoiseFloor:
             horizon=horizon,
             scale=scale,
             counts=Counts(
-                components=unit.shape[-1], independent=independent_share(in_units.reshape(-1, *in_units.shape[2:]))
+                components=unit.shape[-1],
+                bins=in_units.shape[2],
+                independent=independent_share(in_units.reshape(-1, *in_units.shape[2:])),
             ),
             residuals={
                 split: Evaluate(problem, segments[split], scale[split], shared[split]) for split in problem.data
@@ -157,7 +159,7 @@ def with_systematic_share(floor: NoiseFloor, at: Floor, residual: np.ndarray) ->
     return {
         horizon: replace(
             one,
-            counts=replace(one.counts, systematic=min(share * bins / len(one.scale["train"]), one.counts.independent)),
+            counts=replace(one.counts, independent=min(share * bins / one.counts.bins, one.counts.independent)),
         )
         for horizon, one in floor.items()
     }

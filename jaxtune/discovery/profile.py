@@ -104,7 +104,7 @@ class Profile:
         least = square
         for _ in range(reweighted):
             mean = np.maximum(least, 0.0) / self.rows
-            weight = np.where(mean > 1.0, self.counts.systematic / np.maximum(mean, 1.0), self.counts.independent)
+            weight = self.counts.pooled_weights(mean)
             normal = (weight @ self.normal.reshape(parts, -1)).reshape(-1, count, count) + np.diag(self.precision)
             diagonal = np.einsum("nii->ni", normal)
             normal = normal + np.eye(count) * (1e-6 * np.maximum(diagonal, 1e-9))[:, None]
@@ -114,7 +114,7 @@ class Profile:
             bent = np.einsum("npi,ni->np", (step @ self.normal.reshape(parts, count, count)).swapaxes(0, 1), step)
             least = np.maximum(square + 2 * np.einsum("npi,ni->np", pull, step) + bent, 0.0)
         at = self.offset + step
-        return self.counts.cost(least / self.rows, self.rows) + (self.precision * at**2).sum(axis=1), at
+        return self.counts.pooled_cost(least / self.rows, self.rows) + (self.precision * at**2).sum(axis=1), at
 
 
 def profile_of(fit: Fit, library: np.ndarray) -> Profile:

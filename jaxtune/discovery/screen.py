@@ -147,11 +147,8 @@ def screen(
 
 
 def _tempered(at: Floor) -> np.ndarray:
-    """Residuals [logs, features] of the null logs, those of a log beyond the floor divided by its own rms, as in the
-    cost."""
-    mean_squares = np.stack([at.counts.mean_squares(log) for log in at.null_residuals])
-    root = np.sqrt(np.maximum(mean_squares, 1.0))
-    return at.null_residuals / np.tile(root, at.null_residuals.shape[1] // root.shape[1])
+    """Residuals [logs, features] of the null logs, weighed as in the cost."""
+    return np.stack([log * np.sqrt(at.counts.weights(log) / at.counts.independent) for log in at.null_residuals])
 
 
 def spread_segments(at: Floor, base: Fit) -> np.ndarray:

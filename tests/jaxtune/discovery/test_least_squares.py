@@ -37,11 +37,50 @@ def test_no_other_step_within_bounds_is_better(seed):
     assert loss(found) <= min(map(loss, others)) + 1e-9
 
 
-def test_the_cost_is_that_of_the_floor_below_it_and_logarithmic_above():
-    counts = Counts(components=2, independent=0.5, systematic=0.1)
-    # 10 rows; mean squares 0.6 and e^2: 10 (0.5 * 0.6 + 0.5 + 0.1 * 2).
-    assert counts.cost(np.array([0.6, np.e**2]), 10) == pytest.approx(10.0)
-    residual = np.tile([0.5, 3.0], 10)
-    np.testing.assert_allclose(counts.mean_squares(residual), [0.25, 9.0])
-    # What is nine times the floor weighs a ninth of the systematic share.
-    np.testing.assert_allclose(counts.weights(residual).reshape(10, 2), np.tile([0.5, 0.1 / 9.0], (10, 1)))
+COUNTS = Counts(components=2, bins=10, independent=0.5)
+
+
+def direct(mean_squares, variance):
+    """The cost of one component, for 5 independent rows and 4 degrees of freedom."""
+    return (5 * np.log(variance) + 9 * np.log(1 + 5 * mean_squares / (4 * variance))).sum()
+
+
+@pytest.mark.parametrize("scale", [0.3, 5.0, 300.0])
+def test_the_cost_is_at_the_likeliest_variance_and_never_below_the_floor(scale):
+    mean_squares = scale * np.random.default_rng(0).exponential(1.0, (50, 2))
+    variances = np.geomspace(1.0, 1e4, 4001)
+    least = [min(direct(column, variance) for variance in variances) for column in mean_squares.T]
+    of_segments = COUNTS.cost(mean_squares)
+    assert of_segments.shape == (50,)
+    assert of_segments.sum() == pytest.approx(sum(least), rel=1e-4)
+
+
+def test_a_segment_that_nothing_explains_counts_by_its_logarithm():
+    mean_squares = np.ones((50, 2))
+    costs = []
+    for outlier in (1e2, 1e3, 1e4):
+        mean_squares[7, 0] = outlier
+        costs.append(COUNTS.cost(mean_squares).sum())
+        # The others hardly notice.
+        np.testing.assert_allclose(COUNTS.cost(mean_squares)[8], COUNTS.cost(np.ones((50, 2)))[8], rtol=0.1)
+    assert np.diff(costs) == pytest.approx(9 * np.log(10), rel=0.05)
+
+
+def test_weights_are_the_slope_of_the_cost():
+    rng = np.random.default_rng(1)
+    residual = 3.0 * rng.normal(size=(6, 10, 2)) * rng.uniform(0.2, 3.0, (6, 1, 2))
+    weights = COUNTS.weights(residual.ravel()).reshape(residual.shape)
+    for segment, part in ((0, 0), (3, 1), (5, 0)):
+        moved = [residual.copy(), residual.copy()]
+        for sign, one in zip((-1, 1), moved, strict=True):
+            one[segment, :, part] *= 1 + sign * 1e-4
+        costs = [COUNTS.cost(COUNTS.mean_squares(one.ravel())).sum() for one in moved]
+        # d C / d r = 2 w r, so that scaling r changes C by 2 w r^2.
+        slope = 2 * (weights * residual**2)[segment, :, part].sum()
+        assert (costs[1] - costs[0]) / 2e-4 == pytest.approx(slope, rel=1e-3)
+
+
+def test_the_pooled_cost_is_that_of_the_floor_below_it_and_logarithmic_above():
+    # 10 rows; mean squares 0.6 and e^2: 10 * 0.5 (0.6 + 1 + 2).
+    assert COUNTS.pooled_cost(np.array([0.6, np.e**2]), 10) == pytest.approx(18.0)
+    np.testing.assert_allclose(COUNTS.pooled_weights(np.array([0.6, 9.0])), [0.5, 0.5 / 9.0])

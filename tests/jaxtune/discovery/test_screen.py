@@ -49,7 +49,7 @@ def test_the_changes_of_the_nominal_model_find_what_to_screen_beside_another_mod
 
 def fit_of(rng, count=3, rows=60, parts=2):
     free = Free(np.eye(count), np.ones(count), np.tile([-3.0, 3.0], (count, 1)), np.ones(count, bool))
-    counts = Counts(components=parts, independent=0.5, systematic=0.2)
+    counts = Counts(components=parts, bins=rows, independent=0.5)
     jacobian = rng.normal(size=(rows * parts, count))
     return Fit(free, 0.1 * rng.normal(size=count), rng.normal(size=rows * parts), jacobian, counts)
 
@@ -64,7 +64,8 @@ def test_a_profile_is_no_dearer_than_any_answer_within_bounds(seed):
     def cost_at(coordinates):
         residual = fit.residual + change[0] + fit.jacobian @ (coordinates - fit.coordinates)
         rows = len(residual) // fit.counts.components
-        return fit.counts.cost(fit.counts.mean_squares(residual), rows) + (coordinates**2).sum()
+        mean_squares = (residual.reshape(rows, -1) ** 2).mean(axis=0)
+        return fit.counts.pooled_cost(mean_squares, rows) + (coordinates**2).sum()
 
     assert cost == pytest.approx(cost_at(at), rel=1e-4)
     assert cost <= min(cost_at(at + 0.3 * rng.normal(size=3)) for _ in range(200)) + 1e-3
