@@ -224,7 +224,8 @@ class Chain:
         running = self.ahead(memory)[1]
         # Back electromotive force acts continuously, so it is not part of the held torque.
         torque, memory = self.stage("transmission", values, torque - x["emf"] * motor[1], now, memory)
-        return memory, (torque, {"q": readings[0], "dq": readings[1] + running, "tau": torque})
+        read, memory = self.stage("torque_reading", values, torque, now, memory)
+        return memory, (torque, {"q": readings[0], "dq": readings[1] + running, "tau": read})
 
     def ahead(self, memory) -> jax.Array:
         """Computes how far and how fast the motors run ahead of their joints, [2, joints] rad and rad/s.

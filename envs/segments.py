@@ -78,7 +78,28 @@ class Cut:
     """[segments, rows] index of each row in its run."""
 
 
-def cut(runs: Sequence[Run], horizon_s: float, dt: float, bin_s: float = 0.01) -> Cut:
+@dataclass(frozen=True)
+class Estimate:
+    """What the readings of a run say at its rows; it takes longer to compute than cutting does."""
+
+    states: np.ndarray
+    """[rows, 2, joints] rad and rad/s (`envs.smoothing.smoothed`)."""
+    signals: dict[str, np.ndarray]
+    """[rows, components] by name (`envs.readings.aligned`)."""
+
+
+def estimate(run: Run) -> Estimate:
+    """Estimates states and signals at the rows of a run."""
+    return Estimate(smoothed(run), {name: aligned(run, name) for name in COMPARED if name in run.signals})
+
+
+def cut(
+    runs: Sequence[Run],
+    horizon_s: float,
+    dt: float,
+    bin_s: float = 0.01,
+    estimates: Sequence[Estimate] | None = None,
+) -> Cut:
     """Cuts runs into consecutive segments of one length.
 
     Args:
@@ -86,6 +107,7 @@ def cut(runs: Sequence[Run], horizon_s: float, dt: float, bin_s: float = 0.01) -
       horizon_s: length of a segment in s, rounded to whole bins.
       dt: step of the simulation in s.
       bin_s: length of the bins that residuals are averaged over later; a segment is a whole number of them.
+      estimates: of the runs, where they were made already.
 
     Returns:
       The segments and the signals that all runs have, at the times of the rows (`envs.readings.aligned`). `tau` is left
@@ -108,10 +130,11 @@ def cut(runs: Sequence[Run], horizon_s: float, dt: float, bin_s: float = 0.01) -
     names = [name for name in COMPARED if all(name in run.signals for run in runs)]
     if not all("target" in run.signals for run in runs):
         names = [name for name in names if name != "tau"]
+    estimates = estimates or [estimate(run) for run in runs]
     return Cut(
-        segments=_segments(runs, starts, row, lengths.max(), dt),
+        segments=_segments(runs, estimates, starts, row, lengths.max(), dt),
         signals={
-            name: np.concatenate([aligned(run, name)[own] for run, own in zip(runs, row, strict=True)]).astype(
+            name: np.concatenate([one.signals[name][own] for one, own in zip(estimates, row, strict=True)]).astype(
                 np.float32
             )
             for name in names
@@ -136,21 +159,28 @@ def whole(runs: Sequence[Run], dt: float) -> Cut:
         np.minimum(start + 1 + np.arange(most), len(run.time) - 1)[None] for run, start in zip(runs, first, strict=True)
     ]
     longest = max(run.time[-1] - run.time[start] for run, start in zip(runs, first, strict=True))
+    estimates = [estimate(run) for run in runs]
     return Cut(
-        segments=_segments(runs, [np.array([start]) for start in first], row, longest, dt),
-        signals={"q": np.concatenate([aligned(run, "q")[own] for run, own in zip(runs, row, strict=True)])},
+        segments=_segments(runs, estimates, [np.array([start]) for start in first], row, longest, dt),
+        signals={"q": np.concatenate([one.signals["q"][own] for one, own in zip(estimates, row, strict=True)])},
         run=np.arange(len(runs)),
         row=np.concatenate(row),
     )
 
 
 def _segments(
-    runs: Sequence[Run], starts: Sequence[np.ndarray], rows: Sequence[np.ndarray], longest_s: float, dt: float
+    runs: Sequence[Run],
+    estimates: Sequence[Estimate],
+    starts: Sequence[np.ndarray],
+    rows: Sequence[np.ndarray],
+    longest_s: float,
+    dt: float,
 ) -> Segment:
     """Makes the segments of all runs, as one with [segments, ...] on every field.
 
     Args:
       runs: of one robot.
+      estimates: of the runs.
       starts: [segments] of every run: the row at which each begins.
       rows: [segments, rows] of every run: the rows at which each is read, later than its start.
       longest_s: the time from a start to the last row read, of the longest segment. Rows are not exactly periodic, and
@@ -158,7 +188,8 @@ def _segments(
       dt: step of the simulation in s.
     """
     after = 1 + int(np.ceil(longest_s / dt - 1e-6))
-    parts = [_of_run(run, start, row, after, dt) for run, start, row in zip(runs, starts, rows, strict=True)]
+    every = zip(runs, estimates, starts, rows, strict=True)
+    parts = [_of_run(run, one.states, start, row, after, dt) for run, one, start, row in every]
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
 
 
@@ -172,7 +203,7 @@ def rows_together(period_s: float, bin_s: float) -> int:
     return max(1, round(bin_s / period_s))
 
 
-def _of_run(run: Run, start: np.ndarray, rows: np.ndarray, after: int, dt: float) -> Segment:
+def _of_run(run: Run, states: np.ndarray, start: np.ndarray, rows: np.ndarray, after: int, dt: float) -> Segment:
     """Makes the segments of one run, of `after` steps each (`_segments`)."""
     before, ahead = round(HISTORY_S / dt), round(LONGEST_S / dt)
     begin = run.time[start][:, None]
@@ -192,18 +223,18 @@ def _of_run(run: Run, start: np.ndarray, rows: np.ndarray, after: int, dt: float
     ticks = np.floor((grid - run.time[0]) * run.controller.rate_hz + 1e-6)
     at = (run.time[rows] - begin) / dt
     step = np.minimum(np.floor(at + 1e-6).astype(np.int32), after - 1)
-    position, velocity = np.moveaxis(smoothed(run), 1, 0)
+    position, velocity = np.moveaxis(states, 1, 0)
     fine = begin + dt * np.arange(-before, ahead + 1)
     # The slope of interpolated positions would have several times the noise of the velocities, but not at the rows: a
     # delay of whole rows would then seem likelier than any other.
     acceleration = np.gradient(velocity, run.time, axis=0)
-    states = [hermite(run.time, *pair, fine)[0] for pair in ((position, velocity), (velocity, acceleration))]
+    between_rows = [hermite(run.time, *pair, fine)[0] for pair in ((position, velocity), (velocity, acceleration))]
     return Segment(
         target=target,
         between=between,
         **{name: values.astype(np.float32)[last] for name, values in held.items()},
         sample=np.diff(ticks, axis=1, prepend=-np.inf) > 0,
-        measured=np.stack(states, axis=2).astype(np.float32),
+        measured=np.stack(between_rows, axis=2).astype(np.float32),
         row_step=step,
         row_share=np.clip(at - step, 0.0, 1.0).astype(np.float32),
     )

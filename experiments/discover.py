@@ -44,7 +44,7 @@ def main(args: Args) -> None:
     Raises:
       ValueError: an option is wrong, a log cannot be used, or the folder holds another run.
     """
-    checkpoint.set_up_compiler(checkpoint.a_device_a_core())
+    checkpoint.set_up_compiler(checkpoint.for_simulation())
     _check(args)
     # Says what is wrong with the logs before the folder is made and anything is compiled.
     log, _ = read_logs(args.logs, args.clear_flags)

@@ -49,7 +49,7 @@ def main(args: Args) -> None:
     Raises:
       ValueError: an option is wrong, or the folder holds another benchmark.
     """
-    checkpoint.set_up_compiler(checkpoint.a_device_a_core())
+    checkpoint.set_up_compiler(checkpoint.for_simulation())
     if args.size not in (*SIZES, *FIELD_SIZES):
         raise ValueError(f"size: got '{args.size}', expected one of {', '.join((*SIZES, *FIELD_SIZES))}")
     number, _, pieces = args.piece.partition("/")

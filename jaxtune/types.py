@@ -203,6 +203,7 @@ class Effect:
         "bristle",
         "wrench",
         "sensor",
+        "torque_reading",
         "gravity",
     ]
     """Stage at which it acts: the model, or a signal from the commanded target to the sensor."""

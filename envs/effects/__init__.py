@@ -9,6 +9,8 @@ of their rows:
     target -command-> -error-> controller -torque-> motor -transmission-> joint -sensor-> readings
                                           friction, bristle, wrench --^
 
+    motor -torque_reading-> recorded torque
+
 Values of zero leave the signal unchanged, so an effect is absent where its values are zero. That is why limits and
 stiffnesses enter `act` as reciprocals, and ratios as logarithms.
 

@@ -1,7 +1,8 @@
 """What every log leaves uncertain beside the model's own parameters; these rows are fitted, and never named as missing.
 
-A controller's damping gain is rarely known to a percent, and few logs say how their targets went on between two rows.
-Discovery fits both under every hypothesis, or it would call them a delay or a friction.
+A controller's damping gain is rarely known to a percent, few logs say how their targets went on between two rows, and a
+torque that was computed from a motor's current is as good as its constant. Discovery fits these under every hypothesis,
+or it would call them a delay, a friction or a weak motor.
 """
 
 import jax.numpy as jnp
@@ -18,6 +19,12 @@ def _damping_gain(values, speed, now, memory):
 def _target_between_rows(values, target, now, memory):
     """target' = target + share (linear - held): targets that move on in a straight line to the next row."""
     return target + values["share"] * now.between, memory
+
+
+def _torque_reading(values, torque, now, memory):
+    """read = ratio torque; `values` hold the logarithm of the ratio."""
+    del now
+    return torque * jnp.exp(values["ratio"]), memory
 
 
 ROWS = (
@@ -42,5 +49,16 @@ ROWS = (
         act=_target_between_rows,
         sentence="Targets move on between two rows of the log.",
         excited_by="a log at a higher rate",
+    ),
+    Effect(
+        name="torque_reading",
+        family="sensing",
+        on="joint",
+        enters="torque_reading",
+        parameters=(Parameter(name="ratio", form="ratio", bounds=(-1.0, 1.0), prior=0.2),),
+        sizes=(0.05,),
+        act=_torque_reading,
+        sentence="The recorded torque is a multiple of the motor's.",
+        excited_by="slow motion through postures of known gravity torque",
     ),
 )

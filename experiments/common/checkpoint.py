@@ -41,17 +41,22 @@ def set_up_compiler(xla_flags: str) -> None:
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
 
 
-def a_device_a_core(most: int = 8) -> str:
-    """Returns the XLA flag that makes every core of this process a JAX device.
+def for_simulation(most: int = 8) -> str:
+    """Returns XLA flags for programs that simulate robots on CPU; pass them to `set_up_compiler`.
 
-    XLA uses a single CPU device otherwise, and a vmapped simulation would run on one core. Programs that shard their
-    work over devices, as discovery does, use all of them. Pass the flag to `set_up_compiler`.
+    - Every core of this process is a JAX device. XLA uses a single CPU device otherwise, and a vmapped simulation would
+      run on one core. Programs that shard their work over devices, as discovery does, use all of them.
+    - The fusion emitters of JAX 0.10 are off. They compute each body's pose again for every body that hangs on it: a
+      step of MJX took 84 times as long for a chain of six joints, and 6 times for five (github.com/jax-ml/jax,
+      issue 33761). JAX 0.11 has no such flag, and does not need it.
 
     Args:
       most: largest number of devices.
     """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return f"--xla_force_host_platform_device_count={min(cores, most)}"
+    devices = f"--xla_force_host_platform_device_count={min(cores, most)}"
+    # XLA ends the process at a flag that it does not know.
+    return devices if jax.__version_info__ >= (0, 11) else f"{devices} --xla_cpu_use_fusion_emitters=false"
 
 
 def versions() -> dict[str, str]:

@@ -140,10 +140,11 @@ def cut_log(log: Log, dt: float, signals: Sequence[str], horizons: Sequence[floa
     """
     names = {split: {run.name for run in runs} for split, runs in splits(log).items()}
     labels = [regimes(run) for run in log.runs]
+    estimates = [segments.estimate(run) for run in log.runs]
     data: dict[str, dict[float, Segments]] = {split: {} for split in names}
     for horizon in horizons:
         # All runs at once, so that segments have one shape and programs compile once.
-        cut = segments.cut(log.runs, horizon, dt, BIN_S)
+        cut = segments.cut(log.runs, horizon, dt, BIN_S, estimates)
         label = np.stack([labels[run][rows] for run, rows in zip(cut.run, cut.row, strict=True)])
         for split in names:
             mine = np.array([log.runs[run].name in names[split] for run in cut.run])
@@ -159,5 +160,25 @@ def cut_log(log: Log, dt: float, signals: Sequence[str], horizons: Sequence[floa
                 steps=cut.segments.target.shape[1] - round(segments.HISTORY_S / dt),
                 run=cut.run[mine],
                 regimes=label[mine],
+                repeats=_repeats(log, cut.run[mine], cut.row[mine]),
             )
     return data
+
+
+def _repeats(log: Log, run: np.ndarray, row: np.ndarray) -> np.ndarray:
+    """Groups segments in which several runs of a condition were told the same, [segments]; -1 for all others.
+
+    Args:
+      log: of the runs.
+      run: [segments] index of each segment's run.
+      row: [segments, rows] of that run.
+    """
+    told: dict[tuple, list[int]] = {}
+    for number, (mine, rows) in enumerate(zip(run, row, strict=True)):
+        one = log.runs[mine]
+        target = one.signals["target"][rows] if "target" in one.signals else one.signals["tau"][rows]
+        told.setdefault((one.condition, str(one.controller), rows[0], target.round(6).tobytes()), []).append(number)
+    groups = np.full(len(run), -1)
+    for group, numbers in enumerate(numbers for numbers in told.values() if len(numbers) > 1):
+        groups[numbers] = group
+    return groups

@@ -12,6 +12,7 @@ from jaxtune.types import Effect, Parameter
 
 _LARGE = 0.7  # of the bounds: the largest size that is screened
 _TRAVEL_RAD, _MOST_TRAVELS = 0.002, 5.0  # over which dry friction sets in, and how many of these at most
+_TORQUE_SHARE, _MOST_SHARES = 0.2, 3.0  # by which recorded torques are off, and how many of these at most
 _BENT, _STRAIGHT = 5, 3  # sizes of an effect without a slope at zero, and of one with
 
 
@@ -93,31 +94,38 @@ def _kind(place: str) -> str:
     return _WORDS.sub(lambda word: "" if word[0].lower() in _SIDES else word[0], place)
 
 
-def unknown_directions(axes: Sequence[Axis], control_hz: float) -> tuple[np.ndarray, np.ndarray]:
+def unknown_directions(
+    axes: Sequence[Axis], control_hz: float, signals: Sequence[str] = ()
+) -> tuple[np.ndarray, np.ndarray]:
     """Returns directions in the rig's coordinates along what neither log nor model says, and their bounds.
 
-    They are a delay of all readings, a delay of all targets, the share in which targets move on between two rows, and
-    the travel over which the dry friction of the nominal model sets in. A log does not say when within its period the
-    controller read and acted, and no model says what friction does at a reversal. So discovery leaves these free under
-    every hypothesis; otherwise a delay or a friction would be named for a robot that has neither.
+    They are a delay of all readings, a delay of all targets, the share in which targets move on between two rows, the
+    travel over which the dry friction of the nominal model sets in, and the scale of recorded torques. A log does not
+    say when within its period the controller read and acted, and no model says what friction does at a reversal. So
+    discovery leaves these free under every hypothesis; otherwise a delay, a friction or a weak motor would be named for
+    a robot that has none.
 
     Args:
       axes: coordinates of the rig.
       control_hz: rate of the controller in Hz.
+      signals: that are compared.
 
     Returns:
-      [unknowns, axes] of the size of half a period, of half of the way between rows, or of a typical travel; and
-      [unknowns, 2] least and largest coordinate.
+      [unknowns, axes] of the size of half a period, of half of the way between rows, of a typical travel, or of a
+      typical error of a motor's constant; and [unknowns, 2] least and largest coordinate.
     """
-    half = {"sensor_delay": 0.5 / control_hz, "command_delay": 0.5 / control_hz, "target_between_rows": 0.5}
-    directions = [[size * (axis.effect == effect) for axis in axes] for effect, size in half.items()]
     # Nothing acts before it is time, and nothing is later than a whole period.
-    bounds = [[0.0, 2.0]] * len(half)
+    common = {"sensor_delay": 0.5 / control_hz, "command_delay": 0.5 / control_hz, "target_between_rows": 0.5}
+    found = [([size * (axis.effect == effect) for axis in axes], (0.0, 2.0)) for effect, size in common.items()]
     rubbing = {axis.place for axis in axes if axis.effect == "coulomb" and axis.prior_sd > 0}
-    for number, axis in enumerate(axes):
-        if axis.effect == "presliding" and axis.place in rubbing:
-            directions.append(_TRAVEL_RAD * np.eye(len(axes))[number])
-            bounds.append([0.0, _MOST_TRAVELS])
+    recorded = {axis.place for axis in axes if {"tau", "abs_tau"} & set(signals)}
+    for effect, size, bounds, places in (
+        ("presliding", _TRAVEL_RAD, (0.0, _MOST_TRAVELS), rubbing),
+        ("torque_reading", _TORQUE_SHARE, (-_MOST_SHARES, _MOST_SHARES), recorded),
+    ):
+        mine = [number for number, axis in enumerate(axes) if axis.effect == effect and axis.place in places]
+        found += [(size * np.eye(len(axes))[number], bounds) for number in mine]
+    directions, bounds = zip(*found, strict=True)
     return np.array(directions, float), np.array(bounds)
 
 

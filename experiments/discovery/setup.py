@@ -145,7 +145,7 @@ def build_question(
     axes = {(axis.effect, axis.place): number for number, axis in enumerate(rig.axes)}
     library = {name: row for name, row in rig.effects.items() if name in LIBRARY}
     every = hypotheses(rig.axes, rig.places, library)
-    unknowns, unknown_bounds = unknown_directions(rig.axes, rig.control_hz)
+    unknowns, unknown_bounds = unknown_directions(rig.axes, rig.control_hz, signals)
     measured = cut_log(log, rig.dt, signals, horizons)
     simulated = simulate_null_logs(log, spec, null_logs, seed)
     nulls = [told_alike(cut_log(one, rig.dt, signals, horizons), measured) for one in simulated]

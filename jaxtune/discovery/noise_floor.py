@@ -4,8 +4,8 @@ It is measured on simulated null logs: another engine moves the nominal robot, w
 the measured log's noise. Their nominal parameters are fitted. The residuals that are left hold noise, rounding, the
 error of the state that a segment starts from, and the gap between engines. What all logs leave alike is subtracted from
 the measured residuals too. The rms of the rest, for every component of every signal and every moment of a segment, is
-the floor. All other modules work on residuals divided by it: a residual of one
-floor unit is as large as that rms, which even a model in which nothing is missing leaves.
+the floor; more if the robot does not repeat itself so well. All other modules work on residuals divided by it: a
+residual of one floor unit is as large as that rms, which even a model in which nothing is missing leaves.
 """
 
 from collections.abc import Callable, Mapping
@@ -18,7 +18,7 @@ import numpy as np
 from jaxtune.discovery.fit import Free
 from jaxtune.discovery.least_squares import Counts, Linear
 from jaxtune.discovery.problem import Problem, Segments
-from jaxtune.discovery.simulation import Evaluate, paired_residuals
+from jaxtune.discovery.simulation import Evaluate, paired_residuals, residuals
 
 FURTHEST = 3.0
 """Prior standard deviations that a nominal parameter may move. One that stops there is a finding, not a nuisance."""
@@ -26,6 +26,7 @@ FURTHEST = 3.0
 _STEPS = 5  # of the fits to null logs; a tenth off in the parameters, one step would leave an engine gap
 _FITTED = 64  # segments of a null log that its fit sees, at most
 _FEW = 8  # null logs that scales are measured on, at most
+_REPEATED = 8  # repetitions of segments that it takes to tell how far they differ
 _LEAST_SHARE = 0.25  # of a component's mean floor: else the first rows of a segment would count without end
 
 Say = Callable[[str], None]
@@ -112,6 +113,8 @@ def measure(problem: Problem, say: Say) -> NoiseFloor:
         shared = {split: _shared(values) for split, values in left.items()}
         left = {split: values - shared[split] for split, values in left.items()}
         scale = {split: _rms_floor(values) for split, values in left.items()}
+        wider = _of_repeats(problem, horizon, scale)
+        scale = {split: wider * values for split, values in scale.items()}
         in_units = left["train"] / scale["train"]
         segments = {split: data[horizon] for split, data in problem.data.items()}
         found[horizon] = Floor(
@@ -222,6 +225,7 @@ def _merged(problem: Problem, split: str, horizon: float, count: int) -> Segment
         signals={name: np.concatenate([log.signals[name] for log in logs]) for name in logs[0].signals},
         run=np.concatenate([log.run for log in logs]),
         regimes=np.concatenate([log.regimes for log in logs]),
+        repeats=None,
     )
 
 
@@ -241,6 +245,26 @@ def _rms_floor(left: np.ndarray) -> np.ndarray:
     return np.maximum(fresh, _LEAST_SHARE * fresh.mean(axis=0))
 
 
+def _of_repeats(problem: Problem, horizon: float, scale: Mapping[str, np.ndarray]) -> np.ndarray:
+    """How many times the floor repetitions of a motion differ from each other, [components]; one at least.
+
+    What differs from one run to the next, such as friction that warms up, no model of one robot explains. The error of
+    the model is nearly the same in all of them, and drops out of their differences. Sealed runs are not looked at.
+    """
+    squares, count = 0.0, 0
+    for split in (split for split in problem.data if split != "sealed"):
+        segments = problem.data[split][horizon]
+        groups = np.full(len(segments.run), -1) if segments.repeats is None else segments.repeats
+        if (groups < 0).all():
+            continue
+        (left,) = residuals(problem, np.zeros(problem.axes), segments) / scale[split]
+        for group in np.unique(groups[groups >= 0]):
+            mine = left[groups == group]
+            squares = squares + ((mine - mine.mean(axis=0)) ** 2).mean(axis=1).sum(axis=0)
+            count += len(mine) - 1
+    return np.sqrt(np.maximum(squares / count, 1.0)) if count >= _REPEATED else np.ones(len(problem.cells))
+
+
 def _on_some(
     problem: Problem, segments: Segments, scale: np.ndarray, shared: np.ndarray, chosen: np.ndarray
 ) -> Evaluate:
@@ -256,4 +280,5 @@ def _some_of(segments: Segments, chosen: np.ndarray) -> Segments:
         signals={name: values[chosen] for name, values in segments.signals.items()},
         run=segments.run[chosen],
         regimes=segments.regimes[chosen],
+        repeats=None,
     )

@@ -86,6 +86,9 @@ class Segments:
     """[segments]: index of the run that the segment was cut from."""
     regimes: np.ndarray
     """[segments, rows, joints]: index of the regime that each joint is in."""
+    repeats: np.ndarray | None = None
+    """[segments]: the same number for segments in which several runs were told the same, -1 for all others; None where
+    that is not known."""
 
 
 @dataclass(frozen=True, kw_only=True)

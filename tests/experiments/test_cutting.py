@@ -13,7 +13,7 @@ from envs.logs import Controller, Log, Run, splits, write
 from envs.models import suspended
 from envs.null_logs import Robot, as_recorded, play
 from experiments.discovery.blind_cases import ARM
-from experiments.discovery.cutting import HORIZONS_S, fitting_horizons, split_in_time
+from experiments.discovery.cutting import HORIZONS_S, cut_log, fitting_horizons, split_in_time
 from experiments.discovery.setup import build_question, drop_filtered, read_logs
 
 MEASURED = Path(__file__).parents[3] / "shared" / "data"
@@ -197,3 +197,25 @@ def test_real_logs_become_questions(name, signals, note):
     assert [text.startswith(note) for text in question.notes] == ([True] if note else [])
     # Nothing of them is taken for stale.
     assert not any("repeat" in text for text in question.notes)
+
+
+def test_segments_in_which_runs_were_told_the_same_are_repeats(played):
+    (one,) = played.runs
+    other = replace(one, signals={**one.signals, "target": 0.5 * one.signals["target"]})
+    splits_of = {"again": (one, one), "other": (one, other), "alone": (one,)}
+    splits_named = dict(zip(splits_of, ("train", "select", "sealed"), strict=True))
+    runs = [
+        replace(run, name=f"{condition}_{number}", condition=condition, split=splits_named[condition])
+        for condition, mine in splits_of.items()
+        for number, run in enumerate(mine)
+    ]
+    found = cut_log(replace(played, runs=tuple(runs)), 0.001, ("q",), (0.24,))
+    again = found["train"][0.24]
+    for group in np.unique(again.repeats[again.repeats >= 0]):
+        first, second = np.flatnonzero(again.repeats == group)
+        assert again.run[first] != again.run[second]
+        np.testing.assert_array_equal(again.signals["q"][first], again.signals["q"][second])
+    # Of many segments some are left out.
+    assert (again.repeats >= 0).mean() > 0.6
+    assert (found["select"][0.24].repeats < 0).all()
+    assert (found["sealed"][0.24].repeats < 0).all()

@@ -201,6 +201,11 @@ def test_the_travel_of_friction_is_unknown_where_the_model_has_friction(spec):
     (number,) = np.flatnonzero(directions[3])
     assert (rig.axes[number].effect, rig.axes[number].place) == ("presliding", "elbow")
     assert (bounds[:, 0] == 0).all()
+    # The scale of torques is unknown where they are compared.
+    more, _ = unknown_directions(rig.axes, 1000.0, ("abs_tau", "q"))
+    np.testing.assert_array_equal(more[:4], directions)
+    places = [rig.axes[number] for row in more[4:] for number in np.flatnonzero(row)]
+    assert [(axis.effect, axis.place) for axis in places] == [("torque_reading", joint) for joint in JOINTS]
 
 
 def test_every_form_moves_the_axes_of_its_parameter_at_the_places_of_its_effect(spec):

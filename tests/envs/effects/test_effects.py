@@ -503,6 +503,12 @@ def test_the_damping_gain_scales_what_the_controller_damps():
     np.testing.assert_allclose(speed, 3.0, rtol=1e-6)
 
 
+def test_a_recorded_torque_may_be_a_multiple_of_the_motors():
+    row = NOMINAL["torque_reading"]
+    torque, _ = row.act(values_of(row, ratio=0.8), jnp.full(JOINTS, -2.0), None, None)
+    np.testing.assert_allclose(torque, -1.6, rtol=1e-6)
+
+
 # Against MuJoCo C: an arm under its controller, with the effect and without.
 
 

@@ -1,5 +1,8 @@
 """The floor is what null logs leave once they are fitted, not what a fit that stopped short leaves."""
 
+from dataclasses import replace
+
+import jax
 import numpy as np
 import pytest
 import slider as toy
@@ -31,3 +34,30 @@ def test_fits_to_null_logs_find_what_was_drawn(monkeypatch):
     draws = np.random.default_rng(2).uniform(-1.5, 1.5, (6, 2))
     _, found = floor_of(draws, monkeypatch)
     np.testing.assert_allclose(found.null_coordinates, draws, atol=0.3)
+
+
+def floor_of_repeats(masses, told_alike=True):
+    """Mean floor [components] where a motion of train was repeated by sliders whose masses are off by so much."""
+    problem = toy.problem({})
+    runs = [toy.measured({"mass": mass}, number, count=20, motion=7) for number, mass in enumerate(masses)]
+    both = {}
+    for horizon in toy.HORIZONS:
+        one, two = (run[horizon] for run in runs)
+        both[horizon] = replace(
+            one,
+            inputs=jax.tree.map(lambda *leaves: np.concatenate(leaves), one.inputs, two.inputs),
+            signals={name: np.concatenate([one.signals[name], two.signals[name]]) for name in one.signals},
+            run=np.concatenate([one.run, 100 + two.run]),
+            regimes=np.concatenate([one.regimes, two.regimes]),
+            repeats=np.tile(np.arange(20), 2) if told_alike else None,
+        )
+    found = measure(replace(problem, data={**problem.data, "train": both}), lambda text: None)
+    return found[problem.main_horizon].scale["train"].mean(axis=0)
+
+
+def test_what_a_robot_does_not_repeat_is_part_of_the_floor():
+    alone = floor_of_repeats((0.1, 0.1), told_alike=False)
+    np.testing.assert_allclose(floor_of_repeats((0.1, 0.1)), alone, rtol=0.3)
+    assert (floor_of_repeats((0.4, -0.4)) > 1.5 * alone).any()
+    # The floor is of the robot, whatever the model.
+    np.testing.assert_allclose(floor_of_repeats((0.3, 0.3)), alone, rtol=0.3)
