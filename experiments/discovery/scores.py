@@ -7,7 +7,7 @@ import numpy as np
 SEVERITIES = (2.0, 5.0, 15.0)
 """Severities at which effects are hidden in the sizes `arm` and `standard`, in floor units."""
 
-EMPTY = ("empty", "linear")
+EMPTY = ("empty", "linear", "wandering")
 """Kinds of cases in which nothing is hidden."""
 
 _HARM = (1.1, 0.2)  # ratio and floor units by which a model may be worse than the better of nominal and null
@@ -21,9 +21,9 @@ def score(truth: dict, answer: dict) -> dict:
     A model that was withdrawn after the look at the sealed runs counts as `unnamed`, and so does a case that failed.
 
     Args:
-      truth: `kind` of the case (`single`, `weak`, `pair`, `triple`, `empty`, `linear` or `outside`) and its `effects`,
-        each with `name`, `family`, `places`, `value` of the first parameter (None where the generator's formula has no
-        such number), and its `asked` and reached `severity`.
+      truth: `kind` of the case (`field.cases.FieldCase`) and its `effects`, each with `name`, `family`, `places`,
+        `value` of the first parameter (None where the generator's formula has no such number), and its `asked` and
+        reached `severity`.
       answer: content of `summary.json`, or the verdict `failed` with its `message`.
 
     Returns:

@@ -166,6 +166,18 @@ def test_a_log_is_as_a_user_writes_it_and_says_nothing_of_the_truth(tmp_path, sh
     np.testing.assert_array_equal(again.runs[1].signals["q"], log.runs[1].signals["q"])
 
 
+def test_runs_of_a_robot_that_wanders_are_played_by_robots_that_differ_in_friction_alone(short):
+    drawn, same = scene("mujoco_c", kind="wandering"), scene("mujoco_c")
+    trace = drawn.play([])
+    assert same.wandered == []
+    assert len({tuple(robot.friction) for robot in drawn.wandered}) == len(drawn.motions)
+    for run, robot in enumerate(drawn.wandered):
+        back = replace(robot, friction=drawn.real.friction, damping=drawn.real.damping)
+        np.testing.assert_equal(vars(back), vars(drawn.real))
+        alone = drawn.generator.play([robot], drawn.script, whole(1, drawn.script, [run]))
+        np.testing.assert_allclose(trace.q[run], alone.q[0], atol=1e-9)
+
+
 def test_a_value_is_relative_to_the_nominal_model():
     drawn = scene("mujoco_c")
     placed = writing.Placed("coulomb", (1,), 0.5)

@@ -20,7 +20,8 @@ class FieldCase:
     number: int
     """Position in the shuffled list of cases; it names the files."""
     kind: str
-    """`single`, `weak`, `pair`, `triple`, `empty`, `linear` (empty, targets move between rows) or `outside`."""
+    """`single`, `weak`, `pair`, `triple`, `outside`, or one without any effect: `empty`, `linear` (targets move between
+    rows) or `wandering` (frictions and dampings differ from run to run)."""
     effects: tuple[str, ...]
     severities: tuple[float, ...]
     """Intended, in floor units."""
@@ -39,13 +40,16 @@ class FieldSize:
     empty: int
     linear: int
     outside: int
+    wandering: int = 0
 
 
 FIELD_SIZES = {
     "field": FieldSize(single=60, weak=20, pair=16, triple=8, empty=50, linear=10, outside=20),
     "field_smoke": FieldSize(single=2, weak=0, pair=1, triple=0, empty=1, linear=1, outside=1),
+    "field_wandering": FieldSize(single=0, weak=0, pair=0, triple=0, empty=0, linear=0, outside=0, wandering=24),
 }
-"""Sizes by the name that `--size` takes: `field` for a measurement, `field_smoke` to see that it works."""
+"""Sizes by the name that `--size` takes: `field` for a measurement, `field_smoke` to see that it works, and
+`field_wandering` for how often something is named where nothing is missing, but runs differ."""
 
 
 def cases(size: FieldSize, seed: int) -> list[FieldCase]:
@@ -67,6 +71,7 @@ def cases(size: FieldSize, seed: int) -> list[FieldCase]:
             ("outside", (name,), (_severity(rng, *_OUTSIDE_SEVERITY),))
             for name in _in_turn(tuple(OUTSIDE), size.outside, rng)
         ),
+        *(("wandering", (), ()) for _ in range(size.wandering)),
     ]
     names = [name for name, share in _SHARES.items() for _ in range(share)]
     topologies = _in_turn(names, len(hidden), rng)

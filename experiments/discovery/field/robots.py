@@ -256,6 +256,18 @@ def mistaken(robot: Robot, error: float, rng: np.random.Generator) -> Robot:
     )
 
 
+def wandered(robot: Robot, spread: float, rng: np.random.Generator) -> Robot:
+    """Returns a robot on another day: dry friction and damping of each joint are multiplied by a factor of their own.
+
+    Args:
+      robot: the real one.
+      spread: standard deviation of the factors' logarithms.
+      rng: random numbers.
+    """
+    factors = np.exp(spread * rng.normal(size=(2, len(robot.joints))))
+    return replace(robot, friction=robot.friction * factors[0], damping=robot.damping * factors[1])
+
+
 def rounded(robot: Robot) -> Robot:
     """Returns the robot with the digits that its MJCF has, so that file and numbers agree."""
     arrays = {name: value for name, value in vars(robot).items() if isinstance(value, np.ndarray)}

@@ -2,7 +2,7 @@
 
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
 
@@ -23,6 +23,7 @@ from experiments.discovery.field.sizes import FAMILY, ON_BODY, bounds
 _TRIES = 8  # robots that are drawn until one can show what is wanted
 _SEVERITY_RATIO = 1.3  # between wanted and reached severity, at most
 _FARTHEST_RAD = 2.7  # that a joint may go, within the ranges that a model may give
+_WANDERING = 0.2  # standard deviation of the logarithms of frictions and dampings from run to run
 
 
 @dataclass(frozen=True)
@@ -62,6 +63,8 @@ class Scene:
             self.motions, self.generator.plant.dt, self.topology.control_hz, case.kind == "linear", rng
         )
         self.meter = Meter(self.generator, self.real, self.script, self.sensors, int(rng.integers(2**31)))
+        wandering = self.motions if case.kind == "wandering" else ()
+        self.wandered = [robots.wandered(self.real, _WANDERING, rng) for _ in wandering]
 
     def with_effects(self, placed: Sequence[Placed], sizes: np.ndarray | None, runs: int):
         """Returns robots and `Hidden` effects for lanes ordered by robot, each with a number of runs.
@@ -95,7 +98,10 @@ class Scene:
         """Plays all runs with effects."""
         runs = len(self.motions)
         real, hidden = self.with_effects(placed, None, runs)
-        return self.generator.play(real, self.script, whole(1, self.script, range(runs)), hidden)
+        lanes = whole(1, self.script, range(runs))
+        if self.wandered:
+            real, lanes = self.wandered, replace(lanes, robot=np.arange(runs))
+        return self.generator.play(real, self.script, lanes, hidden)
 
     def log(self, trace: Trace, rng: np.random.Generator) -> Log:
         """Makes the log that a user would have recorded.
