@@ -17,7 +17,7 @@ import mujoco
 import numpy as np
 from mujoco import mjx
 
-from envs import sensing
+from envs import sensing, stepping
 from envs.axes import Axis, describe_axis
 from envs.chain import MIN_FRICTION_NM, Chain
 from envs.effects import EVERY
@@ -33,9 +33,7 @@ ByEffect = Mapping[str, Mapping[str, jax.Array]]
 System = tuple[mjx.Model, mjx.Data, jax.Array]
 """A robot's model and first state in MJX, and the direction of gravity in its IMU's frame, [3]."""
 
-# Of MJX's solver. With friction in every joint, readings differ from those with twice as many iterations by 0.003 floor
-# units (rms over the rms of the noise floor). With four line searches it would be 0.2.
-_ITERATIONS, _LINE_SEARCHES = 4, 6
+_ITERATIONS = 4  # of the solver
 _LONGEST_STEP_S = 0.001
 
 
@@ -88,7 +86,7 @@ class Rig:
         # device. `mj_model` keeps the nominal friction, from which priors and saved models are computed.
         device = suspended(spec)
         device.opt.timestep, device.opt.disableflags = self.dt, model.opt.disableflags
-        device.opt.iterations, device.opt.ls_iterations = _ITERATIONS, _LINE_SEARCHES
+        device.opt.iterations = _ITERATIONS
         device.dof_frictionloss[self.dof] = np.maximum(model.dof_frictionloss[self.dof], MIN_FRICTION_NM)
         self._model = mjx.put_model(device)
         self._data = mjx.make_data(self._model)
@@ -96,7 +94,9 @@ class Rig:
         # A robot on a rig has no feet on the ground, so effects of contact have no place and drop out below.
         self.places = {"joint": self.joints, "body": self.bodies, "foot": (), "robot": ("robot",)}
         self.effects = {row.name: row for row in EVERY.values() if self.places[row.on] and row.needs != "free"}
-        self.chain = Chain(self.dt, tuple(self.effects.values()), self.qpos, self.dof, self._bodies, 0.5 * self.dt)
+        self.chain = Chain(
+            self.dt, tuple(self.effects.values()), self.qpos, self.dof, self._bodies, 0.5 * self.dt, stepping.step
+        )
         self.axes = self._describe_axes()
         # The IMU is taken to sit on the first body, which carries the others.
         self._gravity = sensing.projected_gravity(jnp.asarray(model.body_quat[1], jnp.float32))
@@ -314,6 +314,7 @@ class Rig:
             qpos=self._data.qpos.at[self.qpos].set(start[0] + chain.lead_s * start[1]),
             qvel=self._data.qvel.at[self.dof].set(start[1]),
             qacc=self._data.qacc.at[self.dof].set(acceleration[before]),
+            qacc_warmstart=self._data.qacc.at[self.dof].set(acceleration[before]),
         )
 
         def move(index, carry):
