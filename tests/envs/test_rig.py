@@ -70,6 +70,15 @@ def test_a_robot_without_motors_swings_as_in_mujoco(arm, plain):
     agrees(arm.play(segment), rigs.in_mujoco(arm.rig, plain, segment))
 
 
+@pytest.mark.parametrize("integrator", ["RK4", "implicitfast"])
+def test_the_models_integrator_changes_nothing(arm, plain, integrator):
+    text = rigs.ARM.replace('timestep="0.001"', f'timestep="0.001" integrator="{integrator}"')
+    assert text != rigs.ARM
+    rig = Rig(mujoco.MjSpec.from_string(text), rigs.ARM_JOINTS, rigs.CONTROL_HZ).scaled(rigs.ARM_SCALES)
+    segment = rigs.segment(rig, START, START, limit=0.0, speed=[2.0, -3.0])
+    agrees(rigs.Player(rig).play(segment), rigs.in_mujoco(arm.rig, plain, segment))
+
+
 def test_a_robot_that_is_fed_torques_moves_as_in_mujoco(arm, plain):
     segment = rigs.segment(arm.rig, START, START, feed=[1.0, -0.5], emf=[0.1, 0.05])
     agrees(arm.play(segment), rigs.in_mujoco(arm.rig, plain, segment))
