@@ -1,4 +1,4 @@
-"""Measures speeds, and how often the gate rejects: `python -m experiments.bench speed`, or `targets`, `logs`, `alarm`.
+"""Measures speeds, and how often the gate rejects: `python -m experiments.bench speed`, or another of `Args.what`.
 
 Speeds depend on the machine and on what else it does, so compare only ratios within one run. No test asserts them.
 """
@@ -13,13 +13,17 @@ from typing import Literal
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import tyro
+from mujoco import mjx
 from rich.table import Table
 
+from envs import models, stepping
 from envs.biteno import constants
 from envs.logs import Controller, Log, Run, read, write
 from envs.logs.tables import WRITERS
+from envs.rig import Rig
 from experiments.common import checkpoint
 from experiments.common.cli import console, run
 from experiments.common.config import chosen, preset
@@ -33,6 +37,9 @@ from jaxtune.mjx import parameters
 FIELDS = ("novelty", "threshold", "p_value")
 """Numbers of a gate call that `alarm` keeps."""
 
+_SIDE_BY_SIDE, _STEPS = 64, 200  # robots and steps of `rig`
+_LINE_SEARCHES = 6  # of MJX's solver, the fewest with which dry friction comes out right
+
 _HEADINGS = {"rings": "rejects"}  # of the table; the key in JSON stays
 
 
@@ -40,9 +47,10 @@ _HEADINGS = {"rings": "rejects"}  # of the table; the key in JSON stays
 class Args:
     """Measures one thing, prints it as a table and writes it as JSON."""
 
-    what: tyro.conf.Positional[Literal["speed", "targets", "logs", "alarm"]]
+    what: tyro.conf.Positional[Literal["speed", "targets", "rig", "logs", "alarm"]]
     """speed: training steps per second, with exact and fast physics. targets: simulation steps per second of every
-    engine that is installed. logs: seconds to read ten minutes of 40 columns at 1 kHz. alarm: how often the gate
+    engine that is installed. rig: simulation steps per second of suspended robots, with the step of MJX and with that
+    of discovery. logs: seconds to read ten minutes of 40 columns at 1 kHz. alarm: how often the gate
     rejects in its first call, over many seeds."""
     out: Path = Path("runs/bench")
     """Folder of the results, a JSON file for each measurement."""
@@ -112,6 +120,40 @@ def targets(args: Args) -> dict:
         speed = sizes.ppo.num_envs * sizes.episode_steps / seconds[1]
         physics = speed * learner.robot.substeps
         rows[name] = {"first_call_s": seconds[0], "steps_per_second": speed, "physics_steps_per_second": physics}
+    return rows
+
+
+def rig(args: Args) -> dict:
+    """Measures simulation steps per second of suspended robots: 64 of each side by side, on one core.
+
+    Returns:
+      By robot: steps per second by MJX's own step and by that of the rig, and their ratio.
+    """
+    del args
+    robots = {
+        "pendulum": (models.spec("pendulum"), ("hinge",)),
+        "arm": (mujoco.MjSpec.from_file(str(Path(__file__).parent / "arm.xml")), ("shoulder", "elbow")),
+        "biteno": (models.spec("biteno"), constants.JOINTS),
+    }
+    rows = {}
+    for name, (spec, joints) in robots.items():
+        model, start, _ = jax.device_put(Rig(spec, joints, control_hz=200.0).system)
+        model = model.tree_replace({"opt.ls_iterations": _LINE_SEARCHES})
+        poses = start.qpos + np.random.default_rng(0).normal(scale=0.1, size=(_SIDE_BY_SIDE, model.nq))
+        found = {}
+        for key, step in (("mjx", mjx.step), ("rig", stepping.step)):
+
+            def end(pose, model=model, start=start, step=step):
+                data = start.replace(qpos=pose)
+                return jax.lax.fori_loop(0, _STEPS, lambda _, data: step(model, data), data).qpos
+
+            compiled, seconds = jax.jit(jax.vmap(end)), []
+            for _ in range(4):
+                begin = time.monotonic()
+                jax.block_until_ready(compiled(jnp.asarray(poses, jnp.float32)))
+                seconds.append(time.monotonic() - begin)
+            found[key] = _SIDE_BY_SIDE * _STEPS / min(seconds[1:])
+        rows[name] = {**found, "ratio": found["rig"] / found["mjx"]}
     return rows
 
 
@@ -200,9 +242,11 @@ def alarm(args: Args) -> dict:
 
 def main(args: Args) -> None:
     """Measures one thing, prints a table, and writes it as JSON with the time and the memory that it took."""
-    checkpoint.set_up_compiler(preset(args.preset).xla_flags)
+    checkpoint.set_up_compiler(
+        checkpoint.for_simulation(most=1) if args.what == "rig" else preset(args.preset).xla_flags
+    )
     begin = time.monotonic()
-    rows = {"speed": speed, "targets": targets, "logs": logs, "alarm": alarm}[args.what](args)
+    rows = {"speed": speed, "targets": targets, "rig": rig, "logs": logs, "alarm": alarm}[args.what](args)
     table = Table(title=args.what)
     for column in ("", *next(iter(rows.values()))):
         table.add_column(_HEADINGS.get(column, column))
