@@ -1,6 +1,7 @@
 """Reports a discovery to a person: an HTML page with its plots, and tables on the console. Verdict and advice first."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 
 from rich.console import Console
@@ -46,8 +47,9 @@ def write(path: Path, log: Log, question: Question, result: Result, summary: dic
       free: of `experiments.discovery.summary.free_runs`.
     """
     pictures = {"where": plots.heat_map(result.where), "traces": plots.traces(free["runs"], log.joints)}
+    brief = partial(brief_keys, question)
     if result.terms:
-        pictures["terms"] = plots.accepted_terms(result.terms)
+        pictures["terms"] = plots.accepted_terms(result.terms, [brief(term.hypothesis.key) for term in result.terms])
     presented, effects = _presented(summary, question), question.rig.effects
     page = report.render(
         _TEMPLATE,
@@ -56,6 +58,8 @@ def write(path: Path, log: Log, question: Question, result: Result, summary: dic
         meaning=VERDICTS[summary["verdict"]],
         advice=ADVICE[summary["verdict"]],
         summary=summary,
+        brief=brief,
+        place=partial(place_in_words, question),
         effects=presented,
         notes=question.notes,
         not_testable=[
@@ -96,11 +100,14 @@ def show(console: Console, question: Question, summary: dict, free: dict) -> Non
     table.add_row("short segments, floor units", *(f"{gap[name]:.2f}" for name in ("before", "null", "after")))
     table.add_row("whole runs, mean in rad", *(f"{error[name]:.4f}" for name in ("before", "null", "after")))
     console.print(table)
-    suspects = [f"{one['name']} at {', '.join(one['places'])} {one['probability']:.2f}" for one in summary["suspects"]]
+    suspects = [
+        f"{one['name']} at {place_in_words(question, one)} {one['probability']:.2f}" for one in summary["suspects"]
+    ]
     if suspects:
         console.print(f"suspects: {'; '.join(suspects[:_SHOWN])}")
     if summary["next_experiment"]:
-        console.print(f"to decide between them: {summary['next_experiment']}", highlight=False, markup=False)
+        experiment = brief_keys(question, summary["next_experiment"])
+        console.print(f"to decide between them: {experiment}", highlight=False, markup=False)
     if summary["withdrawn"]:
         console.print("the corrected model was withdrawn: on held-out runs it was worse than the one that is saved")
     if summary["not_testable"]:
@@ -111,20 +118,22 @@ def _presented(summary: dict, question: Question) -> list[dict]:
     """Returns effects and parameter changes with place in words, experiment there, and a sentence for the effect."""
     found = []
     for effect in [*summary["effects"], *summary["parameter_changes"]]:
-        row = question.rig.effects[effect["name"]]
-        place = in_words(effect["places"], question.rig.places[row.on], row.on)
+        row, place = question.rig.effects[effect["name"]], place_in_words(question, effect)
         added = {"place": place, "experiment": f"{row.excited_by} on {place}", "sentence": row.sentence}
         found.append(effect | added)
     return found
 
 
-def in_words(places: Sequence[str], every: Sequence[str], kind: str) -> str:
-    """Names places briefly, such as `all joints` in the place of six names, for tables and pages.
+def place_in_words(question: Question, effect: Mapping) -> str:
+    """Names the places of an effect or a suspect of the summary, such as `all joints` in the place of six names."""
+    name = f"{effect['name']}@{'+'.join(effect['places'])}"
+    return brief_keys(question, name).partition("@")[2].replace("+", ", ")
 
-    Args:
-      places: where an effect is.
-      every: all places where it could be.
-      kind: of places: joint, body, foot or robot.
-    """
-    plural = {"body": "bodies", "foot": "feet"}.get(kind, f"{kind}s")
-    return f"all {plural}" if len(places) > 1 and set(places) == set(every) else ", ".join(places)
+
+def brief_keys(question: Question, text: str) -> str:
+    """Puts `all joints` and such in the place of all their names, wherever a text has the keys of hypotheses."""
+    for kind, plural in (("joint", "joints"), ("body", "bodies")):
+        every = question.rig.places[kind]
+        if len(every) > 1:
+            text = text.replace(f"@{'+'.join(every)}", f"@all {plural}")
+    return text

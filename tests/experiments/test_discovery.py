@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import mujoco
 import numpy as np
@@ -11,6 +12,7 @@ from envs.logs import Controller, read, splits, write
 from envs.scales import measure_scales
 from envs.segments import noise
 from experiments import discover
+from experiments.discovery import report
 from experiments.discovery.blind_bench import Bench
 from experiments.discovery.blind_cases import ARM, SIZE_BOUNDS, SIZES
 from experiments.discovery.blind_robots import OUTSIDE, Truth, record
@@ -132,6 +134,17 @@ def test_places_are_each_alone_pairs_and_all():
     ]
     assert place_sets(JOINTS) == [("shoulder",), ("elbow",), JOINTS]
     assert place_sets(("hinge",)) == [("hinge",)]
+
+
+def test_a_page_names_all_places_at_once():
+    rig = SimpleNamespace(places={"joint": ("hip", "knee"), "body": ("thigh", "shank"), "robot": ("robot",)})
+    question = SimpleNamespace(rig=rig)
+    assert report.brief_keys(question, "coulomb@hip+knee + link_mass@thigh+shank") == (
+        "coulomb@all joints + link_mass@all bodies"
+    )
+    assert report.place_in_words(question, {"name": "coulomb", "places": ["knee"]}) == "knee"
+    assert report.place_in_words(question, {"name": "coulomb", "places": ["hip", "knee"]}) == "all joints"
+    assert report.place_in_words(question, {"name": "link_mass", "places": ["shank", "thigh"]}) == "shank, thigh"
 
 
 @pytest.mark.parametrize(

@@ -110,18 +110,19 @@ def traces(runs: Sequence[dict], joints: Sequence[str], most: int = 6) -> plt.Fi
     return figure
 
 
-def accepted_terms(terms: Sequence) -> plt.Figure:
+def accepted_terms(terms: Sequence, labels: Sequence[str]) -> plt.Figure:
     """Draws how much every accepted effect lowered the cost, beside the threshold that simulated null logs set.
 
     Args:
       terms: `jaxtune.discovery.result.AcceptedTerm`, the one that explains most first.
+      labels: what to call them.
     """
     figure, axis = plt.subplots(figsize=(8, 1.5 + 0.5 * len(terms)), layout="constrained")
     place = np.arange(len(terms))
     axis.barh(place, [term.evidence.gain for term in terms], color="tab:blue", height=0.5, label="gain")
     axis.plot([term.thresholds.gain for term in terms], place, "|", color="black", ms=22, mew=2, label="threshold")
     axis.set(yticks=place, xscale="log", xlabel="fall of the cost on train and select")
-    axis.set_yticklabels([term.hypothesis.key for term in terms])
+    axis.set_yticklabels(labels)
     axis.invert_yaxis()
     axis.legend(fontsize=8, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2)
     return figure
