@@ -9,6 +9,7 @@ the work between two processes.
 from dataclasses import dataclass
 from pathlib import Path
 
+import jax
 from rich.table import Table
 
 from experiments.common import checkpoint
@@ -18,6 +19,8 @@ from experiments.discovery.blind_cases import SIZES
 from experiments.discovery.field.bench import FieldBench
 from experiments.discovery.field.cases import FIELD_SIZES
 from experiments.discovery.scores import shown
+
+_KEPT = 16  # cases after which compiled programs are dropped: those of 90 robots need more memory maps than Linux gives
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,6 +75,8 @@ def main(args: Args) -> None:
             f"{done}/{len(cases)} case {case.number}: {answer['verdict']} {names} ({answer['seconds']:.0f} s)"
         )
         bench.report(identity)
+        if done % _KEPT == 0:
+            jax.clear_caches()
     table = Table("measure", "value", "95 % interval", "cases", "to reach")
     for cells in shown(bench.report(identity)):
         table.add_row(*cells)
