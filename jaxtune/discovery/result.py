@@ -28,7 +28,7 @@ class Settings:
     """How many hypotheses are fitted in the place of an effect."""
     finalists: int = 4
     """How many of those are fitted on with fresh slopes."""
-    most: int = 4
+    most: int = 6
     """Largest number of effects that are accepted."""
     level: float = 0.05
     """Probability of naming something where nothing is missing, which the thresholds allow."""
