@@ -33,7 +33,9 @@ ByEffect = Mapping[str, Mapping[str, jax.Array]]
 System = tuple[mjx.Model, mjx.Data, jax.Array]
 """A robot's model and first state in MJX, and the direction of gravity in its IMU's frame, [3]."""
 
-_ITERATIONS = 4  # of the solver
+# Of the solver. After 100 steps with friction in every joint, positions are 0.05 to 1.4 microrad (rms) from those of a
+# solver that has converged; with three iterations, up to 8.
+_ITERATIONS = 4
 _LONGEST_STEP_S = 0.001
 
 
