@@ -204,7 +204,7 @@ class Rig:
         mujoco.mj_fullM(self.mj_model, data, dense)
         return self.mj_model.body_mass[self._bodies], np.diag(dense)[self.dof]
 
-    def moves(self, on: str, place: str) -> set[int]:
+    def moves(self, on: str, place: str) -> tuple[int, ...]:
         """Finds the joints whose motion an effect at a place changes directly.
 
         Args:
@@ -212,17 +212,18 @@ class Rig:
           place: name of the joint or body.
 
         Returns:
-          Indices of the joints: the joint itself, or those that carry the body; none for the whole robot.
+          Indices of the joints: the joint itself, or those that carry the body, nearest first; none for the whole
+          robot.
         """
         if on == "joint":
-            return {self.joints.index(place)}
-        found, body = set(), self.mj_model.body(place).id if on == "body" else 0
+            return (self.joints.index(place),)
+        found, body = [], self.mj_model.body(place).id if on == "body" else 0
         # From the body up to the world, whose id is 0; the whole robot is no body and finds nothing.
         while body > 0:
             mine = self.mj_model.jnt_bodyid[[self.mj_model.joint(joint).id for joint in self.joints]] == body
-            found |= set(np.flatnonzero(mine).tolist())
+            found += np.flatnonzero(mine).tolist()
             body = self.mj_model.body_parentid[body]
-        return found
+        return tuple(found)
 
     def model(self, values: ByEffect) -> mjx.Model:
         """Makes the MJX model whose fields have the values of the effects that enter the model.
@@ -237,12 +238,10 @@ class Rig:
             for parameter in row.parameters:
                 key = f"{name}.{parameter.name}"
                 entries[key] = parameters.Entry(
-                    name=key,
                     kind=row.on,
                     targets=self.places[row.on],
                     fields=parameter.fields,
-                    bounds=parameter.bounds,
-                    column=parameter.column,
+                    bounds=parameter.bounds if parameter.form != "ratio" else tuple(np.exp(parameter.bounds)),
                     log=parameter.form == "ratio",
                 )
                 inner = values[name][parameter.name]

@@ -36,6 +36,9 @@ class Args:
     """Go on although the log doctor suspects an error of the log that would make the answer wrong."""
     clear_flags: bool = False
     """Clear flags of the model that switch physics off; without this option such a model is refused."""
+    swap_halves: bool = False
+    """Fit the runs of select and sealed, and test on those of train: a second opinion from the other half of the
+    log."""
 
 
 def main(args: Args) -> None:
@@ -47,11 +50,11 @@ def main(args: Args) -> None:
     checkpoint.set_up_compiler(checkpoint.for_simulation())
     _check(args)
     # Says what is wrong with the logs before the folder is made and anything is compiled.
-    log, _ = read_logs(args.logs, args.clear_flags)
-    for note in gate.check(log, args.horizons, trust=args.trust_log):
+    log, spec = read_logs(args.logs, args.clear_flags, args.swap_halves)
+    for note in gate.check(log, spec, args.horizons, trust=args.trust_log):
         console.print(f"note: {note}", highlight=False, markup=False, soft_wrap=True)
-    identity = {"logs": [str(path) for path in args.logs], "horizons": args.horizons, "healthy": args.healthy}
-    checkpoint.open_run(args.out, identity | {"seed": args.seed})
+    identity = {name: value for name, value in vars(args).items() if name not in ("out", "trust_log")}
+    checkpoint.open_run(args.out, identity | {"logs": [str(path) for path in args.logs]})
     with bars() as progress:
         task = progress.add_task("simulating null logs", total=None)
         answer = investigate(
@@ -61,6 +64,7 @@ def main(args: Args) -> None:
             null_logs=args.healthy,
             seed=args.seed,
             clear_flags=args.clear_flags,
+            swap_halves=args.swap_halves,
             say=lambda text: progress.update(task, description=text[:100]),
         )
     report.show(console, answer.question, answer.summary, answer.free)

@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 
 from envs import models
-from envs.logs import Controller, Log, Run, write
+from envs.logs import Controller, Log, Run, read_any, write
 from experiments.common.cli import console, run
 from experiments.discovery.excitation import MOTIONS, excitation, scaled
 
@@ -28,6 +28,9 @@ class Args:
     on."""
     robot: str = "biteno"
     """Robot: biteno, pendulum, or the path of an MJCF file."""
+    like: Path | None = None
+    """Folder of a log of the robot. Its model, joints and first run's controller are taken, in the place of robot, kp,
+    kd, torque_limit_nm and control_hz."""
     runs: int = 6
     """Number of runs; 4 or more, so that they can be split into train, select and sealed."""
     seconds: float = 3.0
@@ -56,20 +59,11 @@ def main(args: Args) -> None:
       ValueError: an option is wrong, or the model cannot be read.
     """
     _check(args)
-    spec = models.spec(args.robot)
-    # A free joint is the base, which is held, and a ball joint has no scalar target.
-    kinds = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
-    joints = tuple(joint.name for joint in spec.joints if joint.type in kinds)
-    if not joints or not all(joints):
-        raise ValueError(f"robot: got '{args.robot}' with joints {joints}, expected hinges or slides that have names")
-    built_in = args.robot in models.BUILT_IN
+    robot, joints, controller = _described(args) if args.like is None else _alike(args.like)
+    spec = models.spec(robot)
+    built_in = robot in models.BUILT_IN
     # Before anything is written, because it may fail.
-    model = None if built_in else _one_file(Path(args.robot), spec)
-    everywhere = np.ones(len(joints))
-    gains = {"kp": args.kp, "kd": args.kd, "torque_limit_nm": args.torque_limit_nm}
-    controller = Controller(
-        kind="pd", rate_hz=args.control_hz, gains={name: value * everywhere for name, value in gains.items()}
-    )
+    model = None if built_in else _one_file(Path(robot), spec)
     runs = tuple(
         Run(
             name=one.name,
@@ -81,7 +75,7 @@ def main(args: Args) -> None:
         )
         for one in excitation(spec, joints, args.runs, args.seconds, args.rate_hz, args.seed, args.motion)
     )
-    name = args.robot if built_in else Path(args.robot).name
+    name = robot if built_in else Path(robot).name
     write(Log(robot=name, base="fixed", rate_hz=args.rate_hz, joints=joints, policy=None, runs=runs), args.out)
     # The log names its model by a path relative to itself, so that the folder can be moved as a whole.
     if model is not None:
@@ -90,6 +84,24 @@ def main(args: Args) -> None:
         f"wrote {len(runs)} runs of {args.seconds:g} s for {', '.join(joints)} to {args.out}. Play each run's targets "
         "on the robot, and add the measured columns to its file or a copy of it: q.*, and dq.* if there is a sensor."
     )
+
+
+def _described(args: Args) -> tuple[str, tuple[str, ...], Controller]:
+    """Robot, joints and controller as the options say."""
+    # A free joint is the base, which is held, and a ball joint has no scalar target.
+    kinds = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+    joints = tuple(joint.name for joint in models.spec(args.robot).joints if joint.type in kinds)
+    if not joints or not all(joints):
+        raise ValueError(f"robot: got '{args.robot}' with joints {joints}, expected hinges or slides that have names")
+    gains = {"kp": args.kp, "kd": args.kd, "torque_limit_nm": args.torque_limit_nm}
+    every = {name: np.full(len(joints), value) for name, value in gains.items()}
+    return args.robot, joints, Controller(kind="pd", rate_hz=args.control_hz, gains=every)
+
+
+def _alike(folder: Path) -> tuple[str, tuple[str, ...], Controller]:
+    """Robot, joints and controller of a log."""
+    log = read_any(folder)
+    return log.robot, log.joints, log.runs[0].controller
 
 
 def _check(args: Args) -> None:

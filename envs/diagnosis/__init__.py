@@ -34,16 +34,17 @@ __all__ = ["Finding", "diagnose", "diagnose_log", "shared_findings"]
 _LEAST_ROWS = 100  # consecutive rows, below which only the structure is checked
 
 
-def diagnose_log(log: Log) -> dict[str, list[Finding]]:
+def diagnose_log(log: Log, spec: mujoco.MjSpec | None = None) -> dict[str, list[Finding]]:
     """Diagnoses every run of a log separately; `python -m experiments.doctor` reports the result.
 
     Args:
-      log: as it was read; its robot's model is loaded by name or path.
+      log: as it was read.
+      spec: its robot's model; None loads it by the name or path in the log.
 
     Returns:
       What is suspected, by the name of the run, in the log's order; an empty list where nothing is.
     """
-    spec = models.spec(log.robot)
+    spec = models.spec(log.robot) if spec is None else spec
     # On a free base the model's dynamics are not compared, so the base may stay.
     model = suspended(spec) if log.base == "fixed" else spec.compile()
     found = {run.name: diagnose(run, log.joints, model, log.base) for run in log.runs}

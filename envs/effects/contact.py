@@ -12,7 +12,7 @@ ROWS = (
         name="ground_friction",
         on="foot",
         parameters=(
-            Parameter(name="ratio", form="ratio", bounds=(-2.0, 1.5), prior=0.3, fields=("geom_friction",), column=0),
+            Parameter(name="ratio", form="ratio", bounds=(-2.0, 1.5), prior=0.3, fields=(("geom_friction", 0),)),
         ),
         sizes=(0.1,),
         sentence="The feet slip earlier or later than the model says.",
@@ -22,7 +22,7 @@ ROWS = (
     Effect(
         name="ground_compliance",
         on="foot",
-        parameters=(Parameter(name="seconds", bounds=(-0.005, 0.1), prior=0.01, fields=("geom_solref",), column=0),),
+        parameters=(Parameter(name="seconds", bounds=(-0.005, 0.1), prior=0.01, fields=(("geom_solref", 0),)),),
         sizes=(0.005,),
         sentence="The ground is softer: it gives way and recovers more slowly.",
         excited_by="stepping in place, harder and softer",
@@ -32,7 +32,7 @@ ROWS = (
         name="ground_slope",
         on="robot",
         parameters=tuple(
-            Parameter(name=f"{axis}_rad", bounds=(-0.3, 0.3), prior=0.03, fields=("gravity",), column=column)
+            Parameter(name=f"{axis}_rad", bounds=(-0.3, 0.3), prior=0.03, fields=(("gravity", column),))
             for column, axis in ((1, "roll"), (0, "pitch"))
         ),
         sizes=(0.01,),

@@ -22,7 +22,7 @@ ROWS = (
     Effect(
         name="com_offset",
         parameters=tuple(
-            Parameter(name=f"{axis}_m", bounds=(-0.1, 0.1), prior=0.01, fields=("body_ipos",), column=column)
+            Parameter(name=f"{axis}_m", bounds=(-0.1, 0.1), prior=0.01, fields=(("body_ipos", column),))
             for column, axis in enumerate("xyz")
         ),
         # About an upright axis gravity does not feel it, and inertia grows with its square.

@@ -8,7 +8,18 @@ those of the model: joint positions and targets in rad, velocities in rad/s, tor
 
 from envs.logs.controller import Controller, Impedance
 from envs.logs.files import read, write
-from envs.logs.format import Log, Run, splits
-from envs.logs.xl330 import read_xl330
+from envs.logs.format import Log, Run, splits, with_halves_swapped
+from envs.logs.xl330 import read_any, read_xl330
 
-__all__ = ["Controller", "Impedance", "Log", "Run", "read", "read_xl330", "splits", "write"]
+__all__ = [
+    "Controller",
+    "Impedance",
+    "Log",
+    "Run",
+    "read",
+    "read_any",
+    "read_xl330",
+    "splits",
+    "with_halves_swapped",
+    "write",
+]

@@ -4,7 +4,7 @@
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -145,6 +145,22 @@ def splits(log: Log) -> dict[str, tuple[Run, ...]]:
                 f"{', '.join(sorted(split_of))}, expected three conditions that differ in split or leave it open"
             )
     return chosen
+
+
+def with_halves_swapped(log: Log) -> Log:
+    """Returns the log with train in the place of select and sealed, and the other way round.
+
+    A discovery from the other half of a log is a second opinion: what both name is not the chance of one split.
+
+    Raises:
+      ValueError: train has one condition only, which cannot be both select and sealed.
+    """
+    parts = splits(log)
+    conditions = sorted({run.condition for run in parts["train"]})
+    if len(conditions) < 2:
+        raise ValueError(f"runs: 'train' has condition {conditions[0]} only, expected two or more to swap the halves")
+    split_of = {name: ("select", "sealed")[number % 2] for number, name in enumerate(conditions)}
+    return replace(log, runs=tuple(replace(run, split=split_of.get(run.condition, "train")) for run in log.runs))
 
 
 def column_names(signal: str, joints: Sequence[str]) -> list[str]:

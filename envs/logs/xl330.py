@@ -1,7 +1,6 @@
 """Reads recordings of a Dynamixel XL330 that turns a pendulum, in the JSON files of github.com/Rhoban/bam.
 
-They are public measurements of one real motor, at several firmware gains. It is the only real machine in
-the project's results.
+They are public measurements of one real motor, at several firmware gains.
 """
 
 import json
@@ -10,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from envs.logs.controller import Controller
+from envs.logs.files import read
 from envs.logs.format import JOINT_SIGNALS, Log, Run
 from envs.logs.tables import check_time, check_values
 
@@ -31,6 +31,15 @@ _SIGNALS = {
     "volts": "input_volts",
 }
 _OTHER = ("load", "temp")
+
+
+def read_any(folder: Path) -> Log:
+    """Reads the log in a folder, in the project's format or as JSON files of the XL330 pendulum.
+
+    Raises:
+      ValueError: it is neither, or has errors.
+    """
+    return read(folder) if (folder / "meta.yaml").exists() or not any(folder.glob("*.json")) else read_xl330(folder)
 
 
 def read_xl330(folder: Path) -> Log:

@@ -9,8 +9,10 @@ from typing import Protocol
 
 from experiments.common import checkpoint, plots
 from experiments.common.checkpoint import write_json
+from experiments.discovery import gate
 from experiments.discovery.investigate import investigate
 from experiments.discovery.scores import page, score, tally
+from experiments.discovery.setup import read_logs
 
 
 class Case(Protocol):
@@ -59,6 +61,7 @@ class Benchmark:
         if self._answered(case) is None:
             folder, log, began = self.out / "answers" / name_of(case), self.write(case), time.monotonic()
             try:
+                gate.check(*read_logs([log]))
                 investigate([log], folder)
             except Exception as error:  # one bad case must not end a night's work
                 folder.mkdir(parents=True, exist_ok=True)

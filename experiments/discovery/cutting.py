@@ -115,10 +115,24 @@ def told_alike(null: Cuts, measured: Cuts) -> Cuts:
     }
 
 
-def _spread(found: np.ndarray, horizon: float) -> np.ndarray:
-    """Takes segments evenly from those of a split, where there are more than it takes to decide."""
-    count = min(len(found), int(np.clip(round(_ENOUGH_S / horizon), *_ENOUGH)))
-    return found[np.linspace(0, len(found) - 1, count).round().astype(int)]
+def _spread(repeats: np.ndarray, horizon: float) -> np.ndarray:
+    """Takes segments evenly from those of a split, where there are more than it takes to decide.
+
+    Repeats stay together, because alone they do not show how far runs differ.
+
+    Args:
+      repeats: [segments] of `_repeats`.
+      horizon: their length in s.
+
+    Returns:
+      Indices of the segments that are taken, rising.
+    """
+    total = len(repeats)
+    count = min(total, int(np.clip(round(_ENOUGH_S / horizon), *_ENOUGH)))
+    _, unit = np.unique(np.where(repeats < 0, np.arange(total) + total, repeats), return_inverse=True)
+    units = int(unit.max()) + 1
+    taken = np.linspace(0, units - 1, round(count * units / total)).round().astype(int)
+    return np.flatnonzero(np.isin(unit, taken))
 
 
 def cut_log(log: Log, dt: float, signals: Sequence[str], horizons: Sequence[float]) -> Cuts:
@@ -153,14 +167,17 @@ def cut_log(log: Log, dt: float, signals: Sequence[str], horizons: Sequence[floa
                     f"runs: '{split}' has {mine.sum()} segment(s) of {horizon:g} s, expected {_LEAST_SEGMENTS} or "
                     "more: record longer runs or more of them, or choose shorter horizons"
                 )
-            mine = _spread(np.flatnonzero(mine), horizon)
+            mine = np.flatnonzero(mine)
+            repeats = _repeats(log, cut.run[mine], cut.row[mine])
+            kept = _spread(repeats, horizon)
+            mine = mine[kept]
             data[split][horizon] = Segments(
                 inputs=jax.tree.map(lambda leaf, mine=mine: leaf[mine], cut.segments),
                 signals={name: cut.signals[name][mine] for name in signals},
                 steps=cut.segments.target.shape[1] - round(segments.HISTORY_S / dt),
                 run=cut.run[mine],
                 regimes=label[mine],
-                repeats=_repeats(log, cut.run[mine], cut.row[mine]),
+                repeats=repeats[kept],
             )
     return data
 

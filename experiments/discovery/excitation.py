@@ -91,7 +91,7 @@ def deciding(
     seconds: float = 3.0,
     rate_hz: float = 500.0,
     seed: int = 0,
-) -> Decision:
+) -> Decision | None:
     """Chooses the motion with the largest score, of all but the medley.
 
     Args:
@@ -103,8 +103,11 @@ def deciding(
       rate_hz: rows per second.
       seed: of postures, paces and steps; `excite` writes the same targets with the same numbers.
 
+    Returns:
+      The motion; None where no score is a number.
+
     Raises:
-      ValueError: fewer runs than can be split, or no score is a number.
+      ValueError: fewer runs than can be split.
     """
     candidates = [name for name in MOTIONS if name != "medley"]
     motions = {name: excitation(spec, joints, runs, seconds, rate_hz, seed, name) for name in candidates}
@@ -113,7 +116,7 @@ def deciding(
     scores = {name: value if np.isfinite(value) else -np.inf for name, value in scores.items()}
     best = max(scores, key=scores.__getitem__)
     if scores[best] == -np.inf:
-        raise ValueError(f"score: got no finite number for any of {', '.join(scores)}")
+        return None
     return Decision(name=best, motion=motions[best], scores=scores)
 
 

@@ -6,6 +6,7 @@ answer wrong (`envs.diagnosis.finding.MISLEADING`) is refused unless the user tr
 
 from collections.abc import Sequence
 
+import mujoco
 import numpy as np
 
 from envs import segments
@@ -14,7 +15,7 @@ from envs.logs import Log, Run, splits
 from envs.readings import quantum_of
 from envs.smoothing import smoothed
 from experiments.discovery.cutting import fitting_horizons
-from experiments.discovery.setup import without_sealed
+from experiments.discovery.setup import check_simulatable, without_sealed
 
 _LEAST_SEGMENTS = 3  # of the longest horizon in every split
 _REST = 2e-3  # rad or m, and in quanta: what a joint at rest may wander, averaged over a tenth of a second
@@ -22,11 +23,12 @@ _REST_QUANTA = 3.0
 _SATURATED = 0.95  # of the rows in which motors are on
 
 
-def check(log: Log, horizons: Sequence[float] | None = None, trust: bool = False) -> list[str]:
+def check(log: Log, spec: mujoco.MjSpec, horizons: Sequence[float] | None = None, trust: bool = False) -> list[str]:
     """Checks that a log can answer, without its sealed runs, whose time stamps alone are looked at.
 
     Args:
       log: of all runs, its base fixed.
+      spec: the nominal model, its flags as they will be simulated.
       horizons: lengths of the segments in s; None takes those that fit the rows.
       trust: whether what the doctor suspects is a note too.
 
@@ -36,13 +38,15 @@ def check(log: Log, horizons: Sequence[float] | None = None, trust: bool = False
     Raises:
       ValueError: nothing can be learnt from the log, or it is misleading and not trusted.
     """
-    _check_length(log, max(fitting_horizons(log, horizons)))
+    fitting = fitting_horizons(log, horizons)
+    check_simulatable(log, spec, fitting)
+    _check_length(log, max(fitting))
     log = without_sealed(log)
     _check_driven(log)
     _check_motion(log)
     said = [
         (finding.misleading and not trust, f"{finding.sentence} ({_some(runs)})")
-        for finding, runs in shared_findings(diagnose_log(log))
+        for finding, runs in shared_findings(diagnose_log(log, spec))
     ]
     if refused := [sentence for misleading, sentence in said if misleading]:
         raise ValueError(f"{'; '.join(refused)}: correct the log, or use --trust-log where it is right")

@@ -176,7 +176,7 @@ def _hypothesis(
         probes=_probes(row.sizes, parameters, bounds[0, 0]),
         bounds=bounds,
         prior=np.array([one.prior for one in parameters]),
-        joints=tuple(sorted({joint for axis in first for joint in axes[axis].joints})),
+        joints=tuple(sorted({joint for axis in first for joint in axes[axis].joints[:1]})),
     )
 
 

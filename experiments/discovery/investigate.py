@@ -38,6 +38,7 @@ def investigate(
     null_logs: int = 20,
     seed: int = 0,
     clear_flags: bool = False,
+    swap_halves: bool = False,
     say: Say = lambda text: None,
 ) -> Answer:
     """Reads logs, discovers what their model lacks, and writes summary, details and the corrected model.
@@ -51,6 +52,7 @@ def investigate(
       null_logs: number of simulated null logs.
       seed: of the null logs.
       clear_flags: whether flags of the model that switch physics off are cleared; else they are refused.
+      swap_halves: whether train changes places with select and sealed.
       say: receives a line of text about progress.
 
     Returns:
@@ -60,7 +62,7 @@ def investigate(
       ValueError: a log cannot be used.
     """
     began, saved = time.monotonic(), out / "state.json"
-    log, spec = read_logs(logs, clear_flags)
+    log, spec = read_logs(logs, clear_flags, swap_halves)
     question = build_question(log, spec, horizons, null_logs, seed)
     out.mkdir(parents=True, exist_ok=True)
     result = workflow.discover(
@@ -71,7 +73,7 @@ def investigate(
     )
     free = free_runs(log, question, result)
     stamp = {"seconds": time.monotonic() - began, "versions": checkpoint.versions()}
-    summary = summarise(question, log, result) | stamp
+    summary = summarise(question, log, logs[0], result) | stamp
     write_json(out / "summary.json", summary)
     write_json(out / "details.json", details(question, result, free))
     corrected.save(out / "model", spec, question.rig, result.model)

@@ -1,12 +1,13 @@
 """The experiment that would decide between the two models that are most believed: both play every motion."""
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 
 from envs import segments
 from envs.logs import Log, Run
-from experiments.discovery.excitation import Decision, TargetRun, deciding, scaled
+from experiments.discovery.excitation import TargetRun, deciding, scaled
 from experiments.discovery.setup import Question
 from experiments.discovery.whole_runs import simulate_runs
 from jaxtune.discovery.result import Result
@@ -14,16 +15,18 @@ from jaxtune.discovery.result import Result
 _RUNS, _SECONDS, _RATE_HZ = 4, 3.0, 200.0
 
 
-def deciding_experiment(question: Question, log: Log, result: Result) -> str | None:
+def deciding_experiment(question: Question, log: Log, folder: Path, result: Result) -> str | None:
     """Says which motion of `excite` would decide between the two models that are most believed, and by how much.
 
     Args:
       question: the problem that discovery worked on.
       log: what was measured; its controller plays the motions.
+      folder: of the log.
       result: with the two models.
 
     Returns:
-      A sentence with the command that writes the targets; None where there are no two models with an effect.
+      A sentence with the command that writes the targets; None where there are no two models with an effect, or where
+      no motion can be simulated with both.
     """
     if len(result.rivals) < 2:
         return None
@@ -34,10 +37,12 @@ def deciding_experiment(question: Question, log: Log, result: Result) -> str | N
         # Of the joint in which they differ most.
         return float(np.sqrt(np.mean([(a - b) ** 2 for a, b in simulated], axis=(0, 1)).max()))
 
-    found: Decision = deciding(question.spec, log.joints, score, runs=_RUNS, seconds=_SECONDS, rate_hz=_RATE_HZ, seed=0)
+    found = deciding(question.spec, log.joints, score, runs=_RUNS, seconds=_SECONDS, rate_hz=_RATE_HZ, seed=0)
+    if found is None:
+        return None
     return (
-        f"python -m experiments.excite --robot {log.robot} --motion {found.name} --runs {_RUNS} --seconds {_SECONDS:g} "
-        f"--rate-hz {_RATE_HZ:g} (with this robot's gains): there {one} and {other} differ by "
+        f"python -m experiments.excite --like {folder} --motion {found.name} --runs {_RUNS} --seconds {_SECONDS:g} "
+        f"--rate-hz {_RATE_HZ:g} --out NEW: there {one} and {other} differ by "
         f"{1e3 * found.scores[found.name]:.2g} mrad (rms)"
     )
 

@@ -92,14 +92,22 @@ def show(console: Console, question: Question, summary: dict, free: dict) -> Non
             for name, value in effect["parameters"].items()
         )
         others = ", ".join(effect["confusable_with"]) or "-"
-        table.add_row(effect["name"], effect["place"], values, others, effect["experiment"])
+        name = f"{effect['name']} ({effect['form'].replace('_', ' ')})" if effect["form"] else effect["name"]
+        table.add_row(name, effect["place"], values, others, effect["experiment"])
     if table.row_count:
         console.print(table)
+    for effect in summary["not_named"]:
+        name, why = f"{effect['name']} at {place_in_words(question, effect)}", "explains only a part"
+        if effect["refines"] is not None:
+            why = f"may only make up for the form of {brief_keys(question, effect['refines'])}"
+        console.print(f"accepted, not named: {name}, which {why}")
     table = Table("error on held-out runs", "nominal model", "parameters fitted", "corrected model")
     gap, error = summary["gap"], free["error_rad"]["sealed"]
     table.add_row("short segments, floor units", *(f"{gap[name]:.2f}" for name in ("before", "null", "after")))
     table.add_row("whole runs, mean in rad", *(f"{error[name]:.4f}" for name in ("before", "null", "after")))
     console.print(table)
+    if summary["effects"] or summary["not_named"]:
+        console.print(f"explained: {summary['explained_share']:.0%} of the gap that can be explained")
     suspects = [
         f"{one['name']} at {place_in_words(question, one)} {one['probability']:.2f}" for one in summary["suspects"]
     ]
@@ -125,9 +133,8 @@ def _presented(summary: dict, question: Question) -> list[dict]:
 
 
 def place_in_words(question: Question, effect: Mapping) -> str:
-    """Names the places of an effect or a suspect of the summary, such as `all joints` in the place of six names."""
-    name = f"{effect['name']}@{'+'.join(effect['places'])}"
-    return brief_keys(question, name).partition("@")[2].replace("+", ", ")
+    """Names the places of an effect, suspect or family of the summary, such as `all joints` for six names."""
+    return brief_keys(question, f"@{'+'.join(effect['places'])}")[1:].replace("+", ", ")
 
 
 def brief_keys(question: Question, text: str) -> str:

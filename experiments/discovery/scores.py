@@ -4,21 +4,23 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
+from jaxtune.discovery.prove import is_worse
+
 SEVERITIES = (2.0, 5.0, 15.0)
 """Severities at which effects are hidden in the sizes `arm` and `standard`, in floor units."""
 
 EMPTY = ("empty", "linear", "wandering")
 """Kinds of cases in which nothing is hidden."""
 
-_HARM = (1.1, 0.2)  # ratio and floor units by which a model may be worse than the better of nominal and null
 _REACHED = 0.7  # least share of the wanted severity: an effect that could not be made so severe is not counted
 _STRONG = 15.0
+_SHOWN = 5.0  # floor units of the null on sealed, where one run in four has to show what was hidden in all
 
 
 def score(truth: dict, answer: dict) -> dict:
     """Compares the answer of one case with its truth.
 
-    A model that was withdrawn after the look at the sealed runs counts as `unnamed`, and so does a case that failed.
+    With `unnamed`, nothing was named; so it is with a model that was withdrawn, and with a case that failed.
 
     Args:
       truth: `kind` of the case (`field.cases.FieldCase`) and its `effects`, each with `name`, `family`, `places`,
@@ -29,8 +31,7 @@ def score(truth: dict, answer: dict) -> dict:
     Returns:
       What was hidden and named; whether name, family, place and reported set are right; gaps in floor units.
     """
-    withdrawn = bool(answer.get("withdrawn", False))
-    named = [] if withdrawn else [*answer.get("effects", ()), *answer.get("parameter_changes", ())]
+    named = [*answer.get("effects", ()), *answer.get("parameter_changes", ())]
     first = named[0] if named else None
     effects = truth["effects"]
     main = _main(effects, first)
@@ -38,7 +39,6 @@ def score(truth: dict, answer: dict) -> dict:
     gap = {name: _number(answer.get("gap", {}).get(name)) for name in ("before", "null", "after")}
     right = bool(first) and bool(main) and first["name"] == main["name"]
     place = bool(first) and bool(main) and set(first["places"]) == set(main["places"])
-    best = min(gap["before"], gap["null"])
     where = answer.get("where") or [{"joint": None}]
     return {
         "kind": truth["kind"],
@@ -48,7 +48,7 @@ def score(truth: dict, answer: dict) -> dict:
         "severity": main["severity"] if main else 0.0,
         "asked": main["asked"] if main else 0.0,
         "reached": all(effect["severity"] > _REACHED * effect["asked"] for effect in effects),
-        "verdict": "unnamed" if withdrawn else answer["verdict"],
+        "verdict": answer["verdict"],
         "message": answer.get("message"),
         "named": first["name"] if first else None,
         "named_places": first["places"] if first else [],
@@ -65,8 +65,8 @@ def score(truth: dict, answer: dict) -> dict:
         "nominal": gap["before"],
         "null": gap["null"],
         "after": gap["after"],
-        "harm": gap["after"] > _HARM[0] * best and gap["after"] > best + _HARM[1],
-        "withdrawn": withdrawn,
+        "harm": is_worse(gap),
+        "withdrawn": bool(answer.get("withdrawn", False)),
         "seconds": answer["seconds"],
     }
 
@@ -133,6 +133,9 @@ def tally(rows: Sequence[dict]) -> list[dict]:
     def each(group: Sequence[dict], key: str) -> list:
         return [row[key] for row in group if row[key] is not None]
 
+    def closing(group: Sequence[dict]) -> list[float]:
+        return [row["null"] / row["after"] for row in group if row["after"] > 0]
+
     lines = [
         _rate("top-1 name, 5 floor units and more", each(singles, "name"), ">= 0.85"),
         _rate("top-1 name, 15 floor units and more", each(strong, "name"), ""),
@@ -157,10 +160,11 @@ def tally(rows: Sequence[dict]) -> list[dict]:
         _rate("95 % interval holds the truth", each(right, "covered"), "0.88 to 0.98"),
         _mean("final gap, floor units, name right (median)", each(right, "after"), "<= 1.2", np.median),
         _mean("final gap, floor units, name right (mean)", each(right, "after"), "<= 1.6"),
+        _mean("null over after at 15 floor units (median)", closing(strong), ">= 8", np.median),
         _mean(
-            "null over after at 15 floor units (median)",
-            [row["null"] / row["after"] for row in strong if row["after"] > 0],
-            ">= 8",
+            "null over after where sealed runs show 5 floor units (median)",
+            closing([row for row in singles if row["null"] >= _SHOWN]),
+            "",
             np.median,
         ),
         _rate("worse than the better of nominal and null", each(answered, "harm"), ""),

@@ -10,7 +10,7 @@ import numpy as np
 
 from envs import models, readings, segments
 from envs.effects import LEARNED, LIBRARY
-from envs.logs import Log, Run, read, read_xl330, splits
+from envs.logs import Log, Run, read_any, splits, with_halves_swapped
 from envs.null_logs import simulate_null_logs
 from envs.regimes import REGIMES
 from envs.rig import Rig
@@ -27,7 +27,15 @@ from experiments.discovery.cutting import (
 from experiments.discovery.hypotheses import forms, hypotheses, learned_torque, unknown_directions
 from jaxtune.discovery.problem import Problem
 
-__all__ = ["HORIZONS_S", "Question", "build_question", "drop_filtered", "read_logs", "without_sealed"]
+__all__ = [
+    "HORIZONS_S",
+    "Question",
+    "build_question",
+    "check_simulatable",
+    "drop_filtered",
+    "read_logs",
+    "without_sealed",
+]
 
 _LEAST_STALE = 0.02  # share of readings
 _LATE_S = 0.001  # a velocity that lags its position by more was filtered, and would be mistaken for a sensor's lag
@@ -63,12 +71,15 @@ class _Simulator:
         return {name: read[name] for name in self.signals}
 
 
-def read_logs(folders: Sequence[Path], clear_flags: bool = False) -> tuple[Log, mujoco.MjSpec]:
+def read_logs(
+    folders: Sequence[Path], clear_flags: bool = False, swap_halves: bool = False
+) -> tuple[Log, mujoco.MjSpec]:
     """Reads the logs of one robot as a single log that can be split, and the robot's nominal model.
 
     Args:
       folders: of logs, or of the XL330 pendulum's JSON files.
       clear_flags: whether flags of the model that switch physics off are cleared; else they are refused.
+      swap_halves: whether train changes places with select and sealed.
 
     Returns:
       A log with the runs of all folders (of several, a run's name ends in the number of its folder), cut in time where
@@ -78,10 +89,7 @@ def read_logs(folders: Sequence[Path], clear_flags: bool = False) -> tuple[Log, 
       ValueError: a log cannot be read, the logs are not of one robot, its base is free, or its model has flags that
         switch physics off.
     """
-    logs = [
-        read(folder) if (folder / "meta.yaml").exists() or not any(folder.glob("*.json")) else read_xl330(folder)
-        for folder in folders
-    ]
+    logs = [read_any(folder) for folder in folders]
     if not logs:
         raise ValueError("logs: got none, expected one or more")
     first = logs[0]
@@ -100,7 +108,8 @@ def read_logs(folders: Sequence[Path], clear_flags: bool = False) -> tuple[Log, 
     runs = first.runs
     if len(logs) > 1:
         runs = tuple(replace(run, name=f"{run.name}_{number}") for number, log in enumerate(logs) for run in log.runs)
-    return split_in_time(replace(first, runs=runs, notes=notes)), spec
+    log = split_in_time(replace(first, runs=runs, notes=notes))
+    return with_halves_swapped(log) if swap_halves else log, spec
 
 
 def build_question(
@@ -130,8 +139,7 @@ def build_question(
       ValueError: the runs cannot be split, are too short for a horizon, or lack what discovery needs.
     """
     horizons = fitting_horizons(log, horizons)
-    rate = _checked_rate(log, segments.HISTORY_S + min(horizons))
-    _check_joints(log, spec)
+    rate = check_simulatable(log, spec, horizons)
     log, notes = drop_filtered(log)
     log = replace(log, runs=readings.with_noise(log.runs, without_sealed(log).runs))
     unsealed = without_sealed(log).runs
@@ -140,6 +148,10 @@ def build_question(
     rig = plain.scaled(measure_scales(plain, unsealed))
     # A signal that some runs lack is not compared, since segments of all runs share one layout.
     signals = tuple(name for name in sorted(segments.COMPARED) if all(name in run.signals for run in log.runs))
+    partly = [
+        name for name in segments.COMPARED if name not in signals and any(name in run.signals for run in log.runs)
+    ]
+    notes = (*notes, *(f"{name} is not in all runs, and is not used" for name in partly))
     if not all("target" in run.signals for run in log.runs):
         signals = tuple(name for name in signals if name != "tau")  # sent, not measured
     axes = {(axis.effect, axis.place): number for number, axis in enumerate(rig.axes)}
@@ -178,8 +190,28 @@ def _one_tree(trees: np.ndarray) -> int:
     return int(trees[0]) if len(set(trees.tolist())) == 1 else -1
 
 
-def _checked_rate(log: Log, least_s: float) -> float:
-    """Returns the controller's rate in Hz, which all runs share, after checking that the runs can be simulated."""
+def check_simulatable(log: Log, spec: mujoco.MjSpec, horizons: Sequence[float]) -> float:
+    """Checks that the runs of a log can be simulated, and that it says something of every joint that may move.
+
+    Args:
+      log: what was measured.
+      spec: the nominal model.
+      horizons: lengths of the segments in s.
+
+    Returns:
+      The controller's rate in Hz, which all runs share.
+
+    Raises:
+      ValueError: names the run or the joints, and what is expected.
+    """
+    model, least_s = models.suspended(spec), segments.HISTORY_S + min(horizons)
+    names = [model.joint(i).name or f"joint {i}" for i in range(model.njnt)]
+    others = [name for name in names if name not in log.joints]
+    if others:
+        raise ValueError(
+            f"joints: got a log without {', '.join(others)}, expected all joints that may move: log these too, or "
+            "fix them by taking their <joint> out of the MJCF"
+        )
     rate = log.runs[0].controller.rate_hz
     for run in log.runs:
         if run.controller.rate_hz != rate:
@@ -192,18 +224,6 @@ def _checked_rate(log: Log, least_s: float) -> float:
         if run.time[-1] - run.time[0] < least_s:
             raise ValueError(f"{run.name}: got {run.time[-1] - run.time[0]:.3g} s, expected {least_s:.3g} s or more")
     return rate
-
-
-def _check_joints(log: Log, spec: mujoco.MjSpec) -> None:
-    """Refuses a log that says nothing of a joint that may move."""
-    model = models.suspended(spec)
-    names = [model.joint(i).name or f"joint {i}" for i in range(model.njnt)]
-    others = [name for name in names if name not in log.joints]
-    if others:
-        raise ValueError(
-            f"joints: got a log without {', '.join(others)}, expected all joints that may move: log these too, or "
-            "fix them by taking their <joint> out of the MJCF"
-        )
 
 
 def _stale_notes(runs: Sequence[Run]) -> list[str]:

@@ -1,49 +1,52 @@
 """Prepares the result of a discovery for files and pages: `summary.json`, `details.json`, and whole simulated runs."""
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 
 from envs.effects import LIBRARY
 from envs.logs import Log
 from envs.rig import Rig
+from experiments.discovery.hypotheses import hypotheses
 from experiments.discovery.next_experiment import deciding_experiment
 from experiments.discovery.setup import Question
 from experiments.discovery.whole_runs import simulate_runs
 from jaxtune.discovery.fit import Fit
-from jaxtune.discovery.problem import Hypothesis
+from jaxtune.discovery.problem import Hypothesis, acts_within
 from jaxtune.discovery.result import AcceptedTerm, Result
 
 _SHOWN = 12  # places with the largest gap that the summary lists
 
 
-def summarise(question: Question, log: Log, result: Result) -> dict:
+def summarise(question: Question, log: Log, folder: Path, result: Result) -> dict:
     """Returns the content of `summary.json`, except for times and versions.
 
     Args:
       question: the problem that discovery worked on.
       log: what was measured.
+      folder: of the log.
       result: what was found.
 
     Returns:
-      The verdict; effects and parameter changes with values, intervals and confusable names; what these logs cannot
-      show; the cells with the largest gap; and the gap on sealed runs.
+      The verdict; effects and parameter changes with values, intervals and confusable names; what was accepted beside
+      them and is not named; what these logs cannot show; the cells with the largest gap; and the gap on sealed runs.
     """
-    effects, changes = [], []
-    for term in result.terms:
-        group = changes if question.problem.is_nominal(term.hypothesis) else effects
-        group.append(_effect(question.rig, term, result.fit, result.errors))
-    singles = {h.key: h for h in question.problem.hypotheses if len(h.places) == 1 and len(h.directions) == 1}
-    for number in result.changed:
-        axis = question.rig.axes[number]
-        known = any(change["name"] == axis.effect and axis.place in change["places"] for change in changes)
-        if not known and (hypothesis := singles.get(f"{axis.effect}@{axis.place}")) is not None:
-            changes.append(_effect(question.rig, AcceptedTerm(hypothesis, None, None), result.fit, result.errors))
+    effects, changes, not_named = [], [], []
+    for term in (*result.terms, *_changed(question, result)):
+        effect = _effect(question.rig, term, result.fit, result.errors)
+        if term.refines is not None or result.verdict == "unnamed":
+            not_named.append(effect | {"refines": term.refines})
+        elif question.problem.is_nominal(term.hypothesis):
+            changes.append(effect)
+        else:
+            effects.append(effect)
     not_there = [name for name in LIBRARY if name not in question.rig.effects]
     return {
         "verdict": result.verdict,
         "effects": effects,
         "parameter_changes": changes,
+        "not_named": not_named,
         "not_testable": [*result.not_testable, *not_there],
         "where": [
             {name: cell[name] for name in ("joint", "signal", "regime", "excess_floor_units")}
@@ -60,11 +63,28 @@ def summarise(question: Question, log: Log, result: Result) -> dict:
             }
             for one in result.suspects
         ],
-        "next_experiment": deciding_experiment(question, log, result),
+        "families": [
+            {"family": family, "places": list(places), "probability": probability}
+            for (family, places), probability in result.families.items()
+        ],
+        "next_experiment": deciding_experiment(question, log, folder, result),
         "withdrawn": result.withdrawn,
         "explained_share": result.explained_share,
         "model_is": result.model_is,
     }
+
+
+def _changed(question: Question, result: Result) -> list[AcceptedTerm]:
+    """Nominal parameters that went as far as they may. One at the joints of a named effect refines that effect."""
+    rig, found = question.rig, []
+    for axis in (rig.axes[number] for number in result.changed):
+        if any(term.hypothesis.name == axis.effect and axis.place in term.hypothesis.places for term in result.terms):
+            continue
+        every = hypotheses(rig.axes, rig.places, {axis.effect: rig.effects[axis.effect]})
+        hypothesis = next(one for one in every if one.places == (axis.place,))
+        over = [t.hypothesis.key for t in result.terms if t.refines is None and acts_within(hypothesis, t.hypothesis)]
+        found.append(AcceptedTerm(hypothesis, None, None, refines=over[0] if over else None))
+    return found
 
 
 def _effect(rig: Rig, term: AcceptedTerm, fit: Fit, errors: np.ndarray) -> dict:
@@ -113,7 +133,7 @@ def free_runs(log: Log, question: Question, result: Result) -> dict:
       `runs`: name, split, time in s, positions in rad [rows, joints] (`measured`, `before`, `null`, `after`) and their
       mean absolute errors; `error_rad`: means of these errors by split and model.
     """
-    vectors = {"before": np.zeros(len(question.rig.axes)), "null": result.null.vector, "after": result.model}
+    vectors = {"before": np.zeros(len(question.rig.axes)), "null": result.null.vector, "after": result.proposed}
     rows, simulated = simulate_runs(question, log.runs, np.stack(list(vectors.values())))
     splits = {name: split for split, names in question.splits.items() for name in names}
     runs = []
@@ -158,6 +178,7 @@ def details(question: Question, result: Result, free: dict) -> dict:
                 "thresholds": term.thresholds,
                 "form": _names(term.forms),
                 "confusable_with": term.confusable_with,
+                "refines": term.refines,
             }
             for term in result.terms
         ],

@@ -10,6 +10,7 @@ from jaxtune.discovery.decide import (
     Candidate,
     Thresholds,
     believed,
+    families,
     key_of,
     passes,
     posterior,
@@ -22,7 +23,7 @@ from jaxtune.discovery.decide import (
 from jaxtune.discovery.evaluate import rms
 from jaxtune.discovery.fit import Fit, begin, polish, refine, taken_over
 from jaxtune.discovery.noise_floor import Floor, NoiseFloor, Say
-from jaxtune.discovery.problem import Hypothesis, Problem
+from jaxtune.discovery.problem import Hypothesis, Problem, acts_within
 from jaxtune.discovery.resample import standard_errors
 from jaxtune.discovery.result import AcceptedTerm, Settings, Suspect
 from jaxtune.discovery.state import State
@@ -44,6 +45,7 @@ class Conclusion:
     """The model [axes] without each of the terms, by key."""
     errors: np.ndarray
     suspects: tuple[Suspect, ...]
+    families: Mapping[tuple[str, tuple[str, ...]], float]
     rivals: tuple[tuple[str, np.ndarray], ...]
     explained_share: float
     models: Mapping[str, np.ndarray]
@@ -73,7 +75,7 @@ def conclude(settings: Settings, problem: Problem, floor: NoiseFloor, state: Sta
     probabilities = posterior(problem, at, candidates, state.price)
     terms = tuple(
         replace(term, confusable_with=rivals(at, candidates, probabilities, best, term.hypothesis, settings))
-        for term in terms
+        for term in with_refinements(terms, settings.own)
     )
     say("learned torque")
     learned = learn(settings, problem, at, best)
@@ -85,7 +87,7 @@ def conclude(settings: Settings, problem: Problem, floor: NoiseFloor, state: Sta
     changed = _at_bounds(problem, best.fit, state.price) if explains else {}
     if not explains:
         verdict = "unnamed"
-    elif any(not problem.is_nominal(term.hypothesis) for term in terms):
+    elif any(not problem.is_nominal(term.hypothesis) for term in terms if term.refines is None):
         # A term about a nominal parameter is a change, however large: the model has the parameter.
         verdict = "named"
     else:
@@ -95,6 +97,9 @@ def conclude(settings: Settings, problem: Problem, floor: NoiseFloor, state: Sta
     terms = tuple(
         replace(term, forms=(*term.forms, *_moved(problem, best.fit, errors, term.hypothesis))) for term in terms
     )
+    for term in terms:
+        inexact = settings.inexact * best.fit.coordinates * best.fit.along(term.hypothesis)
+        errors = np.hypot(errors, inexact)
     return Conclusion(
         verdict=verdict,
         best=best,
@@ -102,9 +107,10 @@ def conclude(settings: Settings, problem: Problem, floor: NoiseFloor, state: Sta
         ablated=ablated,
         errors=errors,
         suspects=tuple(believed(candidates, probabilities)[:_SUSPECTS]),
+        families=dict(list(families(candidates, probabilities).items())[:_SUSPECTS]),
         rivals=_rivals(candidates, probabilities),
         explained_share=share,
-        models=models if verdict == "unnamed" else _effects_first(models),
+        models=models if verdict == "unnamed" else {"effects" if terms else "null": best.fit.vector} | models,
         changed=changed,
         dropped=tuple(key for key, _ in failed),
         rejected=failed[0][1] if failed else {},
@@ -113,6 +119,29 @@ def conclude(settings: Settings, problem: Problem, floor: NoiseFloor, state: Sta
             for one, probability in zip(candidates, probabilities, strict=True)
         },
     )
+
+
+def with_refinements(terms: Sequence[AcceptedTerm], own: float) -> list[AcceptedTerm]:
+    """Marks effects that may only refine a stronger one at the same joints, because no form of the library is exact.
+
+    What is left of a large effect in another form than the robot's can be several floor units, and other effects of
+    the same joint fit that well. So a weaker effect there stays in the model, but says nothing about the robot.
+
+    Args:
+      terms: the strongest first.
+      own: `Settings.own`.
+    """
+    marked: list[AcceptedTerm] = []
+    for term in terms:
+        over = [
+            one.hypothesis.key
+            for one in marked
+            if one.refines is None
+            and acts_within(term.hypothesis, one.hypothesis)
+            and term.evidence.gain < own * one.evidence.gain
+        ]
+        marked.append(replace(term, refines=over[0] if over else None))
+    return marked
 
 
 def _moved(problem: Problem, fit: Fit, errors: np.ndarray, effect: Hypothesis) -> list[Hypothesis]:
@@ -212,11 +241,6 @@ def _gap_on_select(at: Floor, residual: np.ndarray) -> float:
     """Rms of the worst component on `select`; infinite where the model breaks."""
     found = float(rms(at, residual).max())
     return found if np.isfinite(found) else np.inf
-
-
-def _effects_first(models: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Puts the model with the named effects first: a name is worth nothing if the model that is saved has not it."""
-    return {"effects": models["effects"], **models}
 
 
 def _open_gaps(problem: Problem, at: Floor, candidate: Candidate) -> np.ndarray:

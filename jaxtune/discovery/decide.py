@@ -234,6 +234,23 @@ def believed(candidates: Sequence[Candidate], probabilities: np.ndarray) -> list
     return sorted(found.values(), key=lambda one: -one.probability)
 
 
+def families(candidates: Sequence[Candidate], probabilities: np.ndarray) -> dict[tuple[str, tuple[str, ...]], float]:
+    """Pools equivalents: the probability that an effect of a family is at some places, most likely first.
+
+    Args:
+      candidates: all models.
+      probabilities: [candidates] of `posterior`.
+
+    Returns:
+      Probabilities by family and places.
+    """
+    found: dict[tuple[str, tuple[str, ...]], float] = {}
+    for candidate, probability in zip(candidates, probabilities, strict=True):
+        for kind in {(effect.family, effect.places) for effect in candidate.effects}:
+            found[kind] = found.get(kind, 0.0) + float(probability)
+    return dict(sorted(found.items(), key=lambda one: -one[1]))
+
+
 def rivals(
     at: Floor,
     candidates: Sequence[Candidate],

@@ -45,7 +45,7 @@ class Hypothesis:
     prior: np.ndarray
     """[parameters]: standard deviation of the coordinates before anything was measured."""
     joints: tuple[int, ...]
-    """Components of the signals in which the effect shows first; empty where it may show in any."""
+    """Joints that it acts at: its places, or for a link the joint that moves it; empty where it acts at none alone."""
     form: str = ""
     """Empty for an effect. Else the hypothesis is that the effect of this name, at the same places, has this form: it
     frees one parameter more, is tried only beside the effect, and is no name of its own."""
@@ -66,6 +66,11 @@ class Hypothesis:
 def are_distinct(one: Hypothesis, two: Hypothesis) -> bool:
     """Says whether two hypotheses may stand side by side: no axis is moved by both."""
     return not ((one.directions != 0).any(axis=0) & (two.directions != 0).any(axis=0)).any()
+
+
+def acts_within(one: Hypothesis, other: Hypothesis) -> bool:
+    """Says whether a hypothesis acts at some joints, and at no others than another one."""
+    return bool(one.joints) and set(one.joints) <= set(other.joints)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,8 +114,8 @@ class Problem:
     """[axes]: standard deviation of the nominal parameters, which are free under every hypothesis; zero elsewhere."""
     unknowns: np.ndarray
     """[directions, axes]: one standard deviation along other unknowns that are free from the start: the delay with
-    which the controller reads its sensors and applies its commands, how targets go on between rows, and the travel
-    over which dry friction sets in."""
+    which the controller reads its sensors and applies its commands, how targets go on between rows, the travel over
+    which dry friction sets in, and the scale of recorded torques."""
     unknown_bounds: np.ndarray
     """[directions, 2]: least and largest coordinate along each."""
     data: Mapping[str, Mapping[float, Segments]]

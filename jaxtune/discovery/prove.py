@@ -1,6 +1,6 @@
 """The proof, on sealed segments, which are simulated once, after all decisions (step 10)."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -20,7 +20,7 @@ def prove(problem: Problem, floor: NoiseFloor, state: State, conclusion: Conclus
 
     An effect is proved if the gap falls on runs that nothing was fitted to, if it opens again without the effect, and
     if another place or another effect does not close it. A model that is worse there than the better of the nominal
-    model and the null is withdrawn: whatever was believed, the user gets the better one.
+    model and the null is withdrawn: whatever was believed, the user gets the better one, and the verdict is `unnamed`.
 
     Args:
       problem: the hypotheses, among which are the placebos.
@@ -38,11 +38,10 @@ def prove(problem: Problem, floor: NoiseFloor, state: State, conclusion: Conclus
     found = at.residuals["sealed"](np.stack([*named.values(), *others.values()]))
     of_model = dict(zip([*named, *others], (rms(at, one) for one in found), strict=True))
     gap = {name: position_gap(problem, of_model[name]) for name in named}
-    better = min(gap["before"], gap["null"])
-    withdrawn = gap["after"] > _WORSE * better and gap["after"] > better + _WORSE_FLOORS
-    if withdrawn:
-        model_is = "nominal" if gap["before"] <= gap["null"] else "null"
-        model = conclusion.models[model_is]
+    saved = model
+    if withdrawn := is_worse(gap):
+        model_is = "null" if gap["null"] < gap["before"] else "nominal"
+        saved = conclusion.models[model_is]
     proof = {
         "cells": [
             {"signal": signal, "joint": part} | {name: float(of_model[name][index]) for name in named}
@@ -52,17 +51,19 @@ def prove(problem: Problem, floor: NoiseFloor, state: State, conclusion: Conclus
         "others": {name: position_gap(problem, of_model[name]) for name in others},
     }
     return Result(
-        verdict=conclusion.verdict,
+        verdict="unnamed" if withdrawn else conclusion.verdict,
         terms=conclusion.terms,
         fit=conclusion.best.fit,
         errors=conclusion.errors,
         null=state.null.fit,
-        model=model,
+        proposed=model,
+        model=saved,
         model_is=model_is,
         suspects=conclusion.suspects,
+        families=conclusion.families,
         rivals=conclusion.rivals,
         explained_share=conclusion.explained_share,
-        withdrawn=bool(withdrawn),
+        withdrawn=withdrawn,
         where=state.where,
         needs_torque=state.needs_torque,
         # What was accepted was shown, whatever the screen had thought of it at the smallest size.
@@ -75,6 +76,17 @@ def prove(problem: Problem, floor: NoiseFloor, state: State, conclusion: Conclus
         proof=proof,
         details=conclusion.details,
     )
+
+
+def is_worse(gap: Mapping[str, float]) -> bool:
+    """Says whether a model is worse than the better of nominal and null, by more than a tenth and 0.2 floor units.
+
+    Args:
+      gap: of `before` (nominal), `null` and `after`, in floor units; one that is no number is the worst.
+    """
+    before, null, after = (float(np.nan_to_num(gap[name], nan=np.inf)) for name in ("before", "null", "after"))
+    better = min(before, null)
+    return after > _WORSE * better and after > better + _WORSE_FLOORS
 
 
 def _placebos(state: State, conclusion: Conclusion) -> dict[str, np.ndarray]:

@@ -27,7 +27,7 @@ class Settings:
     swaps: int = 4
     """How many hypotheses are fitted in the place of an effect."""
     finalists: int = 4
-    """How many of those are fitted on with fresh slopes."""
+    """How many of those with one effect are fitted on with fresh slopes, and half as many pairs."""
     most: int = 6
     """Largest number of effects that are accepted."""
     level: float = 0.05
@@ -48,6 +48,12 @@ class Settings:
     """The same for a name of the same family at the same place, as a low-pass filter is beside a delay."""
     possible: float = 0.05
     """Probability from which on another name may as well be right."""
+    inexact: float = 0.08
+    """Standard deviation, as a share, by which the form of the library may shift the size of an effect. Intervals hold
+    it beside the noise."""
+    own: float = 0.5
+    """Share of the evidence for a stronger effect at the same joints from which on an effect is a name of its own. With
+    less it may make up for the form of that one."""
     rivals: int = 3
     """Largest number of names that are reported beside one."""
     rounds: int = 4
@@ -71,6 +77,8 @@ class AcceptedTerm:
     """Names of other effects that these logs cannot distinguish from it, or that explain nearly as much."""
     forms: tuple[Any, ...] = ()
     """Each a `problem.Hypothesis` about its form; none where its first form is as good."""
+    refines: str | None = None
+    """Key of a stronger effect at the same joints that it may only refine; None for an effect that is named."""
 
 
 @dataclass(frozen=True)
@@ -95,16 +103,19 @@ class Result:
     fit: Any
     """The `fit.Fit` with all accepted effects, at the main horizon."""
     errors: np.ndarray
-    """[coordinates] standard errors of `fit`."""
+    """[coordinates] standard errors of `fit`: of its effects by noise and `Settings.inexact`, of others by noise."""
     null: Any
     """The `fit.Fit` with none, its nominal parameters fitted."""
+    proposed: np.ndarray
+    """[axes]: the model that was chosen on `select`, and what `gap` calls `after`."""
     model: np.ndarray
-    """[axes]: the corrected model, as the simulator is given it. It is chosen on `select`, and what `gap` calls
-    `after`."""
+    """[axes]: the corrected model, as the simulator is given it: `proposed`, unless that was withdrawn."""
     model_is: str
-    """What the corrected model is: `nominal`, `null`, `effects`, or `learned` (effects and a learned torque)."""
+    """What `model` is: `nominal`, `null`, `effects`, or `learned` (effects and a learned torque)."""
     suspects: tuple[Suspect, ...]
     """Effects that may be part of the truth, most likely first, whatever the verdict."""
+    families: Mapping[tuple[str, tuple[str, ...]], float]
+    """The probability that an effect of a family is at some places, by family and places, most likely first."""
     rivals: tuple[tuple[str, np.ndarray], ...]
     """Keys and vectors [axes] of the two models that are most believed, of those with effects; their effects differ in
     more than form."""
@@ -112,8 +123,8 @@ class Result:
     """Share of the explainable gap that the reported effects explain, on `train` and `select`; see
     `conclude.explained`."""
     withdrawn: bool
-    """True if the corrected model was worse on `sealed` than the better of the nominal model and the null; then `model`
-    is that one."""
+    """True if `proposed` was worse on `sealed` than the better of the nominal model and the null; then `model` is that
+    one."""
     where: tuple[Mapping[str, Any], ...]
     """Cells above the floor before anything was accepted, largest first; see `localise.cells`."""
     needs_torque: Mapping[str, float]

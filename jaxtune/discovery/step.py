@@ -203,15 +203,41 @@ def fit_leads(
         return []
     whole = _on_all(at, [fits[index] for index in order])
     whole.sort(key=lambda pair: pair[1].cost)
-    least, before = whole[0][1].cost, base.cost
-    finalists = [fit for _, fit in whole[: settings.finalists] if before - fit.cost >= _REACH * (before - least)]
-    best = polish(finalists, at.residuals["train"], settings.rounds)
-    every = [*best, *(fit for _, fit in whole[len(finalists) :])]
+    every = [fit for _, fit in whole]
+    chosen = _finalists(settings, base.cost, [groups[order[index]] for index, _ in whole], [fit.cost for fit in every])
+    # A further round costs little beside the slopes.
+    for number, fit in zip(
+        chosen, polish([every[n] for n in chosen], at.residuals["train"], 3 * settings.rounds), strict=True
+    ):
+        every[number] = fit
     select = at.residuals["select"](np.stack([fit.vector for fit in every]))
     return [
         Candidate((*present, *groups[order[index]]), fit, residual)
         for (index, _), fit, residual in zip(whole, every, select, strict=True)
     ]
+
+
+def _finalists(
+    settings: Settings, before: float, groups: Sequence[Sequence[Hypothesis]], costs: Sequence[float]
+) -> list[int]:
+    """Picks the fits that get fresh slopes, of those that gain enough: the best single effects and half as many pairs.
+
+    Pairs have a list of their own, since a pair costs less than its better half for want of rounds alone.
+
+    Args:
+      settings: how many.
+      before: cost without any of them.
+      groups: what each fit adds, in the order of their costs.
+      costs: of the fits, rising.
+
+    Returns:
+      Indices of the fits.
+    """
+    near = [index for index, cost in enumerate(costs) if before - cost >= _REACH * (before - costs[0])]
+    effects = [sum(not hypothesis.form for hypothesis in groups[index]) for index in near]
+    single = [index for index, count in zip(near, effects, strict=True) if count < 2][: settings.finalists]
+    pairs = [index for index, count in zip(near, effects, strict=True) if count >= 2][: settings.finalists // 2]
+    return [*single, *pairs]
 
 
 def _on_all(at: Floor, fits: Sequence[Fit]) -> list[tuple[int, Fit]]:

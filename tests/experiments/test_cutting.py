@@ -215,7 +215,7 @@ def test_segments_in_which_runs_were_told_the_same_are_repeats(played):
         first, second = np.flatnonzero(again.repeats == group)
         assert again.run[first] != again.run[second]
         np.testing.assert_array_equal(again.signals["q"][first], again.signals["q"][second])
-    # Of many segments some are left out.
-    assert (again.repeats >= 0).mean() > 0.6
+    # Of many segments some are left out, in pairs.
+    assert (again.repeats >= 0).all()
     assert (found["select"][0.24].repeats < 0).all()
     assert (found["sealed"][0.24].repeats < 0).all()

@@ -190,11 +190,11 @@ def test_a_case_that_fails_is_recorded_and_the_next_one_goes_on(tmp_path, monkey
     bench = FieldBench(tmp_path, "field_smoke", 3, 0.1)
     asked = []
 
-    def fails(logs, out):
+    def fails(logs):
         asked.append(logs)
         raise ValueError("no floor")
 
-    monkeypatch.setattr(benchmark, "investigate", fails)
+    monkeypatch.setattr(benchmark, "read_logs", fails)
     monkeypatch.setattr(FieldBench, "write", lambda self, case: tmp_path / "log")
     assert bench.answer(bench.cases[0])["verdict"] == "failed"
     assert bench.answer(bench.cases[0])["message"] == "ValueError: no floor"

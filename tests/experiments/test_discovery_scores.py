@@ -63,6 +63,14 @@ def test_names_families_sets_and_places_count_apart():
     assert [wrong(row) for row in rows] == [None, "wrong name", "wrong name"]
 
 
+def test_how_far_a_gap_is_closed_is_counted_apart_where_sealed_runs_show_it():
+    shown = score(truth(hidden("coulomb")), answer([named("coulomb")]))
+    gentle = score(truth(hidden("coulomb")), answer([named("coulomb")], gap={"before": 9.0, "null": 1.5, "after": 1.0}))
+    rows = [shown, gentle, gentle]
+    assert value(rows, "null over after at 15 floor units (median)") == 1.5
+    assert value(rows, "null over after where sealed runs show 5 floor units (median)") == 10.0
+
+
 def test_where_nothing_is_hidden_a_name_is_a_false_alarm():
     rows = [
         score(EMPTY, answer(verdict="no_missing_effect")),
@@ -121,9 +129,8 @@ def test_harm_is_to_be_worse_than_nominal_and_null():
     assert not score(truth(hidden("coulomb")), small)["harm"]
 
 
-def test_a_withdrawn_model_counts_as_unnamed():
-    row = score(truth(hidden("coulomb")), answer([named("coulomb")], withdrawn=True))
-    assert row["verdict"] == "unnamed"
+def test_a_withdrawn_model_names_nothing():
+    row = score(truth(hidden("coulomb")), answer(verdict="unnamed", withdrawn=True))
     assert row["named"] is None
     assert not row["name"]
     assert value([row], "withdrawn after the look at sealed") == 1.0

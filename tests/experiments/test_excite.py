@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from envs import models
-from envs.logs import read
+from envs.logs import read, write
 from experiments import excite
 from experiments.discovery.blind_cases import ARM
 from experiments.discovery.excitation import MOTIONS, deciding, excitation
@@ -96,8 +96,7 @@ def test_the_motion_with_the_largest_score_is_chosen(spec):
 def test_scores_that_are_no_numbers_decide_nothing(spec):
     chosen = deciding(spec, JOINTS, lambda motion: 1.0 if motion[0].enabled.min() == 0 else np.nan, seconds=2.0)
     assert chosen.name == "swing"
-    with pytest.raises(ValueError, match="score: got no finite number"):
-        deciding(spec, JOINTS, lambda motion: np.inf, seconds=2.0)
+    assert deciding(spec, JOINTS, lambda motion: np.inf, seconds=2.0) is None
 
 
 def test_the_command_writes_the_motion_that_was_chosen(tmp_path, spec):
@@ -108,6 +107,21 @@ def test_the_command_writes_the_motion_that_was_chosen(tmp_path, spec):
         np.testing.assert_allclose(run.signals["target"], wanted.target)
         assert run.controller.gains["kp"] == pytest.approx(30.0)
     assert (tmp_path / "log" / "arm.xml").read_text() == ARM.read_text()
+
+
+def test_targets_for_the_robot_of_a_log_have_its_model_joints_and_controller(tmp_path):
+    excite.main(excite.Args(out=tmp_path / "targets", robot=str(ARM), seconds=2.0, kp=33.0, control_hz=500.0))
+    log = read(tmp_path / "targets", measured=False)
+    order = JOINTS[::-1]
+    runs = [replace(run, signals={"q": run.signals["target"], **run.signals}) for run in log.runs]
+    write(replace(log, runs=tuple(runs), joints=order), tmp_path / "measured")
+    (tmp_path / "measured" / "arm.xml").write_text(ARM.read_text())
+    excite.main(excite.Args(out=tmp_path / "next", like=tmp_path / "measured", motion="chirp", seconds=2.0))
+    following = read(tmp_path / "next", measured=False)
+    assert following.joints == order
+    assert following.runs[0].controller.rate_hz == 500.0
+    np.testing.assert_allclose(following.runs[0].controller.gains["kp"], 33.0)
+    assert (tmp_path / "next" / "arm.xml").read_text() == ARM.read_text()
 
 
 @pytest.mark.parametrize("compiler", ["", 'inertiafromgeom="true"'])

@@ -15,6 +15,7 @@ from experiments.discovery import gate
 from experiments.discovery.blind_cases import ARM
 from experiments.discovery.blind_robots import Truth, record
 from experiments.discovery.excitation import excitation
+from experiments.discovery.setup import read_logs
 
 JOINTS = ("shoulder", "elbow")
 GAINS = {"kp": np.array([40.0, 20.0]), "kd": np.array([2.0, 0.8]), "torque_limit_nm": np.array([15.0, 15.0])}
@@ -88,8 +89,12 @@ MISLED = {
 }
 
 
+def check(log, **options):
+    return gate.check(log, mujoco.MjSpec.from_file(str(ARM)), HORIZONS, **options)
+
+
 def test_a_good_log_passes_without_a_word(good):
-    assert gate.check(good, HORIZONS) == []
+    assert check(good) == []
 
 
 @pytest.mark.parametrize("kind", MISLED)
@@ -98,9 +103,9 @@ def test_what_would_mislead_is_refused_unless_the_log_is_trusted(good, kind):
     damage, sentence = MISLED[kind]
     damaged = damage(good)
     with pytest.raises(ValueError, match=sentence) as refused:
-        gate.check(damaged, HORIZONS)
+        check(damaged)
     assert "--trust-log" in str(refused.value)
-    assert any(sentence in note for note in gate.check(damaged, HORIZONS, trust=True))
+    assert any(sentence in note for note in check(damaged, trust=True))
 
 
 def test_what_does_not_mislead_is_a_note(good):
@@ -115,7 +120,7 @@ def test_what_does_not_mislead_is_a_note(good):
             for run in good.runs
         ),
     )
-    assert any("an apparent delay of" in note for note in gate.check(late, HORIZONS))
+    assert any("an apparent delay of" in note for note in check(late))
 
 
 def test_sealed_runs_are_not_looked_at(good):
@@ -123,7 +128,7 @@ def test_sealed_runs_are_not_looked_at(good):
         replace(run, signals=run.signals | {"q": np.degrees(run.signals["q"])}) if run.split == "sealed" else run
         for run in good.runs
     ]
-    assert gate.check(replace(good, runs=tuple(runs)), HORIZONS) == []
+    assert check(replace(good, runs=tuple(runs))) == []
 
 
 def servo(log):
@@ -135,6 +140,7 @@ def servo(log):
     ("damage", "message"),
     [
         (lambda log: replace(log, runs=log.runs[:1]), "no run is left for 'select'"),
+        (lambda log: replace(log, joints=("elbow",)), "joints: got a log without shoulder"),
         (lambda log: at(log, *range(200, 1000)), "'train' has room for 2 segment"),
         (lambda log: signals(log, q=lambda v: v[:1] + 1e-4 * np.sin(np.arange(len(v)))[:, None]), "a robot at rest"),
         (lambda log: gains(log, kp=np.zeros(2)), "controller.kp: got 0 for shoulder, elbow, expected the controller's"),
@@ -144,7 +150,7 @@ def servo(log):
 )
 def test_a_log_that_cannot_answer_is_refused_though_it_is_trusted(good, damage, message):
     with pytest.raises(ValueError, match=message):
-        gate.check(damage(good), HORIZONS, trust=True)
+        check(damage(good), trust=True)
 
 
 def test_a_passive_joint_needs_no_gain(good):
@@ -210,3 +216,15 @@ def test_flags_that_switch_physics_off_are_refused_unless_they_are_cleared(tmp_p
     # Cleared, it is the doctor that refuses.
     with pytest.raises(ValueError, match="degrees for radians"):
         discover.main(discover.Args(logs=(folder,), out=tmp_path / "out", horizons=HORIZONS, clear_flags=True))
+
+
+def test_the_doctor_looks_at_the_model_whose_flags_were_cleared(tmp_path, good):
+    folder = tmp_path / "log"
+    write(replace(good, robot="arm.xml"), folder)
+    option = '<option timestep="0.001" gravity="0 0 -9.81"'
+    (folder / "arm.xml").write_text(
+        ARM.read_text().replace(f"{option}/>", f'{option}><flag gravity="disable"/></option>')
+    )
+    log, spec = read_logs([folder], clear_flags=True)
+    assert gate.check(log, spec, HORIZONS) == []
+    assert log.notes == ("flags of the model that disabled gravity were cleared",)

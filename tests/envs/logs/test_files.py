@@ -337,6 +337,23 @@ def test_splits_are_what_the_log_says_where_it_does(tmp_path):
         logs.splits(many(tmp_path, said))
 
 
+def test_halves_swap_whole_conditions(tmp_path):
+    said = [
+        {"condition": name, "split": split}
+        for name, split in zip("abcdab", 2 * ["train"] + 2 * ["select"] + 2 * ["train"], strict=True)
+    ]
+    said[3]["split"] = "sealed"
+    log = logs.with_halves_swapped(many(tmp_path, said))
+    held = {split: {run.condition for run in runs} for split, runs in logs.splits(log).items()}
+    assert held == {"train": {"c", "d"}, "select": {"a"}, "sealed": {"b"}}
+
+
+def test_a_half_of_one_condition_is_not_swapped(tmp_path):
+    log = many(tmp_path, [{"condition": name} for name in "abc"])
+    with pytest.raises(ValueError, match="'train' has condition a only, expected two or more"):
+        logs.with_halves_swapped(log)
+
+
 def test_too_few_conditions_to_split_are_named(tmp_path):
     with pytest.raises(ValueError, match=r"2 run\(s\) of conditions a, b, expected three"):
         logs.splits(many(tmp_path, [{"condition": "a"}, {"condition": "b"}]))

@@ -1,0 +1,132 @@
+"""What a discovery's files and page say, from a result that is made up."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from rich.console import Console
+
+from envs.logs import Controller
+from experiments.discovery import report
+from experiments.discovery.blind_cases import ARM
+from experiments.discovery.blind_robots import Truth, record
+from experiments.discovery.excitation import excitation
+from experiments.discovery.setup import build_question
+from experiments.discovery.summary import details, free_runs, summarise
+from jaxtune.discovery.decide import Evidence, Thresholds
+from jaxtune.discovery.fit import Fit, Free
+from jaxtune.discovery.result import AcceptedTerm, Result, Suspect
+
+JOINTS = ("shoulder", "elbow")
+GAINS = {"kp": np.array([40.0, 20.0]), "kd": np.array([2.0, 0.8]), "torque_limit_nm": np.array([15.0, 15.0])}
+EVIDENCE = Evidence(
+    gain=90.0, confirmed=40.0, floors=3.0, left=1.1, relief=0.0, interval=(0.4, 0.6), inside=True, horizons=3
+)
+
+
+@pytest.fixture(scope="module")
+def asked():
+    spec = mujoco.MjSpec.from_file(str(ARM))
+    controller = Controller(kind="pd", rate_hz=1000.0, gains=GAINS)
+    motions = excitation(spec, JOINTS, 4, 1.0, 200.0)
+    log = record(spec, JOINTS, motions, controller, Truth("coulomb", ("elbow",), 0.5), 0.1, 3)
+    log = replace(log, robot=str(ARM))
+    return log, build_question(log, spec, (0.05, 0.1, 0.2), null_logs=0)
+
+
+def found(question, **changes):
+    """Dry friction at the elbow, a weaker push beside it, and a damping gain at its bound at the shoulder."""
+    axes = question.rig.axes
+    at = {(axis.effect, axis.place): number for number, axis in enumerate(axes)}
+    every = {hypothesis.key: hypothesis for hypothesis in question.problem.hypotheses}
+    coulomb, push = every["coulomb@elbow"], every["constant_push@elbow"]
+    gain = at["damping_gain", "shoulder"]
+    directions = np.concatenate([np.eye(len(axes))[[gain]], coulomb.directions, push.directions])
+    point = np.array([0.3, 0.5, 0.1])
+    free = Free(directions, np.ones(3), np.tile([-1.0, 1.0], (3, 1)), np.array([True, False, False]))
+    fit = Fit(free, point, np.zeros(0), np.zeros((0, 3)), None)
+    nothing = replace(fit, coordinates=np.zeros(3))
+    terms = (
+        AcceptedTerm(coulomb, EVIDENCE, Thresholds(10.0), confusable_with=("stribeck",)),
+        AcceptedTerm(push, replace(EVIDENCE, gain=30.0), Thresholds(10.0), refines="coulomb@elbow"),
+    )
+    cells = [
+        {"signal": signal, "joint": part, "before": 3.0, "null": 2.0, "after": 1.0}
+        for signal, part in question.problem.cells
+    ]
+    where = {"joint": "elbow", "signal": "q", "regime": "reversal", "excess_floor_units": 2.0, "low": 1.0, "high": 3.0}
+    result = Result(
+        verdict="named",
+        terms=terms,
+        fit=fit,
+        errors=np.array([0.01, 0.02, 0.01]),
+        null=nothing,
+        proposed=fit.vector,
+        model=fit.vector,
+        model_is="effects",
+        suspects=(Suspect(coulomb, (), 0.9),),
+        families={("joint_friction", ("elbow",)): 0.97},
+        rivals=(),
+        explained_share=0.93,
+        withdrawn=False,
+        where=(where | {"bins": 9},),
+        needs_torque={},
+        not_testable=("drag",),
+        not_finite=(),
+        dropped=(),
+        rejected={},
+        changed={gain: 3.0},
+        gap={"before": 3.0, "null": 2.0, "after": 1.0},
+        proof={"cells": cells, "no_cell_worse": True, "others": {"without coulomb@elbow": 2.5}},
+    )
+    return replace(result, **changes)
+
+
+def test_what_is_named_changed_and_neither(asked):
+    log, question = asked
+    summary = summarise(question, log, Path("logs"), found(question))
+    (effect,), (change,), (weaker,) = (summary[key] for key in ("effects", "parameter_changes", "not_named"))
+    assert (effect["name"], effect["places"], effect["confusable_with"]) == ("coulomb", ["elbow"], ["stribeck"])
+    value = effect["parameters"]["torque_nm"]
+    # 1.96 standard errors of 0.02, in the scale of the coordinate.
+    assert (value["high"] - value["low"]) / value["value"] == pytest.approx(2 * 1.96 * 0.02 / 0.5, rel=1e-3)
+    # A parameter that no hypothesis is about can be at its bound all the same.
+    assert (change["name"], change["places"]) == ("damping_gain", ["shoulder"])
+    assert change["parameters"]["ratio"]["value"] == pytest.approx(np.exp(0.3), rel=1e-5)
+    assert (weaker["name"], weaker["refines"]) == ("constant_push", "coulomb@elbow")
+    assert summary["families"] == [{"family": "joint_friction", "places": ["elbow"], "probability": 0.97}]
+
+
+def test_an_answer_without_a_name_asserts_nothing(asked):
+    log, question = asked
+    summary = summarise(question, log, Path("logs"), found(question, verdict="unnamed", changed={}))
+    assert summary["effects"] == summary["parameter_changes"] == []
+    assert [(one["name"], one["refines"]) for one in summary["not_named"]] == [
+        ("coulomb", None),
+        ("constant_push", "coulomb@elbow"),
+    ]
+
+
+@pytest.mark.parametrize("withdrawn", [False, True])
+def test_page_and_console_say_what_was_found(tmp_path, asked, withdrawn):
+    log, question = asked
+    result = found(question)
+    if withdrawn:
+        result = replace(result, verdict="unnamed", withdrawn=True, model_is="null", model=result.null.vector)
+    summary, free = summarise(question, log, Path("logs"), result), free_runs(log, question, result)
+    assert {run["split"] for run in details(question, result, free)["free_runs"]} == {"train", "select", "sealed"}
+    # What was proposed is simulated, whether or not it was withdrawn.
+    assert abs(free["error_rad"]["train"]["after"] - free["error_rad"]["train"]["null"]) > 1e-3
+    report.write(tmp_path / "page.html", log, question, result, summary, free)
+    page = (tmp_path / "page.html").read_text()
+    assert ("was withdrawn" in page) is withdrawn
+    assert ("the nominal model with its parameters fitted" in page) is withdrawn
+    assert "constant_push" in page
+    console = Console(record=True, width=160)
+    report.show(console, question, summary, free)
+    said = console.export_text()
+    assert ("was withdrawn" in said) is withdrawn
+    assert "constant_push at elbow, which may only make up for the form of coulomb@elbow" in said
+    assert "93% of the gap that can be explained" in said
