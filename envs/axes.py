@@ -1,17 +1,17 @@
 """The coordinates of a rig: what a unit of each stands for, how far it may go, and what is believed of it before."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import mujoco
 
 from jaxtune.types import Effect, Parameter
 
-# Parameters that every model has, by the effect that changes them: link masses, the proportional gain, armature,
-# damping and dry friction. Each may be wrong by a tenth of its nominal value (one prior standard deviation). Discovery
-# fits them under all hypotheses, the null included, so that an inaccurate number is not taken for a missing effect.
+# Parameters that every model has, by the effect that changes them, and by which share of its nominal value each may be
+# wrong (one prior standard deviation). Discovery fits them under all hypotheses, the null included, so that an
+# inaccurate number is not taken for a missing effect. A proportional gain is set, and better known than a mass.
 _PRIOR_SHARE = 0.1
-_NOMINAL_RATIOS = ("link_mass", "gain_error", "damping_gain")
+_NOMINAL_RATIOS = {"link_mass": _PRIOR_SHARE, "gain_error": 0.035, "damping_gain": _PRIOR_SHARE}
 _NOMINAL_FIELDS = {"armature": "dof_armature", "viscous": "dof_damping", "coulomb": "dof_frictionloss"}
 _MOST_TAKEN = 0.9  # of a field of the model: armature and damping must stay positive
 
@@ -40,7 +40,7 @@ class Axis:
     fits); zero for an effect that models lack."""
     joints: tuple[int, ...]
     """Indices of the joints in which an effect at this place shows directly: the joint itself, or for a link all joints
-    that carry it."""
+    that carry it, nearest first."""
 
 
 def describe_axis(
@@ -51,7 +51,7 @@ def describe_axis(
     place: str,
     index: int,
     scale: float,
-    joints: Collection[int],
+    joints: Sequence[int],
 ) -> Axis:
     """Describes the coordinate of one parameter of one effect at one place.
 
@@ -63,13 +63,13 @@ def describe_axis(
       place: where the effect sits.
       index: number of the place.
       scale: what one unit of the coordinate stands for.
-      joints: indices of the joints in which the effect shows directly.
+      joints: indices of the joints in which the effect shows directly, nearest first.
     """
     least, prior_sd, fields = parameter.bounds[0], 0.0, parameter.fields
     if parameter.form == "added" and row.on == "joint" and fields:
         least = max(least, -_MOST_TAKEN * getattr(model, fields[0])[dof[index]] / scale)
     if row.name in _NOMINAL_RATIOS:
-        prior_sd = _PRIOR_SHARE
+        prior_sd = _NOMINAL_RATIOS[row.name]
     elif row.name in _NOMINAL_FIELDS:
         prior_sd = _PRIOR_SHARE * float(getattr(model, _NOMINAL_FIELDS[row.name])[dof[index]] / scale)
     return Axis(
@@ -80,5 +80,5 @@ def describe_axis(
         scale=scale,
         least=float(least),
         prior_sd=prior_sd,
-        joints=tuple(sorted(joints)),
+        joints=tuple(joints),
     )

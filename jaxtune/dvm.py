@@ -193,15 +193,18 @@ def novelty(
     mean, so the score of a set is repeatable. Windows are not averaged here; the gate ranks them first.
 
     Returns:
-      Novelty in nats per window, nan where a step is not finite; whether the window is valid; and whether it is
-      covered, that is, has a neighbour within reach. The novelty of a window that is not covered is zero and means
-      nothing.
+      Novelty in nats per window, nan where a step is not finite, and everywhere if no simulated observation ever
+      changes; whether the window is valid; and whether it is covered, that is, has a neighbour within reach. The
+      novelty of a window that is not covered is zero and means nothing.
     """
     cut, valid = windows.grid(trajectory, config.window, config.stride)
     elbo, latent = _evaluate(config, dvm.variables, dvm.scaler, cut.reshape(-1, *cut.shape[2:]))
     closeness, index = jax.lax.top_k(-_distances(latent, dvm.latent), config.neighbours)
     near = -closeness <= dvm.reach
     mean = jnp.sum(jnp.where(near, dvm.elbo[index], 0.0), axis=-1) / jnp.maximum(near.sum(axis=-1), 1)
+    # Observations that never change in simulation say nothing of a robot, so there is no novelty to compute.
+    varies = jnp.any(dvm.scaler.std[: trajectory.obs.shape[-1]] > windows.MIN_STD)
+    elbo = jnp.where(varies, elbo, jnp.nan)
     # A window that is not finite must stay nan for the gate to see it, not pass for one without a neighbour.
     covered = near.any(axis=-1) | jnp.isnan(elbo)
     return jnp.where(covered, mean - elbo, 0.0), valid.reshape(-1), covered

@@ -185,7 +185,7 @@ def calibrated_gate(
 
     Returns:
       Score (`novelty`), threshold and p-value. The score is nan where the set has no valid window or holds a living
-      step that is not finite.
+      step that is not finite, and where no simulated observation ever changes.
     """
     model, elbo = dvm.train(key, config.dvm, collected.trajectory)
     held_out = jax.lax.map(lambda episodes: dvm.novelty(config.dvm, model, episodes), collected.held_out)

@@ -71,6 +71,8 @@ import jax
 import jax.numpy as jnp
 
 from jaxtune import dist as dists
+from jaxtune.checks import check_measured, check_simulated
+from jaxtune.explain import explain
 from jaxtune.rules import (
     Collected,
     GateInfo,
@@ -98,6 +100,8 @@ __all__ = [
     "TunerState",
     "UpdateInfo",
     "calibrated_gate",
+    "explain",
+    "keep",
     "knobs",
     "posterior_update",
     "vote_update",
@@ -113,6 +117,11 @@ Simulate = Callable[[jax.Array, Policy, Coords], Trajectory]
 Measure = Callable[[jax.Array, Policy], Trajectory]
 """`(key, policy) -> Trajectory [set_episodes, time]`: episodes of the target, with the same episode length, policy,
 commands and observation noise as the simulated ones."""
+
+
+def keep(key: jax.Array, policy: Policy, dist: ParamDist) -> tuple[Policy, dict]:
+    """Leaves a policy as it is: the `train_policy` of a tuner whose policy is trained elsewhere, or not at all."""
+    return policy, {}
 
 
 @chex.dataclass(frozen=True)
@@ -133,6 +142,21 @@ class Info:
     dist: ParamDist  # the distribution that the last episodes were drawn from, before the update
     measured_falls: jax.Array  # number of measured episodes that ended early
     not_finite: jax.Array  # number of episodes, simulated or measured, whose simulation broke
+
+
+def make_info(carry: dict, update: UpdateInfo, measured: Trajectory) -> Info:
+    """Puts together what happened in one tuning, from what its gate's loop carried last; `train` is empty."""
+    return Info(
+        train={},
+        calls=carry["calls"],
+        verdicts=carry["verdicts"],
+        radius=carry["radius"],
+        gate=carry["gate"],
+        update=update,
+        dist=carry["dist"],
+        measured_falls=measured.fell.sum(),
+        not_finite=carry["not_finite"] + measured.not_finite.sum(),
+    )
 
 
 @chex.dataclass(frozen=True)
@@ -217,6 +241,9 @@ class Tuner:
 
         Returns:
           The state with the new distribution, and the `Info`, with an empty `train`.
+
+        Raises:
+          ValueError: episodes, simulated or measured, do not have the shapes that they should (`jaxtune.checks`).
         """
         key_gate, key_update = jax.random.split(key)
         carry = self._gate_loop(key_gate, state, measured)
@@ -226,63 +253,67 @@ class Tuner:
             lambda: self.update(key_update, self.config, carry["collected"], measured, carry["dist"], state.knobs),
             lambda: (carry["dist"], no_update(carry["dist"])),
         )
-        info = Info(
-            train={},
-            calls=carry["calls"],
-            verdicts=carry["verdicts"],
-            radius=carry["radius"],
-            gate=carry["gate"],
-            update=update,
-            dist=carry["dist"],
-            measured_falls=measured.fell.sum(),
-            not_finite=carry["not_finite"] + measured.not_finite.sum(),
-        )
-        return state.replace(dist=moved), info
+        return state.replace(dist=moved), make_info(carry, update, measured)
 
     def _gate_loop(self, key, state, measured):
         """Simulates, verifies and widens while the verdict is `widen`: the do-while of Algorithm 1."""
 
         def body(carry):
-            calls = carry["calls"]
             # Every call simulates new robots and trains its models anew, because the distribution has changed.
-            key_collect, key_verify = jax.random.split(jax.random.fold_in(key, calls))
-            dist = carry["dist"]
-            collected = self.collect(key_collect, state.policy, dist)
+            key_collect, key_verify = jax.random.split(jax.random.fold_in(key, carry["calls"]))
+            collected = self.collect(key_collect, state.policy, carry["dist"])
             gate = self.verify(key_verify, self.config, collected, measured, state.knobs)
-            closer = gate.novelty < carry["closest"] - self.config.least_fall
-            stalled = jnp.where(closer, 0, carry["stalled"] + 1)
-            verdict = self._verdict(gate, dist, calls, stalled)
-            broken = collected.trajectory.not_finite.sum() + collected.held_out.not_finite.sum()
-            wider = dists.widen(dist, state.knobs.widen_factor)
-            return {
-                "calls": calls + 1,
-                "dist": jax.tree.map(lambda new, old: jnp.where(verdict == Verdict.WIDEN, new, old), wider, dist),
-                "collected": collected,
-                "verdict": verdict,
-                # Several small decreases may add up to one that counts as progress.
-                "closest": jnp.where(closer, gate.novelty, carry["closest"]),
-                "stalled": stalled,
-                "verdicts": carry["verdicts"].at[calls].set(verdict),
-                "radius": carry["radius"].at[calls].set(dists.ravel(dist.radius).max()),
-                "gate": jax.tree.map(lambda log, value: log.at[calls].set(value), carry["gate"], gate),
-                "not_finite": carry["not_finite"] + broken,
-            }
+            return {**self.decide(carry, collected, gate, state.knobs), "collected": collected}
 
-        return jax.lax.while_loop(lambda carry: carry["verdict"] == Verdict.WIDEN, body, self._before_gate(key, state))
-
-    def _before_gate(self, key, state):
-        """Makes the loop's carry before the first call; the verdict `widen` lets the loop begin."""
         # A while loop needs a carry of fixed shapes: zeros stand for the episodes that the first call will collect.
         shapes = jax.eval_shape(self.collect, key, state.policy, state.dist)
+        check_measured(measured, shapes.trajectory, self.config)
+        blank = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+        return jax.lax.while_loop(
+            lambda carry: carry["verdict"] == Verdict.WIDEN, body, {**self.before(state.dist), "collected": blank}
+        )
+
+    def before(self, dist: ParamDist) -> dict:
+        """Makes what the gate's loop carries before the first call; the verdict `widen` lets the loop begin."""
         return {
             "calls": jnp.zeros((), int),
-            "dist": state.dist,
-            "collected": jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes),
+            "dist": dist,
             "verdict": jnp.asarray(Verdict.WIDEN, int),
-            "closest": jnp.asarray(jnp.inf),
+            "closest": jnp.asarray(jnp.inf, float),
             "stalled": jnp.zeros((), int),
             "not_finite": jnp.zeros((), int),
             **no_gate_log(self.config),
+        }
+
+    def decide(self, carry: dict, collected: Collected, gate: GateInfo, knobs: Knobs) -> dict:
+        """Takes the verdict of one gate call, and widens the distribution if that is it.
+
+        Args:
+          carry: from `before`, or from the call before.
+          collected: the simulated episodes that the gate compared.
+          gate: what it found.
+          knobs: for the widening factor.
+
+        Returns:
+          What the loop carries to the next call; the loop ends unless its `verdict` is `widen`.
+        """
+        calls, dist = carry["calls"], carry["dist"]
+        closer = gate.novelty < carry["closest"] - self.config.least_fall
+        stalled = jnp.where(closer, 0, carry["stalled"] + 1)
+        verdict = jnp.asarray(self._verdict(gate, dist, calls, stalled), int)
+        broken = collected.trajectory.not_finite.sum() + collected.held_out.not_finite.sum()
+        wider = dists.widen(dist, knobs.widen_factor)
+        return {
+            "calls": calls + 1,
+            "dist": jax.tree.map(lambda new, old: jnp.where(verdict == Verdict.WIDEN, new, old), wider, dist),
+            "verdict": verdict,
+            # Several small decreases may add up to one that counts as progress.
+            "closest": jnp.where(closer, gate.novelty, carry["closest"]),
+            "stalled": stalled,
+            "verdicts": carry["verdicts"].at[calls].set(verdict),
+            "radius": carry["radius"].at[calls].set(dists.ravel(dist.radius).max()),
+            "gate": jax.tree.map(lambda log, value: log.at[calls].set(value), carry["gate"], gate),
+            "not_finite": carry["not_finite"] + broken,
         }
 
     def collect(self, key: jax.Array, policy: Policy, dist: ParamDist) -> Collected:
@@ -298,6 +329,7 @@ class Tuner:
         # One call of the simulator for both, so that it is compiled once and the device is full.
         every = jax.tree.map(lambda a, b: jnp.concatenate([a, jnp.repeat(b, each)]), coords, held_out_coords)
         trajectory = self.simulate(key_simulate, policy, every)
+        check_simulated(trajectory, self.config.episodes + sets * each, self.config)
         return Collected(
             trajectory=jax.tree.map(lambda leaf: leaf[: self.config.episodes], trajectory),
             sampled_coords=coords,

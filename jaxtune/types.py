@@ -5,21 +5,23 @@ discovery workflow may add to a model. This module imports nothing from the rest
 
 Two kinds of value have two names. A *parameter* is physical: a multiplier of the nominal model's value (0.8 of a mass)
 or an offset (0.004 s of delay). A *coordinate* is the number that is searched in its stead: the logarithm of a
-multiplier, so that halving and doubling are equally far, or an offset as it is. The tuner sees coordinates alone.
+multiplier, so that halving and doubling are equally far, or an offset in units of order one. The tuner sees
+coordinates alone.
 """
 
 import enum
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import chex
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 Coords = Mapping[str, jax.Array]
-"""Searched values by name: the logarithm of a multiplier, or an offset. All arrays have one shape, often [episodes].
+"""Searched values by name: the logarithm of a multiplier, or a scaled offset. Arrays have one shape, often [episodes].
 
 Physical values, by contrast, are called `params`.
 """
@@ -43,6 +45,78 @@ class Trajectory:
     score: jax.Array  # [episodes, time], reward of each step, zero where not alive
     fell: jax.Array  # [episodes], True where the episode ended early
     not_finite: jax.Array  # [episodes], True where it ended because the simulation broke
+
+    @classmethod
+    def from_episodes(cls, episodes: Sequence[Mapping[str, Any]], *, steps: int | None = None) -> "Trajectory":
+        """Makes a set of episodes from lists of any length, as a Gymnasium loop collects them.
+
+        Args:
+          episodes: mappings with `observation` [time, obs], `action` [time, act], `reward` [time] and `terminated`, for
+            the episode or [time]; others, such as `truncated`, are not read. Observations may have one entry more, the
+            one after the last step, which is left out.
+          steps: length of the set; longer episodes are cut, shorter ones masked. That of the longest where None.
+
+        Returns:
+          NumPy arrays. An episode fell where it was terminated within `steps`. From a step on that is not finite it is
+          masked, and counts as one that broke.
+
+        Raises:
+          ValueError: there is no episode, one lacks a key, or its lists or widths do not agree.
+        """
+        read = [_read_episode(number, episode) for number, episode in enumerate(episodes)]
+        if not read:
+            raise ValueError("episodes: got none, expected at least one")
+        obs, action, reward, terminated = zip(*read, strict=True)
+        steps = max(map(len, reward)) if steps is None else steps
+        for field, values in (("observation", obs), ("action", action)):
+            widths = {value.shape[1:] for value in values}
+            if len(widths) > 1:
+                raise ValueError(f"episodes, {field}: got {len(widths)} widths ({widths}), expected one")
+
+        def padded(values):
+            whole = np.zeros((len(values), steps, *values[0].shape[1:]), np.float32)
+            for row, value in zip(whole, values, strict=True):
+                row[: len(value)] = value[:steps]
+            return whole
+
+        obs, action, score = padded(obs), padded(action), padded(reward)
+        lived = np.array([min(len(value), steps) for value in reward])
+        inside = np.arange(steps) < lived[:, None]
+        finite = np.isfinite(obs).all(-1) & np.isfinite(action).all(-1) & np.isfinite(score)
+        alive = inside & np.logical_and.accumulate(finite, axis=1)
+        return cls(
+            obs=obs,
+            action=action,
+            alive=alive,
+            score=np.where(alive, score, 0.0),
+            fell=np.array([end and len(value) <= steps for end, value in zip(terminated, reward, strict=True)]),
+            not_finite=(inside & ~finite).any(axis=1),
+        )
+
+
+def _read_episode(number: int, episode: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray, np.ndarray, bool]:
+    """Reads observations, actions, rewards and whether it was terminated, and checks that their lengths agree."""
+    keys = ("observation", "action", "reward", "terminated")
+    missing = [key for key in keys if key not in episode]
+    if missing:
+        raise ValueError(f"episode {number}: got {', '.join(episode)}, expected {', '.join(missing)} as well")
+    found = []
+    for key in keys[:3]:
+        value = episode[key]
+        try:
+            array = np.asarray(value, np.float32)
+        except (TypeError, ValueError):
+            raise ValueError(
+                f"episode {number}, {key}: expected one list of numbers a step, all of one width"
+            ) from None
+        found.append(array.reshape(len(array), -1) if key != "reward" else array)
+    obs, action, reward = found
+    if reward.ndim != 1 or len(action) != len(reward) or len(obs) not in (len(reward), len(reward) + 1):
+        raise ValueError(
+            f"episode {number}: got {len(obs)} observations, {len(action)} actions, rewards of shape {reward.shape}; "
+            "expected as many of each (one more observation is allowed)"
+        )
+    return obs[: len(reward)], action, reward, bool(np.any(episode["terminated"]))
 
 
 @chex.dataclass(frozen=True)
@@ -81,7 +155,8 @@ class Verdict(enum.IntEnum):
     RADIUS_EXHAUSTED = 3
     """The measured set is not covered, and the distribution fills its bounds or was widened as often as allowed."""
     NOT_FINITE = 4
-    """No score could be computed: no episode held a whole window, or a number was not finite."""
+    """No score could be computed: no episode held a whole window, a number was not finite, or no simulated observation
+    ever changed."""
 
 
 Scale = Literal[
@@ -126,10 +201,8 @@ class Parameter:
     shape: bool = False
     """True for a parameter that only shapes its effect, such as the speed at which friction falls off. It has no
     influence while the effect's other parameters are zero, and its coordinate starts at zero like theirs."""
-    fields: tuple[str, ...] = ()
-    """Fields of the MuJoCo model that it changes, if it changes any."""
-    column: int | None = None
-    """Column of these fields that it changes; all columns where None."""
+    fields: tuple[str | tuple[str, int], ...] = ()
+    """Fields of the MuJoCo model that it changes, if any: a name for all columns, or (name, column) for one."""
 
     def inner(self, coordinate, scale):
         """Converts a coordinate at a place of this scale into the number that the physics reads.

@@ -15,7 +15,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxtune.types import Trajectory
 
-_MIN_STD = 1e-3  # a channel that is constant in training would otherwise be divided by zero
+MIN_STD = 1e-3
+"""Smallest standard deviation by which a channel is divided: one that is smaller in training counts as constant."""
 
 
 def steps(trajectory: Trajectory) -> Float[Array, "... time channels"]:
@@ -107,7 +108,7 @@ def scaler(values: Float[Array, "... channels"], weight: Float[Array, "... 1"] |
     weight = values.shape[-1] / values.size if weight is None else weight
     mean = jnp.sum(weight * values, axis=axes)
     variance = jnp.sum(weight * (values - mean) ** 2, axis=axes)
-    return Scaler(mean=mean, std=jnp.maximum(jnp.sqrt(variance), _MIN_STD))
+    return Scaler(mean=mean, std=jnp.maximum(jnp.sqrt(variance), MIN_STD))
 
 
 def fit_scaler(trajectory: Trajectory) -> Scaler:

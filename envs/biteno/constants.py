@@ -6,7 +6,6 @@ choice of this project, scaled from the nearest public robot, the point-footed L
 joints).
 """
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -54,56 +53,39 @@ SHAPING = {"clock_contact": -1.0}
 and a half touchdowns a step."""
 
 
-def _mass(name: str, *bodies: str) -> Entry:
+def _mass(*bodies: str) -> Entry:
     # A heavier link of the same shape: its inertia grows in proportion to its mass.
-    return Entry(name=name, kind="body", targets=bodies, fields=("body_mass", "body_inertia"), bounds=(0.2, 5.0))
+    return Entry(kind="body", targets=bodies, fields=("body_mass", "body_inertia"), bounds=(0.2, 5.0))
 
 
-def _joints(name: str, *fields: str, bounds: tuple[float, float]) -> Entry:
-    return Entry(name=name, kind="joint", targets=JOINTS, fields=fields, bounds=bounds)
+def _joints(field: str, bounds: tuple[float, float], log: bool = True) -> Entry:
+    return Entry(kind="joint", targets=JOINTS, fields=(field,), bounds=bounds, log=log)
 
 
 ENTRIES = {
-    entry.name: entry
-    for entry in (
-        Entry(name="foot_friction", kind="geom", targets=FEET, fields=("geom_friction",), column=0, bounds=(0.15, 4.0)),
-        *(_mass(f"{side}_{link}_mass", f"{side}_{link}") for side in SIDES for link in ("abductor", "thigh", "shank")),
-        *(_mass(f"{link}_mass", f"left_{link}", f"right_{link}") for link in ("abductor", "thigh", "shank")),
-        _mass("trunk_mass", "trunk"),
-        *(
-            Entry(
-                name=f"trunk_com_{axis}_m",
-                kind="body",
-                targets=("trunk",),
-                fields=("body_ipos",),
-                column=column,
-                bounds=(-0.08, 0.08),
-                log=False,
-            )
-            for column, axis in enumerate("xyz")
-        ),
-        # Gains and limits alike, so that the torque is a share of the nominal one.
-        Entry(
-            name="torque_scale",
-            kind="actuator",
-            targets=JOINTS,
-            fields=("actuator_gainprm", "actuator_biasprm", "actuator_forcerange"),
-            bounds=(0.3, 2.0),
-        ),
-        _joints("joint_damping", "dof_damping", bounds=(0.1, 10.0)),
-        replace(_joints("joint_friction_nm", "dof_frictionloss", bounds=(0.0, 5.0)), log=False),
-        _joints("joint_armature", "dof_armature", bounds=(0.2, 5.0)),
-        Entry(
-            name="contact_time_constant",
-            kind="geom",
-            targets=FEET,
-            fields=("geom_solref",),
-            column=0,
-            bounds=(0.5, 4.0),
-        ),
-        # Time for which the joints still follow the previous target.
-        Entry(name="action_delay_s", kind="control", targets=(), fields=(), bounds=(0.0, POLICY_DT_S), log=False),
-    )
+    "foot_friction": Entry(kind="geom", targets=FEET, fields=(("geom_friction", 0),), bounds=(0.15, 4.0)),
+    **{f"{side}_{link}_mass": _mass(f"{side}_{link}") for side in SIDES for link in ("abductor", "thigh", "shank")},
+    **{f"{link}_mass": _mass(f"left_{link}", f"right_{link}") for link in ("abductor", "thigh", "shank")},
+    "trunk_mass": _mass("trunk"),
+    **{
+        f"trunk_com_{axis}_m": Entry(
+            kind="body", targets=("trunk",), fields=(("body_ipos", column),), bounds=(-0.08, 0.08), log=False
+        )
+        for column, axis in enumerate("xyz")
+    },
+    # Gains and limits alike, so that the torque is a share of the nominal one.
+    "torque_scale": Entry(
+        kind="actuator",
+        targets=JOINTS,
+        fields=("actuator_gainprm", "actuator_biasprm", "actuator_forcerange"),
+        bounds=(0.3, 2.0),
+    ),
+    "joint_damping": _joints("dof_damping", (0.1, 10.0)),
+    "joint_friction_nm": _joints("dof_frictionloss", (0.0, 5.0), log=False),
+    "joint_armature": _joints("dof_armature", (0.2, 5.0)),
+    "contact_time_constant": Entry(kind="geom", targets=FEET, fields=(("geom_solref", 0),), bounds=(0.5, 4.0)),
+    # Time for which the joints still follow the previous target.
+    "action_delay_s": Entry(kind="control", targets=(), fields=(), bounds=(0.0, POLICY_DT_S), log=False),
 }
 """Every parameter that can be tuned, by name. Those whose name ends in a unit are added to the nominal value; the
 others multiply it."""

@@ -83,9 +83,9 @@ class Biteno:
     def _prepare(self, model: mujoco.MjModel) -> None:
         """Prepares a model before it is put on the device, since MJX fixes then which constraints it will solve."""
         for entry in self.entries.values():
-            if "dof_frictionloss" in entry.fields:
+            if "dof_frictionloss" in entry.field_names:
                 # MJX solves for friction only in joints that had some when the model was put on the device.
-                rows = entry.rows(model)
+                rows, _ = entry.rows(model, "dof_frictionloss")
                 model.dof_frictionloss[rows] = np.maximum(model.dof_frictionloss[rows], MIN_FRICTION_NM)
         if (model.dof_frictionloss > 0).any():
             # Dry friction takes twice the iterations: at 2 Nm three are off by 2e-4 rad after 10 ms, six by nothing.

@@ -12,10 +12,8 @@ import jax.numpy as jnp
 
 from envs.biteno import Biteno
 from envs.targets.protocol import Act, Commands, Recording, watch
-from jaxtune.mjx import parameters
+from jaxtune.mjx import in_chunks, parameters
 from jaxtune.types import Coords, Trajectory
-
-_CHUNK = 256  # small batches are fastest on a CPU; larger ones are simulated in turn
 
 
 def rollout(
@@ -46,18 +44,9 @@ def rollout(
     # Without the barrier the compiler would fold constant parameters into every derived field of every model, and take
     # minutes.
     params = jax.lax.optimization_barrier(dict(params))
-    count = next(iter(params.values())).shape[0]
-    episode = jax.vmap(lambda *drawn: _episode(robot, act, steps, watch, *drawn))
-    inputs = (jax.random.split(key, count), params) + (() if commands is None else (commands,))
-    if count <= _CHUNK:
-        return episode(*inputs)
-    # Chunks of equal size need one compilation; the last one is filled up with repetitions.
-    chunks = -(-count // _CHUNK)
-    size = -(-count // chunks)
-    fill = jnp.arange(chunks * size) % count
-    inputs = jax.tree.map(lambda x: x[fill].reshape(chunks, size, *x.shape[1:]), inputs)
-    stacked = jax.lax.map(lambda item: episode(*item), inputs)
-    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:count], stacked)
+    keys = jax.random.split(key, next(iter(params.values())).shape[0])
+    inputs = (keys, params) + (() if commands is None else (commands,))
+    return in_chunks(lambda *drawn: _episode(robot, act, steps, watch, *drawn), inputs)
 
 
 def _episode(robot, act, steps, watch, key, params, commands=None) -> tuple[Trajectory, Any]:

@@ -83,12 +83,7 @@ class Learner:
         Returns:
           The distribution in coordinates, which is what the tuner searches.
         """
-        ends = [{name: entry.bounds[end] for name, entry in self.entries.items()} for end in (0, 1)]
-        middle, lower, upper = (
-            {name: float(value) for name, value in parameters.to_coords(self.entries, side).items()}
-            for side in (centre, *ends)
-        )
-        return dists.make(middle, radius, lower, upper)
+        return parameters.distribution(self.entries, radius, centre)
 
     def init(self, key: jax.Array, ppo: PPOState | None = None) -> Policy:
         """Starts a policy on freshly reset training robots.

@@ -1,12 +1,16 @@
-"""Physical parameters of MuJoCo and MJX models: which may be wrong, and the model that has other values of them.
+"""Physical parameters of MuJoCo and MJX models, and simulated episodes of environments that have other values of them.
 
-A user writes a table of `Entry` rows, one for every parameter (say the mass of both shanks), and calls `apply` with new
-values. `apply` changes the fields of an `mjx.Model` inside `jit`, `vmap` or `grad`, and recomputes the fields that
+A table says which parameters may be wrong (say the mass of both shanks): an `Entry` for each, of which `mass`, `field`,
+`strength`, `friction` and `action_delay` make the usual ones. `Simulator` takes an environment and such a table, and
+gives `jaxtune.tuner` all that it needs:
+
+    sim = Simulator(env, steps=150, parameters={"torso": mass("torso", bounds=(0.4, 2.5))})
+    machine = Tuner(config=TunerConfig(), train_policy=tuner.keep, simulate=sim.simulate(act))
+
+Beneath it, `apply` changes the fields of an `mjx.Model` inside `jit`, `vmap` or `grad`, and recomputes the fields that
 depend on them (`set_const` lists them; tendons, cameras and lights stay as they were). `apply_mujoco` does the same to
 a model of MuJoCo C. `to_coords` and `from_coords` translate between physical values (`Params`) and the coordinates that
-`jaxtune.tuner` searches (`Coords`).
-
-    model = apply(mjx.put_model(mujoco_model), {"shank_mass": 1.2}, table)
+the tuner searches (`Coords`).
 
 This package is the only one in jaxtune that imports MuJoCo; the tuner does without it.
 """
@@ -17,10 +21,35 @@ from jaxtune.mjx.parameters import (
     Params,
     apply,
     apply_mujoco,
+    check,
+    distribution,
     from_coords,
     nominal,
     select,
     to_coords,
 )
+from jaxtune.mjx.rows import action_delay, field, friction, mass, parameters_of, strength
+from jaxtune.mjx.simulator import Simulator, in_chunks, with_model
 
-__all__ = ["Entry", "Params", "apply", "apply_mujoco", "from_coords", "nominal", "select", "set_const", "to_coords"]
+__all__ = [
+    "Entry",
+    "Params",
+    "Simulator",
+    "action_delay",
+    "apply",
+    "apply_mujoco",
+    "check",
+    "distribution",
+    "field",
+    "friction",
+    "from_coords",
+    "in_chunks",
+    "mass",
+    "nominal",
+    "parameters_of",
+    "select",
+    "set_const",
+    "strength",
+    "to_coords",
+    "with_model",
+]

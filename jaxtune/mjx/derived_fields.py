@@ -10,6 +10,8 @@ import jax.numpy as jnp
 import mujoco
 from mujoco import mjx
 
+DERIVED = ("body_subtreemass", "body_invweight0", "dof_M0", "dof_invweight0", "actuator_acc0", "stat.meaninertia")
+"""Fields that `set_const` recomputes."""
 _MIN_VALUE = mujoco.mjMINVAL
 
 
@@ -37,7 +39,11 @@ def set_const(model: mjx.Model) -> mjx.Model:
     Returns:
       The same model with these six fields replaced. In single precision they differ from `mj_setConst`'s by a relative
       2e-6 at most.
+
+    Raises:
+      ValueError: the model is not of MJX's JAX implementation, the only one that has these stages.
     """
+    check_implementation(model)
     # Where the default precision of products is a shortened one (on GPUs), weights would be off by a thousandth.
     with jax.default_matmul_precision("highest"):
         model = model.replace(body_subtreemass=_subtree_mass(model))
@@ -54,6 +60,19 @@ def set_const(model: mjx.Model) -> mjx.Model:
             dof_invweight0=_dof_weight(model, inverse),
             actuator_acc0=jnp.linalg.norm(data._impl.actuator_moment @ inverse, axis=-1),
             stat=model.stat.replace(meaninertia=diagonal.mean()),
+        )
+
+
+def check_implementation(model: mjx.Model) -> None:
+    """Checks that a model is of the implementation whose stages JAX can trace.
+
+    Raises:
+      ValueError: it is not.
+    """
+    if model.impl != mjx.Impl.JAX:
+        raise ValueError(
+            f"model, impl: got '{model.impl.value}', expected 'jax'; make it with mjx.put_model(model, impl='jax') "
+            "(in MuJoCo Playground: config_overrides={'impl': 'jax'})"
         )
 
 

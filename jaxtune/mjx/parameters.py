@@ -6,6 +6,7 @@ all fields that depend on them. `apply_mujoco` does it for MuJoCo C.
 """
 
 import copy
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -16,8 +17,9 @@ import mujoco
 import numpy as np
 from mujoco import mjx
 
-from jaxtune.mjx.derived_fields import set_const
-from jaxtune.types import Coords
+from jaxtune import dist as dists
+from jaxtune.mjx.derived_fields import check_implementation, set_const
+from jaxtune.types import Coords, ParamDist
 
 Params = Mapping[str, jax.Array]
 """Physical values by name: a multiplier of the nominal model for a logarithmic entry, an offset for a linear one.
@@ -31,58 +33,163 @@ _OBJECTS = {
     "joint": mujoco.mjtObj.mjOBJ_JOINT,
     "actuator": mujoco.mjtObj.mjOBJ_ACTUATOR,
 }
+_COUNTS = {"body": "nbody", "geom": "ngeom", "joint": "njnt", "actuator": "nu"}
+_PREFIXES = {
+    "body": ("body_",),
+    "geom": ("geom_", "pair_"),
+    "joint": ("jnt_", "dof_"),
+    "actuator": ("actuator_",),
+    "control": (),
+}
+"""How the fields begin that have rows for objects of a kind."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Entry:
     """Describes one parameter: which fields of which objects of the model share its value, and within which bounds.
 
-    It is a row of the table that `apply` reads. Entries that share a field are applied one after the other, so that
-    two multipliers of one field multiply.
+    It is a row of the table that `apply` reads; the table maps the parameter's name to it. `jaxtune.mjx.rows` makes the
+    usual ones. Entries that share a field are applied one after the other, so that two multipliers of one field
+    multiply.
 
-        mass = Entry(name="shank_mass", kind="body", targets=("left_shank", "right_shank"),
-                     fields=("body_mass", "body_inertia"), bounds=(0.5, 2.0))
+        table = {"shank_mass": Entry(kind="body", targets=("left_shank", "right_shank"),
+                                     fields=("body_mass", "body_inertia"), bounds=(0.5, 2.0))}
     """
 
-    name: str
     kind: Literal["body", "geom", "joint", "actuator", "control"]
     """What the targets are. A `control` parameter, such as a delay of the controller, is not part of the model. It has
     neither targets nor fields, so `apply` ignores it, and the code that simulates the controller reads it."""
-    targets: tuple[str, ...]
-    """Names of the objects that share this value."""
-    fields: tuple[str, ...]
-    """Fields of `mjx.Model` that the value enters. Those of a joint must have one row per degree of freedom, such as
-    `dof_damping`; of a ball or free joint only the first row is changed."""
+    targets: tuple[str, ...] | None
+    """Names of the objects that share this value; None for all of the kind. An actuator may also be named by the joint
+    that it drives."""
+    fields: tuple[str | tuple[str, int], ...]
+    """Fields of `mjx.Model` that the value enters: a name for all columns of the field, or (name, column) for one of
+    them. The stiffness of position servos is `(("actuator_gainprm", 0), ("actuator_biasprm", 1))`. Fields of a joint
+    have rows by joint (`jnt_stiffness`) or by degree of freedom (`dof_damping`); all those of the joint are changed.
+    Fields of a contact pair (`pair_friction`) are changed where a target is one of its two geoms."""
     bounds: tuple[float, float]
     """Smallest and largest physical value. `apply` does not check them: they bound the distribution that is
     searched."""
-    column: int | None = None
-    """Which column of the fields (the first of `geom_friction` is sliding friction); all of them where None."""
     log: bool = True
-    """True: the value multiplies the nominal one and its logarithm is searched. False: it is added, and searched as it
-    is."""
+    """True: the value multiplies the nominal one and its logarithm is searched. False: it is added, and searched in
+    units of half the width of its bounds."""
 
-    def rows(self, model: mjx.Model | mujoco.MjModel) -> np.ndarray:
-        """Finds the rows of the fields that belong to the targets.
+    def __post_init__(self) -> None:
+        """Checks the row before anything is compiled.
 
-        Args:
-          model: in which the targets are looked up by name.
+        Raises:
+          ValueError: a target has no name or stands there twice, a field belongs to another kind of object, or the
+            bounds are not ascending (above zero for a multiplier).
+        """
+        targets = self.targets or ()
+        if "" in targets or len(set(targets)) < len(targets):
+            raise ValueError(
+                f"targets: got {targets}, expected distinct names; an object without one must get one in the model"
+            )
+        for name in self.field_names:
+            prefixes = _PREFIXES[self.kind]
+            if not name.startswith(prefixes):
+                expected = f"fields of a {self.kind}, which begin with {' or '.join(prefixes)}" if prefixes else "none"
+                raise ValueError(f"fields: got '{name}', expected {expected}")
+        low, high = self.bounds
+        if not low < high or (self.log and low <= 0):
+            expected = "ascending ones, above zero for a multiplier" if self.log else "ascending ones"
+            raise ValueError(f"bounds: got {self.bounds}, expected {expected}")
+
+    def check(self, model: mjx.Model) -> None:
+        """Checks that the value can change this model.
+
+        Raises:
+          ValueError: the model has no such target, field or column; a multiplier meets zeros alone; or friction is
+            added to a joint for which MJX does not solve it.
+        """
+        met = []
+        for field in self.fields:
+            name, *column = (field,) if isinstance(field, str) else field
+            array = getattr(model, name, None)
+            if not hasattr(array, "shape"):
+                raise ValueError(f"fields: got '{name}', which mjx.Model does not have")
+            if column and not (array.ndim == 2 and 0 <= column[0] < array.shape[1]):
+                raise ValueError(f"column: got {column[0]} of '{name}', which has {math.prod(array.shape[1:])}")
+            rows, _ = self.rows(model, name)
+            met.append(np.asarray(array)[(rows, *column)])
+            if name == "dof_frictionloss" and not self.log and not met[-1].all():
+                raise ValueError(
+                    "fields: MJX solves for dof_frictionloss only in joints that had some when the model was put on "
+                    "the device; give all of these joints 1e-6 in the MuJoCo model, and put it there again"
+                )
+        if self.log and met and not any(values.any() for values in met):
+            raise ValueError(
+                f"{' and '.join(self.field_names)}: zero for {', '.join(self.targets or ['all'])}, so a multiplier "
+                "changes nothing; add to it (offset=True)"
+            )
+
+    @property
+    def field_names(self) -> tuple[str, ...]:
+        """Names of the fields, without their columns."""
+        return tuple(field if isinstance(field, str) else field[0] for field in self.fields)
+
+    @property
+    def unit(self) -> float:
+        """Physical size of one coordinate: one for a multiplier, else half the width of the bounds."""
+        return 1.0 if self.log else (self.bounds[1] - self.bounds[0]) / 2
+
+    def ids(self, model: mjx.Model | mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
+        """Finds the targets in a model.
 
         Returns:
-          [targets] indices: ids of bodies, geoms or actuators; of a joint the address of its first degree of freedom.
+          [objects] ids, and [objects] which of the targets each belongs to: a joint may have several actuators.
 
         Raises:
           ValueError: the model has no object of that kind and name.
         """
-        ids = []
-        for target in self.targets:
-            index = mjx.name2id(model, _OBJECTS[self.kind], target)
-            if index < 0:
-                raise ValueError(f"parameter '{self.name}': got {self.kind} '{target}', which the model does not have")
-            ids.append(index)
-        ids = np.array(ids)
-        # Damping, armature and friction of a joint are stored by degree of freedom.
-        return model.jnt_dofadr[ids] if self.kind == "joint" else ids
+        count = getattr(model, _COUNTS[self.kind]) if self.kind in _COUNTS else 0
+        if self.targets is None:
+            return np.arange(count), np.zeros(count, int)
+        found = [self._find(model, target) for target in self.targets]
+        owner = [number for number, ids in enumerate(found) for _ in ids]
+        return np.concatenate([*found, []]).astype(int), np.array(owner, int)
+
+    def _find(self, model, target: str) -> np.ndarray:
+        index = mjx.name2id(model, _OBJECTS[self.kind], target)
+        if index >= 0:
+            return np.array([index])
+        if self.kind == "actuator":
+            drives = np.isin(model.actuator_trntype, (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT))
+            joint = mjx.name2id(model, mujoco.mjtObj.mjOBJ_JOINT, target)
+            drives &= (np.asarray(model.actuator_trnid)[:, 0] == joint) & (joint >= 0)
+            if drives.any():
+                return np.flatnonzero(drives)
+        named = [
+            mjx.id2name(model, _OBJECTS[self.kind], number) for number in range(getattr(model, _COUNTS[self.kind]))
+        ]
+        raise ValueError(
+            f"targets: got {self.kind} '{target}', which the model does not have; expected some of "
+            f"{', '.join(filter(None, named))}"
+        )
+
+    def rows(self, model: mjx.Model | mujoco.MjModel, field: str) -> tuple[np.ndarray, np.ndarray]:
+        """Finds the rows of a field that belong to the targets.
+
+        Args:
+          model: in which the targets are looked up by name.
+          field: name of a field.
+
+        Returns:
+          [rows] indices into the field, and [rows] which of the targets each belongs to.
+
+        Raises:
+          ValueError: the model has no object of that kind and name.
+        """
+        ids, owner = self.ids(model)
+        if field.startswith("dof_"):
+            holds = np.asarray(model.dof_jntid)[:, None] == ids
+        elif field.startswith("pair_"):
+            holds = (np.asarray(model.pair_geom1)[:, None] == ids) | (np.asarray(model.pair_geom2)[:, None] == ids)
+        else:
+            return ids, owner
+        rows = np.flatnonzero(holds.any(axis=1))
+        return rows, owner[holds[rows].argmax(axis=1)]
 
 
 def select(entries: Mapping[str, Entry], names: Sequence[str]) -> dict[str, Entry]:
@@ -99,6 +206,52 @@ def select(entries: Mapping[str, Entry], names: Sequence[str]) -> dict[str, Entr
     return {name: entries[name] for name in names}
 
 
+def check(model: mjx.Model, entries: Mapping[str, Entry]) -> None:
+    """Checks that every parameter of a table can change a model (`Entry.check`).
+
+    Raises:
+      ValueError: one cannot, or the model is of another implementation than JAX's.
+    """
+    check_implementation(model)
+    for name, entry in entries.items():
+        try:
+            entry.check(model)
+        except ValueError as error:
+            raise ValueError(f"parameter '{name}', {error}") from None
+
+
+def distribution(entries: Mapping[str, Entry], radius: float, centre: Params) -> ParamDist:
+    """Makes the distribution over a table that a search begins with, bounded by the table's bounds.
+
+    Args:
+      entries: the table.
+      radius: half width in coordinates, the same for every parameter.
+      centre: physical values by name; those that are left out are nominal.
+
+    Raises:
+      ValueError: a name is not in the table, a value is out of bounds, or the radius is not positive.
+    """
+    check_values(entries, centre)
+    ends = ({name: entry.bounds[end] for name, entry in entries.items()} for end in (0, 1))
+    middle, lower, upper = (
+        {name: float(value) for name, value in to_coords(entries, values).items()}
+        for values in (nominal(entries) | dict(centre), *ends)
+    )
+    return dists.make(middle, radius, lower, upper)
+
+
+def check_values(entries: Mapping[str, Entry], params: Params) -> None:
+    """Checks physical values by name against a table.
+
+    Raises:
+      ValueError: a name is not in the table, or a value is out of bounds.
+    """
+    for name, entry in select(entries, tuple(params)).items():
+        low, high = entry.bounds
+        if not low <= params[name] <= high:
+            raise ValueError(f"parameter '{name}': got {params[name]}, expected {low:g} to {high:g}")
+
+
 def nominal(entries: Mapping[str, Entry]) -> dict[str, float]:
     """Returns the values that leave a model as it is: 1 for a multiplier, 0 for an offset.
 
@@ -111,7 +264,8 @@ def to_coords(entries: Mapping[str, Entry], params: Params) -> dict[str, jax.Arr
     """Translates physical values into the coordinates that are searched.
 
     A multiplier becomes its logarithm, so that half and double are equally far from nominal (coordinate 0); an offset
-    stays as it is. `jaxtune.tuner` and its models see coordinates alone.
+    is divided by half the width of its bounds, so that coordinates of all parameters are of order one. `jaxtune.tuner`
+    and its models see coordinates alone.
 
     Args:
       entries: the table; it may have more rows than there are values.
@@ -120,7 +274,10 @@ def to_coords(entries: Mapping[str, Entry], params: Params) -> dict[str, jax.Arr
     Returns:
       Coordinates by name, of the same shapes.
     """
-    return {name: jnp.log(value) if entries[name].log else jnp.asarray(value) for name, value in params.items()}
+    return {
+        name: jnp.log(value) if entries[name].log else jnp.asarray(value) / entries[name].unit
+        for name, value in params.items()
+    }
 
 
 def from_coords(entries: Mapping[str, Entry], coords: Coords) -> dict[str, jax.Array]:
@@ -135,7 +292,10 @@ def from_coords(entries: Mapping[str, Entry], coords: Coords) -> dict[str, jax.A
     Returns:
       Physical values by name, of the same shapes.
     """
-    return {name: jnp.exp(value) if entries[name].log else jnp.asarray(value) for name, value in coords.items()}
+    return {
+        name: jnp.exp(value) if entries[name].log else jnp.asarray(value) * entries[name].unit
+        for name, value in coords.items()
+    }
 
 
 def apply(model: mjx.Model, params: Params, entries: Mapping[str, Entry]) -> mjx.Model:
@@ -158,10 +318,10 @@ def apply(model: mjx.Model, params: Params, entries: Mapping[str, Entry]) -> mjx
     for field, index, entry, value in _cells(model, params, entries):
         # An earlier entry may have changed the same field.
         array = fields.get(field, getattr(model, field))
-        # One value per target must broadcast over the columns of its row.
-        columns = (1,) * (array.ndim - 1 if entry.column is None else 0)
-        cell, value = array.at[index], jnp.reshape(value, (*jnp.shape(value), *columns))
-        fields[field] = cell.multiply(value) if entry.log else cell.add(value)
+        cells = array.at[index]
+        # One value per row must broadcast over the columns of its row.
+        value = jnp.reshape(value, (*jnp.shape(value), *(1,) * (cells.get().ndim - 1)))
+        fields[field] = cells.multiply(value) if entry.log else cells.add(value)
     return set_const(model.tree_replace(fields))
 
 
@@ -191,8 +351,16 @@ def apply_mujoco(model: mujoco.MjModel, params: Params, entries: Mapping[str, En
 
 
 def _cells(model, params, entries):
-    """Yields every field that a parameter enters, the index of its cells there, its entry and its value."""
+    """Yields every field that a parameter enters, the index of its cells there, its entry and its values.
+
+    The values are a scalar, or one per row where the parameter has one per target.
+    """
     for name, entry in select(entries, tuple(params)).items():
-        rows = entry.rows(model)
         for field in entry.fields:
-            yield field, rows if entry.column is None else (rows, entry.column), entry, params[name]
+            field, *column = (field,) if isinstance(field, str) else field
+            try:
+                rows, owner = entry.rows(model, field)
+            except ValueError as error:
+                raise ValueError(f"parameter '{name}', {error}") from None
+            value = params[name]
+            yield field, (rows, *column), entry, jnp.asarray(value)[owner] if np.ndim(value) else value

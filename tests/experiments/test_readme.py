@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text()
 PAGES = [Path("README.md")]
 for _top in ("jaxtune", "envs", "experiments"):
-    PAGES += sorted(page.relative_to(ROOT) for page in (ROOT / _top).rglob("README.md"))
+    PAGES += sorted(page.relative_to(ROOT) for page in (ROOT / _top).rglob("*.md"))
 MOST_LINES, MOST_WORDS = 180, 30
 _RESULTS = ROOT / "experiments" / "results"
 _NOT_PROSE = re.compile(r"^(#|\||!\[|<)")  # headings, tables, pictures, markup

@@ -430,6 +430,19 @@ def test_a_living_step_that_is_not_finite_leaves_no_score(gate):
     assert np.isfinite(score.novelty[1:]).all()
 
 
+def test_observations_that_never_change_leave_no_score():
+    dist = toys.uniform(TWO, 0.2)
+    collected = toys.collect(jax.random.key(0), dist, toys.TINY)
+
+    def blind(episodes):
+        return episodes.replace(obs=jnp.full_like(episodes.obs, 0.3))
+
+    collected = collected.replace(trajectory=blind(collected.trajectory), held_out=blind(collected.held_out))
+    measured = blind(SLIDER.measure(TWO, 2)(jax.random.key(1), toys.policy()))
+    score = tuners.calibrated_gate(jax.random.key(2), toys.TINY, collected, measured, knobs())
+    assert np.isnan(score.novelty)
+
+
 def test_a_set_without_a_window_has_no_score(gate):
     sets = stacked({})
     score = gate(sets.replace(alive=sets.alive.at[0, :, 30:].set(False)))
@@ -453,6 +466,107 @@ def test_a_fixed_threshold_replaces_the_calibrated_one(gate):
     np.testing.assert_array_equal(fixed.p_value, calibrated.p_value)
     median = gate(stacked({}), level=0.5)
     assert np.all(median.threshold < calibrated.threshold)
+
+
+# In words ----------------------------------------------------------------------------------------------------------
+
+
+def test_an_accepted_set_is_explained_with_what_moved(play):
+    _, state, info = play(0.5)
+    text = tuners.explain(info)
+    assert text.startswith("accept after 1 gate call(s): The simulator covers what was measured")
+    assert "novelty 0.500, threshold 1.000" in text
+    # Half a radius of 0.2, give or take an eighth of it.
+    assert "mass: 0.000 -> 0.100 +- 0.025" in text
+    assert state.dist.centre["mass"] == pytest.approx(0.1)
+
+
+def test_a_set_that_was_not_accepted_is_explained_without_movements(play):
+    text = tuners.explain(play(3.0, 3.0, 3.0)[2])
+    assert text.startswith("unexplained after 3 gate call(s): ")
+    assert "->" not in text
+    assert "Do not trust the parameters." in text
+
+
+def test_a_parameter_that_the_episodes_do_not_show_is_said_so(play):
+    info = play(0.5)[2]
+    info = info.replace(update=info.update.replace(identifiable=jnp.array([True, False])))
+    assert "mass: 0.000, not identifiable from these episodes" in tuners.explain(info)
+
+
+def test_keep_leaves_the_policy():
+    assert tuners.keep(jax.random.key(0), {"weights": 1.0}, None) == ({"weights": 1.0}, {})
+
+
+# Shapes of what a user's functions return --------------------------------------------------------------------------
+
+
+def without_tracing(*_):
+    raise AssertionError("a gate was reached")
+
+
+@pytest.fixture(scope="module")
+def refuse():
+    """Runs a tuning with functions that return wrong shapes; nothing may be compiled before it is refused."""
+
+    def run(simulated=lambda episodes: episodes, measured=lambda episodes: episodes):
+        tuner = Tuner(
+            config=toys.TINY,
+            train_policy=toys.train_policy,
+            simulate=lambda *args: simulated(SLIDER.simulate(*args)),
+            verify=without_tracing,
+        )
+        state = tuner.init(toys.policy(), toys.uniform(TWO), knobs())
+        tuner.tune(jax.random.key(1), state, measured(SLIDER.measure(TWO, 2)(jax.random.key(0), toys.policy())))
+
+    return run
+
+
+def cut(steps):
+    return lambda episodes: episodes.replace(
+        **{field: getattr(episodes, field)[:, :steps] for field in ("obs", "action", "alive", "score")}
+    )
+
+
+def doubled(episodes):
+    return jax.tree.map(lambda leaf: jnp.concatenate([leaf, leaf]), episodes)
+
+
+def by_key(episodes):
+    return episodes.replace(obs={"policy": episodes.obs, "privileged": episodes.obs})
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (doubled, r"measured, alive: got shape \(4, 60\), expected 2 episodes \(TunerConfig.set_episodes\) by time"),
+        (cut(55), "measured: got episodes of 55 steps, expected 60, as simulated"),
+        (by_key, "measured, obs: got a dict of policy, privileged, expected one array"),
+        (lambda it: it.replace(obs=it.obs[..., :1]), "measured, obs: got 1 numbers a step, expected 2, as simulated"),
+        (lambda it: it.replace(action=it.action[..., 0]), r"measured, action: got shape \(2, 60\)"),
+        (lambda it: it.replace(fell=it.alive), r"measured, fell: got shape \(2, 60\), expected \(2,\)"),
+    ],
+)
+def test_a_measured_set_of_another_shape_is_refused(refuse, wrong, message):
+    with pytest.raises(ValueError, match=message):
+        refuse(measured=wrong)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (cut(40), r"simulate: got episodes of 40 steps, expected at least 50, the length of a window"),
+        (doubled, r"simulate, alive: got shape \(32, 60\), expected 16 episodes \(one per draw of the coordinates\)"),
+        (by_key, "simulate, obs: got a dict of policy, privileged, expected one array"),
+        (
+            lambda it: it.replace(score=it.score[..., None]),
+            r"simulate, score: got shape \(16, 60, 1\), expected \(16, 60\)",
+        ),
+    ],
+)
+def test_simulated_episodes_of_another_shape_are_refused(refuse, wrong, message):
+    with pytest.raises(ValueError, match=message):
+        refuse(simulated=wrong)
 
 
 # The updates on the slider -----------------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ import reference
 from envs.biteno.constants import ENTRIES
 from envs.targets import mjx
 from envs.targets.mjx import MjxTarget
-from jaxtune.mjx import Entry
+from jaxtune.mjx import Entry, to_coords
 
 NEVER = 99
 
@@ -110,7 +110,7 @@ def test_chunks_change_nothing(monkeypatch, count):
     chunked = mjx.rollout(Script(), jax.random.key(1), act, params, 8)[0]
     assert chunked.fell.shape == (count,)
     assert chunked.obs.shape == (count, 8, 2)
-    monkeypatch.setattr(mjx, "_CHUNK", count)
+    monkeypatch.setattr("jaxtune.mjx.simulator._CHUNK", count)
     whole = mjx.rollout(Script(), jax.random.key(1), act, params, 8)[0]
     for got, expected in zip(jax.tree.leaves(chunked), jax.tree.leaves(whole), strict=True):
         np.testing.assert_array_equal(got, expected)
@@ -119,15 +119,16 @@ def test_chunks_change_nothing(monkeypatch, count):
 
 
 def test_simulate_takes_search_coordinates():
-    table = {"kind": "body", "targets": (), "fields": (), "bounds": (0.0, 100.0)}
+    table = {"kind": "body", "targets": (), "fields": (), "bounds": (0.1, 100.0)}
     robot = Script(
         entries={
-            "pay": Entry(name="pay", **table),
-            **{name: Entry(name=name, log=False, **table) for name in ("falls", "breaks")},
+            "pay": Entry(**table),
+            **{name: Entry(log=False, **table) for name in ("falls", "breaks")},
         }
     )
     params = scripted(3, falls=2.0, pay=jnp.array([1.0, 2.0, 4.0]))
-    coordinates = {**params, "pay": jnp.log(params["pay"])}
+    coordinates = to_coords(robot.entries, params)
+    np.testing.assert_allclose(coordinates["pay"], jnp.log(params["pay"]))
     played = mjx.simulate(robot, jax.random.key(2), act, coordinates, 3)
     # 1 for the first step and 2 for the second, and the pay for each of them.
     np.testing.assert_allclose(played.score, [[2.0, 3.0, 0.0], [3.0, 4.0, 0.0], [5.0, 6.0, 0.0]], rtol=1e-6)

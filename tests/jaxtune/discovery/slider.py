@@ -92,7 +92,12 @@ DIRECTION = replace(HYPOTHESES[3], name="coulomb", family="friction", form="dire
 WARPED = replace(hypothesis("cubic", (0.0, 30.0), [1.0, 10.0]), name="coulomb", form="warped")
 
 
-def problem(truth, seed=0, hypotheses=HYPOTHESES, forms=()):
+# Stands for a learned torque, which explains what no hypothesis does.
+LEARNED = hypothesis("cubic", (-30.0, 30.0), [1.0])
+
+
+def problem(truth, seed=0, hypotheses=HYPOTHESES, forms=(), residual=None, sealed=None):
+    truths = {"train": truth, "select": truth, "sealed": truth if sealed is None else sealed}
     prior = np.array([0.1, 0.1, 0.0, 0.0, 0.0, 0.0, 0.0])
     # Nobody knows the nominal parameters better than to a tenth.
     drawn = [{"mass": 0.1 * m, "damping": 0.1 * d} for m, d in DRAWS]
@@ -112,10 +117,11 @@ def problem(truth, seed=0, hypotheses=HYPOTHESES, forms=()):
         unknown_bounds=np.zeros((0, 2)),
         trees=np.array([0]),
         axis_trees=np.zeros(len(AXES), int),
-        data={split: measured(truth, 10 * seed + i, i) for i, split in enumerate(splits)},
+        data={split: measured(one, 10 * seed + i, i) for i, (split, one) in enumerate(truths.items())},
         null_logs=null_logs,
         bin_rows=2,
         regimes=("steady",),
         components={"q": ("slider",), "dq": ("slider",)},
         push={"slider": AXES.index("push")},
+        residual=residual,
     )

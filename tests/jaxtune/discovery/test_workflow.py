@@ -5,11 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from slider import AXES, DIRECTION, HYPOTHESES, WARPED, WILD, problem
+from slider import AXES, DIRECTION, HYPOTHESES, LEARNED, WARPED, WILD, problem
 
 from jaxtune.discovery import noise_floor, state, step, workflow
-from jaxtune.discovery.conclude import explained
-from jaxtune.discovery.result import Settings
+from jaxtune.discovery.conclude import explained, with_refinements
+from jaxtune.discovery.decide import Evidence
+from jaxtune.discovery.prove import is_worse
+from jaxtune.discovery.result import AcceptedTerm, Settings
 from jaxtune.discovery.screen import Lead
 
 
@@ -26,9 +28,9 @@ def test_hidden_friction_is_named_with_its_size():
     assert result.verdict == "named"
     assert [term.hypothesis.name for term in result.terms] == ["coulomb"]
     axis = AXES.index("coulomb")
-    error = result.errors[-1]
-    assert abs(result.fit.vector[axis] - 0.5) < max(4 * error, 0.02)
-    assert error < 0.05
+    assert abs(result.fit.vector[axis] - 0.5) < 0.02
+    # Its form may be off by 8 %, beside which noise is small.
+    assert 0.04 < result.errors[-1] < 0.05
     # Nominal parameters were found beside it: a tenth of a prior deviation is 0.01.
     assert result.fit.vector[0] == pytest.approx(0.08, abs=0.03)
     assert result.gap["after"] < 1.3 < result.gap["null"] < result.gap["before"]
@@ -41,6 +43,7 @@ def test_nothing_is_named_where_nothing_is_hidden(seed):
     assert result.verdict == "no_missing_effect"
     assert not result.terms
     assert not result.changed
+    assert result.model_is == "null"
 
 
 def test_a_parameter_far_from_its_prior_is_a_change_and_not_an_effect():
@@ -55,6 +58,31 @@ def test_two_effects_are_named_one_after_the_other():
     assert {term.hypothesis.name for term in result.terms} == {"coulomb", "push"}
     assert result.proof["others"]["without push@slider"] > result.gap["after"] + 1.0
     assert result.proof["others"]["without coulomb@slider"] > result.gap["after"] + 1.0
+
+
+def test_a_weak_effect_beside_a_strong_one_at_the_same_joint_stays_in_the_model_but_is_not_named():
+    result = discover({"coulomb": 1.2, "push": 0.1})
+    assert result.verdict == "named"
+    assert [(term.hypothesis.name, term.refines) for term in result.terms] == [
+        ("coulomb", None),
+        ("push", "coulomb@slider"),
+    ]
+    assert result.fit.vector[AXES.index("push")] == pytest.approx(0.1, abs=0.03)
+    assert result.gap["after"] < 1.3
+
+
+@pytest.mark.parametrize(
+    ("joints", "gain", "refines"),
+    [((1,), 49.0, "coulomb@slider"), ((1,), 51.0, None), ((0,), 49.0, None), ((0, 1), 49.0, None), ((), 49.0, None)],
+)
+def test_an_effect_refines_a_stronger_one_only_where_it_acts_at_no_other_joint(joints, gain, refines):
+    coulomb, push = (next(one for one in HYPOTHESES if one.name == name) for name in ("coulomb", "push"))
+    evidence = Evidence(
+        gain=100.0, confirmed=9.0, floors=2.0, left=1.0, relief=0.0, interval=(1.0, 2.0), inside=True, horizons=3
+    )
+    strong = AcceptedTerm(replace(coulomb, joints=(1, 2)), evidence, None)
+    weak = AcceptedTerm(replace(push, joints=joints), replace(evidence, gain=gain), None)
+    assert [term.refines for term in with_refinements([strong, weak], own=0.5)] == [None, refines]
 
 
 def test_a_form_is_found_with_its_effect_and_is_no_name_of_its_own():
@@ -95,6 +123,39 @@ def test_what_no_hypothesis_explains_is_unnamed():
     assert result.verdict == "unnamed"
     assert not result.changed
     assert result.where[0]["excess_floor_units"] > 1.0
+
+
+def test_what_only_a_learned_torque_explains_is_unnamed_and_the_torque_is_saved():
+    result = discover({"cubic": 12.0}, residual=LEARNED)
+    assert (result.verdict, result.model_is) == ("unnamed", "learned")
+    assert result.model[AXES.index("cubic")] == pytest.approx(12.0, abs=1.0)
+    assert result.gap["after"] < 1.3 < result.gap["null"]
+    assert result.explained_share < 0.8
+
+
+def test_a_model_that_sealed_runs_contradict_is_withdrawn_and_names_nothing():
+    result = discover({"coulomb": 1.2}, sealed={})
+    assert result.withdrawn
+    assert result.verdict == "unnamed"
+    assert result.proposed[AXES.index("coulomb")] == pytest.approx(1.2, abs=0.1)
+    assert result.model[AXES.index("coulomb")] == 0.0
+    assert result.gap["after"] > result.gap["before"]
+
+
+@pytest.mark.parametrize(
+    ("before", "null", "after", "worse"),
+    [
+        (5.0, 3.0, 3.2, False),
+        (5.0, 3.0, 3.4, True),
+        (1.0, 3.0, 1.15, False),
+        (1.0, 3.0, 1.25, True),
+        (5.0, 3.0, np.nan, True),
+        (5.0, np.nan, 4.0, False),
+        (np.nan, np.nan, np.nan, False),
+    ],
+)
+def test_a_model_is_worse_by_a_tenth_and_a_fifth_of_a_floor_unit(before, null, after, worse):
+    assert is_worse({"before": before, "null": null, "after": after}) is worse
 
 
 def test_what_does_not_move_the_signals_is_not_testable():

@@ -1,4 +1,5 @@
 import copy
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -153,6 +154,12 @@ def test_derived_fields_of_every_kind_of_joint(set_const):
     np.testing.assert_allclose(got.stat.meaninertia, expected.stat.meaninertia, rtol=RTOL)
 
 
+def test_a_model_of_another_implementation_is_refused():
+    # Warp needs a GPU, so only its name is here.
+    with pytest.raises(ValueError, match=r"impl: got 'warp', expected 'jax'; .*config_overrides"):
+        derived_fields.set_const(SimpleNamespace(impl=mjx.Impl.WARP))
+
+
 def test_without_jit_and_without_the_rest_of_the_table_it_is_the_same(apply, robot, set_const, monkeypatch):
     # Op by op, this one function would take longer than all others; see the slow test of the environment.
     monkeypatch.setattr(parameters, "set_const", set_const)
@@ -179,10 +186,111 @@ def test_models_of_a_batch_are_those_of_a_loop(apply, robot):
 
 def test_rows_are_found_by_name(robot):
     model = robot.mj_model
+
+    def rows(name):
+        return ENTRIES[name].rows(model, ENTRIES[name].field_names[0])[0]
+
     # A joint's row is its degree of freedom, and the first six are the trunk's.
-    assert ENTRIES["joint_damping"].rows(model).tolist() == [6, 7, 8, 9, 10, 11]
-    assert [model.body(row).name for row in ENTRIES["shank_mass"].rows(model)] == ["left_shank", "right_shank"]
-    assert [model.geom(row).name for row in ENTRIES["foot_friction"].rows(model)] == ["left_foot", "right_foot"]
+    assert rows("joint_damping").tolist() == [6, 7, 8, 9, 10, 11]
+    assert [model.body(row).name for row in rows("shank_mass")] == ["left_shank", "right_shank"]
+    assert [model.geom(row).name for row in rows("foot_friction")] == ["left_foot", "right_foot"]
+
+
+def entry(**fields):
+    return parameters.Entry(**{"kind": "joint", "targets": ("arm",), "bounds": (0.5, 2.0), **fields})
+
+
+@pytest.fixture(scope="module")
+def general():
+    model = mujoco.MjModel.from_xml_string(GENERAL)
+    # Joints are the base's, the arm's, the sled's and the wheel's, with 6, 3, 1 and 1 degrees of freedom.
+    model.jnt_stiffness[:] = [0.0, 3.0, 5.0, 7.0]
+    model.dof_damping[6:] = [0.3, 0.3, 0.3, 0.5, 0.7]
+    # The sled's motor as a position servo: kp 40, kv 2.
+    model.actuator_gainprm[0, :3] = [40.0, 0.0, 0.0]
+    model.actuator_biasprm[0, :3] = [0.0, -40.0, -2.0]
+    return model
+
+
+def both(model, table, **params):
+    """The model changed in MJX, and in MuJoCo C."""
+    changed = jax.jit(lambda params: parameters.apply(mjx.put_model(model), params, table))(params)
+    return changed, parameters.apply_mujoco(model, params, table)
+
+
+def test_fields_of_a_joint_have_rows_by_joint_or_by_degree_of_freedom(general):
+    table = {
+        "spring": entry(targets=("sled",), fields=("jnt_stiffness",)),
+        "damping": entry(targets=("wheel", "arm"), fields=("dof_damping",)),
+    }
+    for model in both(general, table, spring=2.0, damping=2.0):
+        np.testing.assert_allclose(model.jnt_stiffness, [0.0, 3.0, 10.0, 7.0])
+        np.testing.assert_allclose(model.dof_damping, [0.0] * 6 + [0.6] * 3 + [0.5, 1.4], rtol=1e-6)
+
+
+def test_one_value_per_target_reaches_all_degrees_of_freedom_of_its_joint(general):
+    table = {"damping": entry(targets=("wheel", "arm"), fields=("dof_damping",), bounds=(0.1, 9.0))}
+    model = parameters.apply(mjx.put_model(general), {"damping": jnp.array([10.0, 3.0])}, table)
+    np.testing.assert_allclose(model.dof_damping, [0.0] * 6 + [0.9] * 3 + [0.5, 7.0], rtol=1e-6)
+
+
+def test_without_targets_all_objects_of_the_kind_are_meant(general):
+    table = {"mass": entry(kind="body", targets=None, fields=("body_mass",))}
+    for model in both(general, table, mass=2.0):
+        np.testing.assert_allclose(model.body_mass, 2.0 * general.body_mass, rtol=1e-6)
+
+
+def test_an_actuator_may_be_named_by_its_joint():
+    xml = GENERAL.replace("""<motor name="wheel" joint="wheel"/>""", """<motor joint="wheel"/><motor joint="wheel"/>""")
+    model = mujoco.MjModel.from_xml_string(xml)
+    table = {"strength": entry(kind="actuator", targets=("wheel", "sled"), fields=("actuator_gainprm",))}
+    changed = parameters.apply(mjx.put_model(model), {"strength": jnp.array([0.5, 0.7])}, table)
+    np.testing.assert_allclose(changed.actuator_gainprm[:, 0], [0.7, 0.5, 0.5], rtol=1e-6)
+
+
+def test_friction_of_contact_pairs_is_that_of_their_geoms():
+    geoms = "".join(
+        f'<body pos="0 0 {height}"><freejoint/><geom name="{name}" size="0.1"/></body>'
+        for height, name in enumerate("abc")
+    )
+    pairs = '<pair geom1="a" geom2="b"/><pair geom1="b" geom2="c"/><pair geom1="a" geom2="c" friction="2 2 1 1 1"/>'
+    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{geoms}</worldbody><contact>{pairs}</contact></mujoco>")
+    fields = (("pair_friction", 0), ("pair_friction", 1))
+    for changed in both(model, {"it": entry(kind="geom", targets=("c",), fields=fields)}, it=0.5):
+        # MuJoCo sorts them: a-b, a-c, b-c.
+        np.testing.assert_allclose(changed.pair_friction[:, :3], [[1, 1, 0.005], [1, 1, 1], [0.5, 0.5, 0.005]])
+
+
+def test_the_stiffness_of_a_position_servo_is_in_two_columns(general):
+    fields = (("actuator_gainprm", 0), ("actuator_biasprm", 1))
+    table = {"kp": entry(kind="actuator", targets=("sled",), fields=fields)}
+    for model in both(general, table, kp=1.5):
+        # 1.5 * 40 on the target and on the position; the damping of 2 stays.
+        np.testing.assert_allclose(model.actuator_gainprm[0, :3], [60.0, 0.0, 0.0])
+        np.testing.assert_allclose(model.actuator_biasprm[0, :3], [0.0, -60.0, -2.0])
+        np.testing.assert_allclose(model.actuator_gainprm[1, 0], 1.0)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"targets": ("arm", "")}, r"targets: got \('arm', ''\), expected distinct names"),
+        ({"targets": ("arm", "arm")}, "expected distinct names"),
+        ({"fields": ("geom_friction",)}, r"fields: got 'geom_friction', expected .* begin with jnt_ or dof_"),
+        ({"kind": "body", "fields": (("dof_damping", 0),)}, "got 'dof_damping', expected fields of a body"),
+        ({"kind": "control", "fields": ("body_mass",)}, "got 'body_mass', expected none"),
+        ({"bounds": (2.0, 0.5)}, r"bounds: got \(2.0, 0.5\), expected ascending ones, above zero"),
+        ({"bounds": (0.0, 2.0)}, "above zero for a multiplier"),
+        ({"bounds": (1.0, -1.0), "log": False}, r"got \(1.0, -1.0\), expected ascending ones$"),
+    ],
+)
+def test_a_row_that_cannot_be_right_is_refused(fields, message):
+    with pytest.raises(ValueError, match=message):
+        entry(**{"fields": (), **fields})
+
+
+def test_an_offset_may_be_negative():
+    assert entry(fields=(), bounds=(-1.0, 0.0), log=False).bounds == (-1.0, 0.0)
 
 
 def test_applying_an_unknown_parameter_names_it(robot):
@@ -202,17 +310,24 @@ def test_an_unknown_parameter_is_named():
 
 @pytest.mark.parametrize(("kind", "target"), [("body", "tail"), ("geom", "trunk_geom"), ("joint", "tail")])
 def test_an_entry_for_an_object_that_is_not_there_is_named(robot, kind, target):
-    entry = parameters.Entry(name="tail_mass", kind=kind, targets=(target,), fields=(), bounds=(0.5, 2.0))
-    with pytest.raises(ValueError, match=f"'tail_mass': got {kind} '{target}', which the model does not have"):
-        entry.rows(robot.mj_model)
+    missing = entry(kind=kind, targets=(target,), fields=())
+    with pytest.raises(ValueError, match=f"targets: got {kind} '{target}', which the model does not have; expected"):
+        missing.ids(robot.mj_model)
 
 
-def test_coordinates_are_logarithms_of_multipliers_and_offsets_as_they_are():
+def test_applying_a_row_whose_target_is_missing_names_the_parameter(robot):
+    table = {"tail_mass": entry(kind="body", targets=("tail",), fields=("body_mass",))}
+    with pytest.raises(ValueError, match=r"parameter 'tail_mass', targets: got body 'tail', .* some of world, trunk, "):
+        parameters.apply_mujoco(robot.mj_model, {"tail_mass": 1.0}, table)
+
+
+def test_coordinates_are_logarithms_of_multipliers_and_offsets_in_half_widths_of_their_bounds():
     params = {"trunk_mass": jnp.float32(2.0), "trunk_com_x_m": jnp.float32(-0.03)}
     coords = parameters.to_coords(ENTRIES, params)
     # log 2 = 0.693147
     np.testing.assert_allclose(coords["trunk_mass"], 0.693147, rtol=1e-6)
-    np.testing.assert_array_equal(coords["trunk_com_x_m"], np.float32(-0.03))
+    # Its bounds are -0.08 and 0.08 m.
+    np.testing.assert_allclose(coords["trunk_com_x_m"], -0.375, rtol=1e-6)
 
 
 def test_coordinates_and_back():

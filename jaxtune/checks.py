@@ -1,0 +1,70 @@
+"""Checks of the episodes that a user's functions return: by shape, so they run before anything is compiled."""
+
+import numpy as np
+
+from jaxtune.rules import TunerConfig
+from jaxtune.types import Trajectory
+
+
+def check_simulated(trajectory: Trajectory, episodes: int, config: TunerConfig) -> None:
+    """Checks what `simulate` returns.
+
+    Args:
+      trajectory: episodes, or their shapes from `jax.eval_shape`.
+      episodes: number of draws that `simulate` was given.
+      config: sizes of the tuning.
+
+    Raises:
+      ValueError: a field has another shape than `Trajectory` says, or an episode is shorter than a window.
+    """
+    steps = _check_shapes("simulate", trajectory, episodes, "one per draw of the coordinates")
+    window = max(config.spm.window, config.dvm.window)
+    if steps < window:
+        raise ValueError(
+            f"simulate: got episodes of {steps} steps, expected at least {window}, the length of a window "
+            "(SPMConfig.window, DVMConfig.window)"
+        )
+
+
+def check_measured(measured: Trajectory, simulated: Trajectory, config: TunerConfig) -> None:
+    """Checks a measured set against the simulated episodes that it will be compared with.
+
+    Args:
+      measured: the measured set, or its shapes.
+      simulated: what `simulate` returns, or its shapes.
+      config: sizes of the tuning.
+
+    Raises:
+      ValueError: the set has another number of episodes than `config.set_episodes`, or episodes, observations or
+        actions of another size than the simulated ones.
+    """
+    steps = _check_shapes("measured", measured, config.set_episodes, "TunerConfig.set_episodes")
+    expected = np.shape(simulated.alive)[1]
+    if steps != expected:
+        raise ValueError(f"measured: got episodes of {steps} steps, expected {expected}, as simulated")
+    for field in ("obs", "action"):
+        got, expected = np.shape(getattr(measured, field))[-1], np.shape(getattr(simulated, field))[-1]
+        if got != expected:
+            raise ValueError(f"measured, {field}: got {got} numbers a step, expected {expected}, as simulated")
+
+
+def _check_shapes(source: str, trajectory: Trajectory, episodes: int, why: str) -> int:
+    """Checks every field of a trajectory, and returns the number of its steps."""
+    for field in ("obs", "action"):
+        value = getattr(trajectory, field)
+        if not hasattr(value, "shape"):
+            names = f" of {', '.join(map(str, value))}" if isinstance(value, dict) else ""
+            raise ValueError(
+                f"{source}, {field}: got a {type(value).__name__}{names}, expected one array "
+                f"[episodes, time, {field}]: put what is to be compared side by side"
+            )
+    shape = np.shape(trajectory.alive)
+    if len(shape) != 2 or shape[0] != episodes:
+        raise ValueError(f"{source}, alive: got shape {shape}, expected {episodes} episodes ({why}) by time")
+    for field in ("obs", "action", "score", "fell", "not_finite"):
+        got = np.shape(getattr(trajectory, field))
+        expected = [*shape[:1]] if field in ("fell", "not_finite") else [*shape]
+        channels = field in ("obs", "action")
+        if [*(got[:-1] if channels else got)] != expected:
+            raise ValueError(f"{source}, {field}: got shape {got}, expected {(*expected, *[field] * channels)}")
+    return shape[1]

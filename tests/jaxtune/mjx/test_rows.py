@@ -1,0 +1,193 @@
+import mujoco
+import numpy as np
+import pytest
+from mujoco import mjx
+
+from envs.biteno import constants
+from jaxtune.mjx import action_delay, apply_mujoco, check, field, friction, mass, parameters_of, strength
+from jaxtune.mjx.parameters import distribution, from_coords
+
+ARM = """
+<mujoco>
+  <worldbody>
+    <geom name="floor" type="plane" size="1 1 1" friction="0.6 0.005 0.0001"/>
+    <body name="upper" pos="0 0 1">
+      <joint name="shoulder" axis="0 1 0" damping="0.2"/>
+      <geom type="capsule" size="0.03" fromto="0 0 0 0 0 -0.3" mass="1.2"/>
+      <body name="lower" pos="0 0 -0.3">
+        <joint name="elbow" axis="0 1 0"/>
+        <geom name="tip" type="capsule" size="0.02" fromto="0 0 0 0 0 -0.25" mass="0.6"/>
+      </body>
+    </body>
+  </worldbody>
+  <contact><pair geom1="floor" geom2="tip" friction="0.9 0.9 0.005 0.0001 0.0001"/></contact>
+  <actuator>
+    <position joint="shoulder" kp="40" kv="2" forcerange="-10 10"/>
+    <motor name="elbow_motor" joint="elbow" gear="3"/>
+  </actuator>
+</mujoco>
+"""
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return mujoco.MjModel.from_xml_string(ARM)
+
+
+def changed(arm, row, value):
+    table = {"it": row}
+    check(mjx.put_model(arm), table)
+    return apply_mujoco(arm, {"it": value}, table)
+
+
+def test_a_heavier_link_has_more_inertia(arm):
+    model = changed(arm, mass("lower", bounds=(0.5, 2.0)), 1.5)
+    np.testing.assert_allclose(model.body("lower").mass, 0.9)
+    np.testing.assert_allclose(model.body("lower").inertia, 1.5 * arm.body("lower").inertia)
+    np.testing.assert_allclose(model.body("upper").mass, 1.2)
+
+
+def test_strength_scales_every_torque_of_motors_and_servos(arm):
+    rng = np.random.default_rng(0)
+    qpos, qvel, ctrl = rng.normal(0.0, 0.1, (3, 2))
+
+    def torque(model):
+        data = mujoco.MjData(model)
+        data.qpos[:], data.qvel[:], data.ctrl[:] = qpos, qvel, ctrl
+        mujoco.mj_forward(model, data)
+        return data.qfrc_actuator.copy()
+
+    weak = changed(arm, strength(("shoulder", "elbow"), bounds=(0.4, 2.0)), 0.7)
+    np.testing.assert_allclose(torque(weak), 0.7 * torque(arm))
+    np.testing.assert_allclose(weak.actuator_forcerange[0], [-7.0, 7.0])
+    np.testing.assert_allclose(
+        torque(changed(arm, strength("elbow_motor", bounds=(0.4, 2.0)), 0.7)) / torque(arm), [1, 0.7]
+    )
+
+
+def test_friction_reaches_geoms_and_contact_pairs(arm):
+    model = changed(arm, friction(bounds=(0.3, 3.0)), 0.5)
+    np.testing.assert_allclose(model.geom_friction[:, 0], 0.5 * arm.geom_friction[:, 0])
+    np.testing.assert_allclose(model.geom_friction[:, 1:], arm.geom_friction[:, 1:])
+    np.testing.assert_allclose(model.pair_friction[0], [0.45, 0.45, 0.005, 0.0001, 0.0001])
+
+
+def test_a_field_may_be_multiplied_or_added_to_and_have_a_column(arm):
+    model = changed(arm, field("dof_damping", joints="shoulder", bounds=(0.3, 3.0)), 2.0)
+    np.testing.assert_allclose(model.dof_damping, [0.4, 0.0])
+    model = changed(arm, field("dof_damping", joints=None, bounds=(0.0, 3.0), offset=True), 0.5)
+    np.testing.assert_allclose(model.dof_damping, [0.7, 0.5])
+    model = changed(arm, field("body_ipos", bodies=["lower"], column=2, bounds=(-0.1, 0.1), offset=True), 0.02)
+    np.testing.assert_allclose(model.body("lower").ipos, [0.0, 0.0, -0.105])
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (
+            lambda: field("dof_damping", bounds=(0.3, 3.0)),
+            "field 'dof_damping': got no targets, expected one of bodies",
+        ),
+        (lambda: field("dof_damping", links="upper", bounds=(0.3, 3.0)), "got links, expected one of bodies, geoms"),
+        (
+            lambda: field("dof_damping", joints="a", bodies="b", bounds=(0.3, 3.0)),
+            "got joints, bodies, expected one of",
+        ),
+        (
+            lambda: field("dof_damping", bodies="upper", bounds=(0.3, 3.0)),
+            "got 'dof_damping', expected fields of a body",
+        ),
+        (lambda: mass("upper", bounds=(-1.0, 2.0)), r"bounds: got \(-1.0, 2.0\), expected ascending ones, above zero"),
+        (lambda: action_delay(bounds_s=(-0.01, 0.02)), r"bounds_s: got \(-0.01, 0.02\), expected no negative delay"),
+    ],
+)
+def test_a_row_that_makes_no_sense_is_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+@pytest.mark.parametrize(
+    ("row", "message"),
+    [
+        (
+            mass("forearm", bounds=(0.5, 2.0)),
+            "parameter 'it', targets: got body 'forearm', .* some of world, upper, lower$",
+        ),
+        (strength("wrist", bounds=(0.5, 2.0)), "targets: got actuator 'wrist', .* some of elbow_motor$"),
+        (
+            field("dof_stiffness", joints=None, bounds=(0.5, 2.0)),
+            "fields: got 'dof_stiffness', which mjx.Model does not",
+        ),
+        (
+            field("geom_friction", geoms="tip", column=3, bounds=(0.5, 2.0)),
+            "column: got 3 of 'geom_friction', which has 3",
+        ),
+        (
+            field("dof_damping", joints="elbow", bounds=(0.5, 2.0)),
+            "dof_damping: zero for elbow, so a multiplier changes",
+        ),
+        (
+            field("dof_frictionloss", joints=None, bounds=(0.0, 2.0), offset=True),
+            "MJX solves for dof_frictionloss only in joints that had some",
+        ),
+    ],
+)
+def test_a_row_that_cannot_change_the_model_is_refused(arm, row, message):
+    with pytest.raises(ValueError, match=message):
+        check(mjx.put_model(arm), {"it": row})
+
+
+def test_a_distribution_spans_bounds_in_coordinates_of_order_one():
+    table = {"mass": mass("lower", bounds=(0.5, 2.0)), "delay": action_delay(bounds_s=(0.0, 0.03))}
+    dist = distribution(table, 0.4, {"mass": 1.5})
+    assert dist.centre["mass"] == pytest.approx(np.log(1.5))
+    # Half the width of the delay's bounds is a coordinate of one.
+    assert (dist.lower["delay"], dist.centre["delay"], dist.upper["delay"]) == (0.0, 0.0, 2.0)
+    assert from_coords(table, {"delay": dist.upper["delay"]})["delay"] == pytest.approx(0.03)
+
+
+@pytest.mark.parametrize(
+    ("centre", "message"),
+    [
+        ({"mass": 3.0}, "parameter 'mass': got 3.0, expected 0.5 to 2"),
+        ({"weight": 1.0}, "got 'weight', expected some of"),
+    ],
+)
+def test_a_centre_that_cannot_be_is_refused(centre, message):
+    with pytest.raises(ValueError, match=message):
+        distribution({"mass": mass("lower", bounds=(0.5, 2.0))}, 0.4, centre)
+
+
+def test_a_table_is_proposed_for_any_model(arm):
+    table = parameters_of(arm)
+    # The elbow has no damping, and no joint has armature or dry friction.
+    assert list(table) == ["upper_mass", "lower_mass", "damping", "strength", "friction"]
+    assert table["damping"].targets == ("shoulder",)
+    check(mjx.put_model(arm), table)
+
+
+def test_left_and_right_are_tied_in_a_proposed_table():
+    model = mujoco.MjModel.from_xml_path(str(constants.MODEL_PATH))
+    table = parameters_of(model, control_s=0.01)
+    assert table["shank_mass"].targets == ("left_shank", "right_shank")
+    assert {"trunk_mass", "abductor_mass", "thigh_mass", "damping", "armature", "strength", "friction"} < table.keys()
+    assert table["delay"].bounds == (0.0, 0.02)
+    check(mjx.put_model(model), table)
+
+
+@pytest.mark.parametrize(
+    ("names", "stems"),
+    [
+        (("FL_hip", "FR_hip", "RL_hip", "RR_hip"), ["f_hip", "r_hip"]),
+        (("L_knee", "R_knee"), ["knee"]),
+        (("knee-left", "knee-right", "torso"), ["knee", "torso"]),
+        (("L", "R", "relay"), ["L", "R", "relay"]),
+    ],
+)
+def test_names_of_links_tell_which_belong_together(names, stems):
+    links = "".join(
+        f'<body name="{name}"><joint axis="0 1 0"/><geom size="0.1" contype="0" conaffinity="0"/></body>'
+        for name in names
+    )
+    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{links}</worldbody></mujoco>")
+    assert list(parameters_of(model)) == [f"{stem}_mass" for stem in stems]

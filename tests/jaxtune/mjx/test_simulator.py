@@ -1,0 +1,338 @@
+import warnings
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+import toys
+from brax import envs
+from brax.envs.wrappers.training import DomainRandomizationVmapWrapper
+from mujoco import mjx
+
+from jaxtune import dist as dists
+from jaxtune import tuner
+from jaxtune.mjx import Simulator, action_delay, apply_mujoco, field, from_coords, mass, strength
+
+SLED = """
+<mujoco>
+  <option timestep="0.005"><flag contact="disable"/></option>
+  <worldbody>
+    <body name="sled"><joint name="rail" type="slide" axis="1 0 0" damping="0.5"/><geom size="0.1" mass="2"/></body>
+  </worldbody>
+  <actuator><motor name="push" joint="rail"/></actuator>
+</mujoco>
+"""
+SUBSTEPS = 4
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class State:
+    data: mjx.Data
+    obs: jax.Array
+    reward: jax.Array
+    done: jax.Array
+
+
+class Sled:
+    """A pushed mass: an environment as a user writes one, with a model where `with_model` looks for it.
+
+    It observes position, velocity and the force that it was given, is rewarded for speed, and ends beyond 1.5 m.
+    """
+
+    dt = 0.02
+
+    def __init__(self):
+        self.mj_model = mujoco.MjModel.from_xml_string(SLED)
+        self._mjx_model = mjx.put_model(self.mj_model)
+
+    @property
+    def mjx_model(self):
+        return self._mjx_model
+
+    @property
+    def unwrapped(self):
+        return self
+
+    def reset(self, key):
+        data = mjx.make_data(self.mj_model)
+        data = data.replace(qvel=0.1 * jax.random.normal(key, (1,)))
+        return self._state(data, jnp.zeros(1))
+
+    def step(self, state, action):
+        data = state.data.replace(ctrl=action)
+        data = jax.lax.fori_loop(0, SUBSTEPS, lambda _, data: mjx.step(self._mjx_model, data), data)
+        return self._state(data, action)
+
+    def _state(self, data, action):
+        obs = jnp.concatenate([data.qpos, data.qvel, action])
+        return State(data=data, obs=obs, reward=data.qvel[0], done=(jnp.abs(data.qpos[0]) > 1.5).astype(float))
+
+
+class Keyed(Sled):
+    """The same with a dictionary of observations."""
+
+    def _state(self, data, action):
+        plain = super()._state(data, action)
+        return State(data=data, obs={"state": plain.obs[:2], "told": action}, reward=plain.reward, done=plain.done)
+
+
+TABLE = {
+    "mass": mass("sled", bounds=(0.5, 2.0)),
+    "damping": field("dof_damping", joints="rail", bounds=(0.2, 5.0)),
+    "strength": strength("push", bounds=(0.5, 2.0)),
+    "delay": action_delay(bounds_s=(0.0, 0.05)),
+}
+STEPS = 60
+
+
+def act(policy, obs, key):
+    """Pushes to and fro with the position, so that actions differ from step to step."""
+    del key
+    return jnp.sin(policy * (1.0 + 9.0 * obs[:1])) + 2.0
+
+
+@pytest.fixture(scope="module")
+def sim():
+    return Simulator(Sled(), steps=STEPS, parameters=TABLE)
+
+
+@pytest.fixture(scope="module")
+def play(sim):
+    rollout = jax.jit(lambda key, params: sim.rollout(key, act, 3.0, params))
+
+    def run(**params):
+        count = max(np.size(value) for value in params.values())
+        values = {"mass": 1.0, "damping": 1.0, "strength": 1.0, "delay": 0.0, **params}
+        return rollout(
+            jax.random.key(7), {name: np.broadcast_to(np.float32(v), (count,)) for name, v in values.items()}
+        )
+
+    return run
+
+
+def in_mujoco(velocity, actions, **params):
+    """Positions and velocities of the sled in MuJoCo C, given what its motor was told."""
+    sled = Sled()
+    model = apply_mujoco(sled.mj_model, params, {name: TABLE[name] for name in params})
+    data = mujoco.MjData(model)
+    data.qvel[:] = velocity
+    found = []
+    for action in actions:
+        found.append([data.qpos[0], data.qvel[0]])
+        data.ctrl[:] = action
+        mujoco.mj_step(model, data, SUBSTEPS)
+    return np.array(found)
+
+
+def test_every_episode_has_a_model_of_its_own(play):
+    params = {"mass": [0.6, 1.7, 1.0], "damping": [3.0, 1.0, 0.3], "strength": [1.0, 1.8, 0.7]}
+    episodes = play(**params)
+    for row in range(3):
+        mine = {name: values[row] for name, values in params.items()}
+        expected = in_mujoco(episodes.obs[row, 0, 1], episodes.action[row], **mine)
+        np.testing.assert_allclose(episodes.obs[row, :, :2], expected, rtol=2e-4, atol=1e-5)
+    assert episodes.alive.all()
+    assert not episodes.fell.any()
+    # The reward of a step is the speed at its end.
+    np.testing.assert_allclose(episodes.score[:, :-1], episodes.obs[:, 1:, 1], rtol=1e-6)
+
+
+@pytest.mark.parametrize("delay_s", [0.0, 0.02, 0.03, 0.05])
+def test_a_delayed_action_is_interpolated_between_two_that_were_given(play, delay_s):
+    episodes = play(mass=1.0, delay=delay_s)
+    given = np.asarray(episodes.action[0, :, 0])
+    assert np.abs(np.diff(given)).max() > 0.1
+    # Control steps of 0.02 s; before the first one the action is as it was then.
+    time = np.arange(STEPS - 1)
+    late = np.interp(time - delay_s / 0.02, time, given[:-1])
+    np.testing.assert_allclose(episodes.obs[0, 1:, 2], late, atol=1e-5)
+
+
+def test_an_episode_ends_where_the_environment_is_done(play):
+    episodes = play(mass=[0.5, 2.0], strength=2.0, damping=0.2)
+    lived = np.asarray(episodes.alive.sum(axis=1))
+    assert lived[0] < STEPS == lived[1]
+    np.testing.assert_array_equal(episodes.fell, [True, False])
+    # The step that ends it is its last one, from within the bounds.
+    assert np.abs(episodes.obs[0, lived[0] - 1, 0]) <= 1.5 < np.abs(episodes.obs[0, lived[0], 0])
+    np.testing.assert_array_equal(episodes.score[0, lived[0] :], 0.0)
+    assert not episodes.not_finite.any()
+
+
+def test_a_step_that_is_not_finite_is_counted_and_masked(sim):
+    def breaks(policy, obs, key):
+        return jnp.where(obs[:1] > policy, jnp.nan, 2.0)
+
+    episodes = sim.rollout(jax.random.key(7), breaks, 0.3, {"delay": jnp.zeros(2)})
+    assert episodes.not_finite.all()
+    lived = episodes.alive.sum(axis=1)
+    assert np.all((lived > 5) & (lived < STEPS))
+    assert np.isfinite(np.where(episodes.alive, episodes.score, 0.0)).all()
+
+
+def test_simulate_takes_coordinates_and_measure_hides_parameters(sim, play):
+    key = jax.random.key(7)
+    coords = {"mass": jnp.log(jnp.array([1.3])), "delay": jnp.array([0.8])}
+    expected = play(mass=1.3, delay=0.02)
+    for episodes in (sim.simulate(act)(key, 3.0, coords), sim.measure(act, {"mass": 1.3, "delay": 0.02}, 1)(key, 3.0)):
+        np.testing.assert_allclose(episodes.obs, expected.obs, rtol=1e-4, atol=1e-5)
+
+
+def test_chunks_change_nothing(sim, monkeypatch):
+    params = {"mass": jnp.linspace(0.5, 2.0, 5)}
+    whole = sim.rollout(jax.random.key(1), act, 1.0, params)
+    monkeypatch.setattr("jaxtune.mjx.simulator._CHUNK", 2)
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5),
+        whole,
+        sim.rollout(jax.random.key(1), act, 1.0, params),
+    )
+
+
+def test_a_distribution_reads_in_physical_values(sim):
+    dist = sim.dist(radius=0.4, centre={"mass": 1.2})
+    found = sim.physical(dist)
+    # 1.2 exp(-0.4) and 1.2 exp(0.4); 0.4 of half of 0.05 s, cut at zero.
+    assert found["mass"] == pytest.approx({"low": 0.80438, "value": 1.2, "high": 1.79019}, rel=1e-4)
+    assert found["delay"] == pytest.approx({"low": 0.0, "value": 0.0, "high": 0.01}, abs=1e-6)
+
+
+def test_a_tuner_takes_it_as_it_is(sim):
+    config = toys.TINY
+    machine = tuner.Tuner(config=config, train_policy=tuner.keep, simulate=sim.simulate(act))
+    measured = sim.measure(act, {"mass": 1.2}, config.set_episodes)(jax.random.key(3), 3.0)
+    state = machine.init(3.0, sim.dist(radius=0.4), tuner.knobs())
+    state, info = jax.jit(machine.tune)(jax.random.key(4), state, measured)
+    assert info.calls >= 1
+    assert "gate call" in tuner.explain(info)
+    assert sim.physical(state.dist).keys() == TABLE.keys()
+
+
+# Observations by key
+
+
+@pytest.mark.parametrize(
+    ("observe", "size"),
+    [("state", 2), (("told", "state"), 3), (lambda obs: obs["state"][1:], 1)],
+    ids=["key", "keys", "function"],
+)
+def test_dictionary_observations_are_compared_by_key(observe, size):
+    sim = Simulator(Keyed(), steps=3, parameters=TABLE, observe=observe)
+    episodes = sim.rollout(jax.random.key(0), lambda policy, obs, key: obs["state"][:1], None, {"mass": jnp.ones(2)})
+    assert episodes.obs.shape == (2, 3, size)
+
+
+@pytest.mark.parametrize("observe", [None, "states", ("state", "torque")], ids=["none", "misspelt", "one of two"])
+def test_a_key_that_is_missing_is_named(observe):
+    sim = Simulator(Keyed(), steps=3, parameters=TABLE, observe=observe)
+    with pytest.raises(ValueError, match=r"observe: got .* expected some of state, told"):
+        sim.rollout(jax.random.key(0), lambda policy, obs, key: obs["state"][:1], None, {"mass": jnp.ones(2)})
+
+
+def test_a_key_for_an_observation_without_keys_is_refused():
+    sim = Simulator(Sled(), steps=3, parameters=TABLE, observe="state")
+    with pytest.raises(ValueError, match="observe: got 'state', but the environment's observation is one array"):
+        sim.rollout(jax.random.key(0), act, 3.0, {"mass": jnp.ones(2)})
+
+
+# What is refused before anything compiles
+
+
+class NoTime(Sled):
+    dt = property()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"steps": 0}, "steps: got 0, expected at least 1"),
+        ({"parameters": {}}, "parameters: got none"),
+        ({"parameters": {"m": mass("sledge", bounds=(0.5, 2.0))}}, "parameter 'm', targets: got body 'sledge'"),
+        ({"parameters": {**TABLE, "more": TABLE["delay"]}}, "got delay and more, expected one action_delay at most"),
+        ({"env": object()}, "env: got object, which has no MJX model in 'mjx_model'"),
+        ({"env": NoTime()}, "parameter 'delay': the environment has no dt"),
+    ],
+)
+def test_a_simulator_that_cannot_be_is_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        Simulator(**{"env": Sled(), "steps": STEPS, "parameters": TABLE, **arguments})
+
+
+def test_a_hidden_parameter_out_of_bounds_is_refused(sim):
+    with pytest.raises(ValueError, match=r"parameter 'mass': got 9.0, expected 0.5 to 2"):
+        sim.measure(act, {"mass": 9.0}, 2)
+
+
+# An environment of Brax
+
+
+PENDULUM = {
+    "pole": mass("pole", bounds=(0.3, 3.0)),
+    "rail": field("dof_damping", joints="slider", bounds=(0.0, 2.0), offset=True),
+}
+
+
+@pytest.fixture(scope="module")
+def pendulum():
+    with warnings.catch_warnings():
+        # Brax says that its own engines are no longer maintained.
+        warnings.simplefilter("ignore", UserWarning)
+        env = envs.get_environment("inverted_pendulum", backend="mjx")
+    return Simulator(env, steps=5, parameters=PENDULUM)
+
+
+# Brax reads contacts where MJX no longer wants them read.
+@pytest.mark.filterwarnings("ignore:Accessing:DeprecationWarning")
+def test_episodes_of_a_brax_environment_feel_their_parameters(pendulum):
+    push = lambda policy, obs, key: jnp.ones(1)  # noqa: E731
+    rollout = jax.jit(lambda params: pendulum.rollout(jax.random.key(0), push, None, params))
+    episodes = rollout({"pole": jnp.array([1.0, 1.0, 3.0])})
+    assert np.isfinite(episodes.obs).all()
+    # Reset keys differ between episodes, and nothing but the pole differs between these two.
+    same = rollout({"pole": jnp.array([1.0, 3.0, 3.0])})
+    np.testing.assert_array_equal(same.obs[0], episodes.obs[0])
+    assert np.abs(same.obs[1, 1:] - episodes.obs[1, 1:]).max() > 1e-3
+
+
+@pytest.mark.filterwarnings("ignore:Accessing:DeprecationWarning")
+def test_brax_randomises_with_draws_of_the_distribution(pendulum):
+    env, count = pendulum.env, 3
+    dist = pendulum.dist(radius=0.5)
+    keys = jax.random.split(jax.random.PRNGKey(1), count)
+    randomize = pendulum.randomization_fn(dist)
+    wrapped = DomainRandomizationVmapWrapper(env, lambda system: randomize(system, keys))
+    state = jax.jit(wrapped.reset)(keys)
+    state = jax.jit(wrapped.step)(state, jnp.ones((count, 1)))
+
+    @jax.jit
+    def alone(model, key):
+        one = pendulum.with_model(env, model)
+        return one.step(one.reset(key), jnp.ones(1)).obs
+
+    # The same robots, one after the other.
+    for row in range(count):
+        draw = jax.tree.map(lambda leaf: leaf[0], dists.sample(keys[row], dist, 1))
+        robot = apply_mujoco(env.sys.mj_model, from_coords(PENDULUM, draw), PENDULUM)
+        np.testing.assert_allclose(wrapped._sys_v.body_mass[row], robot.body_mass, rtol=1e-5)
+        np.testing.assert_allclose(wrapped._sys_v.body_invweight0[row], robot.body_invweight0, rtol=1e-4, atol=1e-8)
+        expected = alone(_row(wrapped._sys_v, wrapped._in_axes, row), keys[row])
+        np.testing.assert_allclose(state.obs[row], expected, rtol=1e-4, atol=1e-5)
+
+
+def _row(batch, axes, row):
+    picked = {}
+    for name in ("body_mass", "body_inertia", "dof_damping", "body_subtreemass", "body_invweight0", "dof_invweight0"):
+        assert getattr(axes, name) == 0
+        picked[name] = getattr(batch, name)[row]
+    for name in ("dof_M0", "actuator_acc0"):
+        picked[name] = getattr(batch, name)[row]
+    picked["stat"] = batch.stat.replace(meaninertia=batch.stat.meaninertia[row])
+    return batch.replace(**picked)
+
+
+def test_a_delay_cannot_be_drawn_into_a_model(sim):
+    with pytest.raises(ValueError, match="parameter 'delay': it is not part of the model"):
+        sim.randomization_fn(sim.dist())

@@ -1,0 +1,134 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import toys
+
+from jaxtune.host import HostTuner
+from jaxtune.tuner import Tuner, TunerState, explain, keep, knobs
+from jaxtune.types import Trajectory, Verdict
+
+TWO = {"friction": 0.0, "mass": 0.0}
+SLIDER = toys.Slider()
+
+
+def state(radius=0.2):
+    return TunerState(policy=toys.policy(), dist=toys.uniform(TWO, radius), knobs=knobs())
+
+
+@pytest.fixture(scope="module")
+def tuners():
+    """The tuner in one program, and the one whose simulator is any Python function."""
+    coords_seen = []
+
+    def simulate(key, policy, coords):
+        coords_seen.append(coords)
+        return jax.tree.map(np.asarray, SLIDER.simulate(key, policy, coords))
+
+    traced = Tuner(config=toys.TINY, train_policy=keep, simulate=SLIDER.simulate)
+    return jax.jit(traced.tune), HostTuner(config=toys.TINY, simulate=simulate), coords_seen
+
+
+@pytest.mark.parametrize("mass", [0.0, 1.1])
+def test_the_loop_in_python_gives_what_the_traced_one_gives(tuners, mass):
+    traced, host, seen = tuners
+    measured = SLIDER.measure({"friction": 0.0, "mass": mass}, 2)(jax.random.key(0), toys.policy())
+    moved, info = traced(jax.random.key(1), state(), measured)
+    seen.clear()
+    host_moved, host_info = host.tune(jax.random.key(1), state(), jax.tree.map(np.asarray, measured))
+    assert len(seen) == info.calls
+    assert all(isinstance(values, np.ndarray) for coords in seen for values in coords.values())
+    for got, expected in zip(jax.tree.leaves((host_moved, host_info)), jax.tree.leaves((moved, info)), strict=True):
+        np.testing.assert_allclose(got, expected, rtol=2e-3, atol=2e-3)
+    assert explain(host_info).splitlines()[0] == explain(info).splitlines()[0]
+
+
+def test_a_distribution_that_changes_compiles_nothing_anew(tuners):
+    _, host, _ = tuners
+    measured = SLIDER.measure(TWO, 2)(jax.random.key(0), toys.policy())
+    host.tune(jax.random.key(1), state(), measured)
+    host.tune(jax.random.key(2), state(radius=0.5), measured)
+    assert host._verify._cache_size() == host._decide._cache_size() == 1
+
+
+def test_a_measured_set_of_another_length_is_refused(tuners):
+    _, host, _ = tuners
+    measured = toys.Slider(steps=55).measure(TWO, 2)(jax.random.key(0), toys.policy())
+    with pytest.raises(ValueError, match="measured: got episodes of 55 steps, expected 60, as simulated"):
+        host.tune(jax.random.key(1), state(), measured)
+
+
+# Episodes of a Gymnasium loop
+
+
+def episode(length, terminated=False, **changes):
+    rows = np.arange(length)
+    record = {
+        "observation": [[float(t), 10.0 + t] for t in range(length)],
+        "action": [[0.1 * t] for t in range(length)],
+        "reward": list(1.0 + rows),
+        "terminated": terminated,
+        "truncated": not terminated,
+    }
+    return {**record, **changes}
+
+
+def test_episodes_of_any_length_become_one_set():
+    ends = [False] * 3 + [True]
+    episodes = Trajectory.from_episodes([episode(6), episode(4, terminated=ends), episode(3)], steps=5)
+    assert episodes.obs.shape == (3, 5, 2)
+    assert episodes.action.shape == (3, 5, 1)
+    np.testing.assert_array_equal(episodes.alive.sum(axis=1), [5, 4, 3])
+    # The first was cut, the second fell, the third was stopped.
+    np.testing.assert_array_equal(episodes.fell, [False, True, False])
+    np.testing.assert_array_equal(episodes.obs[1, :, 1], [10.0, 11.0, 12.0, 13.0, 0.0])
+    np.testing.assert_array_equal(episodes.score[2], [1.0, 2.0, 3.0, 0.0, 0.0])
+    assert not episodes.not_finite.any()
+
+
+def test_the_longest_episode_sets_the_length_and_a_last_observation_is_left_out():
+    longer = episode(4, observation=[[0.0, 0.0]] * 5)
+    assert Trajectory.from_episodes([episode(3), longer]).obs.shape == (2, 4, 2)
+
+
+def test_an_episode_is_masked_from_its_first_number_that_is_not_finite():
+    broken = episode(5)
+    broken["observation"][2][1] = float("nan")
+    episodes = Trajectory.from_episodes([broken, episode(5)])
+    np.testing.assert_array_equal(episodes.alive.sum(axis=1), [2, 5])
+    np.testing.assert_array_equal(episodes.not_finite, [True, False])
+    np.testing.assert_array_equal(episodes.score[0], [1.0, 2.0, 0.0, 0.0, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("episodes", "message"),
+    [
+        ([], "episodes: got none"),
+        (
+            [{"obs": [[1.0]], "action": [[1.0]]}],
+            "episode 0: got obs, action, expected observation, reward, terminated as",
+        ),
+        (
+            [episode(3), episode(3, action=[[0.0]] * 2)],
+            r"episode 1: got 3 observations, 2 actions, rewards of shape \(3,\)",
+        ),
+        ([episode(3, reward=[[1.0]] * 3)], r"rewards of shape \(3, 1\)"),
+        ([episode(3, observation=[[1.0], [1.0, 2.0], [1.0]])], "episode 0, observation: expected one list of numbers"),
+        ([episode(3, observation=[{"camera": 1.0}] * 3)], "episode 0, observation: expected one list of numbers"),
+        ([episode(3), episode(3, action=[[0.0, 1.0]] * 3)], "episodes, action: got 2 widths"),
+    ],
+)
+def test_episodes_that_do_not_fit_together_are_refused(episodes, message):
+    with pytest.raises(ValueError, match=message):
+        Trajectory.from_episodes(episodes)
+
+
+def test_a_set_of_episodes_can_be_measured_by_a_tuner(tuners):
+    whole = SLIDER.measure(TWO, 2)(jax.random.key(0), toys.policy())
+    lists = [
+        {"observation": obs, "action": action, "reward": score, "terminated": False}
+        for obs, action, score in zip(whole.obs.tolist(), whole.action.tolist(), whole.score.tolist(), strict=True)
+    ]
+    measured = Trajectory.from_episodes(lists)
+    _, info = tuners[1].tune(jax.random.key(1), state(), jax.tree.map(jnp.asarray, measured))
+    assert info.verdicts[0] in (Verdict.ACCEPT, Verdict.WIDEN)
