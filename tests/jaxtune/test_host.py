@@ -5,6 +5,7 @@ import pytest
 import toys
 
 from jaxtune.host import HostTuner
+from jaxtune.rules import calibrated_gate, posterior_update
 from jaxtune.tuner import Tuner, TunerState, explain, keep, knobs
 from jaxtune.types import Trajectory, Verdict
 
@@ -44,11 +45,22 @@ def test_the_loop_in_python_gives_what_the_traced_one_gives(tuners, mass):
 
 
 def test_a_distribution_that_changes_compiles_nothing_anew(tuners):
-    _, host, _ = tuners
+    traced = []
+
+    def gate(*args):
+        traced.append("gate")
+        return calibrated_gate(*args)
+
+    def update(*args):
+        traced.append("update")
+        return posterior_update(*args)
+
+    host = HostTuner(config=toys.TINY, simulate=SLIDER.simulate, verify=gate, update=update)
     measured = SLIDER.measure(TWO, 2)(jax.random.key(0), toys.policy())
-    host.tune(jax.random.key(1), state(), measured)
-    host.tune(jax.random.key(2), state(radius=0.5), measured)
-    assert host._verify._cache_size() == host._decide._cache_size() == 1
+    for seed, radius in ((1, 0.2), (2, 0.5)):
+        _, info = host.tune(jax.random.key(seed), state(radius), measured)
+        assert info.verdicts[info.calls - 1] == Verdict.ACCEPT
+    assert traced == ["gate", "update"]
 
 
 def test_a_measured_set_of_another_length_is_refused(tuners):
