@@ -26,9 +26,10 @@ from envs.logs.tables import WRITERS
 from envs.rig import Rig
 from experiments.common import checkpoint
 from experiments.common.cli import console, run
-from experiments.common.config import chosen, preset
+from experiments.common.config import preset
 from experiments.walking.learner import Learner
 from experiments.walking.policies import starting_policy
+from experiments.walking.robots import BITENO
 from experiments.walking.targets import TARGETS
 from jaxtune import dist as dists
 from jaxtune import tuner
@@ -77,7 +78,7 @@ def speed(args: Args) -> dict:
     for physics in ("exact", "fast"):
         sizes = preset(args.preset)
         sizes = dataclasses.replace(sizes, task=dataclasses.replace(sizes.task, physics=physics))
-        learner = Learner(sizes, chosen("legs6"))
+        learner = Learner(sizes, BITENO.chosen("legs6"))
         dist = learner.dist(parameters.nominal(learner.entries), sizes.policy_radius)
         train = jax.jit(
             lambda key, policy, learner=learner, dist=dist: learner.train(key, policy, dist, learner.preset.chunk)
@@ -103,7 +104,7 @@ def targets(args: Args) -> dict:
     """
     sizes = preset(args.preset)
     sizes = dataclasses.replace(sizes, task=dataclasses.replace(sizes.task, physics="exact"))
-    learner = Learner(sizes, chosen("foot_friction"))
+    learner = Learner(sizes, BITENO.chosen("foot_friction"))
     policy = starting_policy(args.policy, learner)
     rows = {}
     for name, make in TARGETS.items():
@@ -197,7 +198,7 @@ def alarm(args: Args) -> dict:
       By target: the number of rejections `rings`, `of` how many calls, and the gate's numbers in every call.
     """
     sizes = preset(args.preset)
-    learner = Learner(sizes, chosen("legs6"))
+    learner = Learner(sizes, BITENO.chosen("legs6"))
     policy = starting_policy(args.policy, learner)
     dist = learner.dist(parameters.nominal(learner.entries), args.radius)
     machine = learner.tuner(None)

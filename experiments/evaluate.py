@@ -18,10 +18,11 @@ from envs.targets.protocol import Commands
 from experiments.common import checkpoint, film, plots
 from experiments.common.checkpoint import write_json
 from experiments.common.cli import console, run
-from experiments.common.config import PRESETS, chosen, named_values, preset
+from experiments.common.config import PRESETS, named_values, preset
 from experiments.walking.learner import Learner
 from experiments.walking.policies import starting_policy
 from experiments.walking.quality import quality, record_walks
+from experiments.walking.robots import BITENO
 from experiments.walking.targets import TARGETS
 from jaxtune.mjx import parameters
 
@@ -83,7 +84,7 @@ def main(args: Args) -> None:
     params = check(args)
     sizes = preset(args.preset)
     # A learner needs a parameter; foot friction at its nominal value changes nothing.
-    entries = chosen(",".join(dict.fromkeys(("foot_friction", *params))))
+    entries = BITENO.chosen(",".join(dict.fromkeys(("foot_friction", *params))))
     task = dataclasses.replace(sizes.task, physics=args.physics)
     pushed = dataclasses.replace(task, push_mps=args.push)
     learners = {

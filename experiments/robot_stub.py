@@ -19,9 +19,9 @@ from pathlib import Path
 import numpy as np
 
 from envs.biteno import constants
+from envs.biteno.player import Player
 from envs.logs import Log, read, write
 from experiments.common.cli import console, run
-from experiments.robot.player import Player
 from experiments.robot.surrogate import ROW_S, Body, Robot
 
 

@@ -192,7 +192,7 @@ def evaluate(args: Args, programs: Programs, policy: Path) -> WalkMeans:
     found = place / "evaluation.json"
     if not found.exists():
         ppo = starting_policy(str(policy), programs.learner).learner
-        policy_files.export(place / "policy", ppo, programs.learner.preset)
+        policy_files.export(place / "policy", ppo, programs.learner)
         request(place, args.evaluation, args.walk_s, _EVALUATION_SEED)
         with stand_in(policy.parent):
             wait(place, _ANSWER_S)

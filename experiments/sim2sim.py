@@ -1,4 +1,4 @@
-"""Tunes the simulator of a walking BITeno to another simulator: `python -m experiments.sim2sim --out DIR`.
+"""Tunes a robot's simulator to another simulator: `python -m experiments.sim2sim --out DIR`.
 
 The simulator starts at its nominal model, in which the starting policy was trained. The target's parameters are the
 nominal ones divided by `start`, so the simulator starts at `start` times the target. The tables' error is
@@ -16,18 +16,17 @@ from pathlib import Path
 import jax
 from rich.progress import Progress
 
-from envs.biteno import constants
 from envs.targets.protocol import Target
 from experiments.common import checkpoint, plots, report
 from experiments.common.checkpoint import as_json, write_json
 from experiments.common.cli import bars, console, run
-from experiments.common.config import Preset, chosen, preset
+from experiments.common.config import Preset, named_values, preset
 from experiments.walking import comparison
-from experiments.walking.cases import CASES, check_case, check_positive
+from experiments.walking.cases import Case, check_positive, checked_case
 from experiments.walking.comparison import METHODS, UPDATES, contenders
 from experiments.walking.learner import Learner, Policy
-from experiments.walking.policies import starting_policy
-from experiments.walking.targets import TARGETS
+from experiments.walking.policies import default_policy, starting_policy
+from experiments.walking.robots import Kind, kind
 from jaxtune import tuner
 from jaxtune.mjx import Entry, parameters
 from jaxtune.types import ParamDist, Verdict
@@ -35,17 +34,23 @@ from jaxtune.types import ParamDist, Verdict
 
 @dataclass(frozen=True, kw_only=True)
 class Args:
-    """Tunes the simulator of a walking BITeno to a second simulator, the target, and compares tuning methods."""
+    """Tunes a robot's simulator to a second simulator, the target, and compares tuning methods."""
 
     out: Path = Path("runs/sim2sim")
     """Folder of the run. The same command with the same folder continues after the last finished (method, seed)."""
+    robot: str = "biteno"
+    """Robot and task: biteno, playground:NAME (an environment of MuJoCo Playground), or path/to/file.py:function, which
+    returns a jaxtune.mjx.Simulator or an environment."""
     case: str = "mass"
     """How the target differs: friction, mass, bullet (the engine PyBullet), weak_motor or weaker_motor (PyBullet with
     0.75 or 0.6 of the torque)."""
     start: float = 0.5
     """Where the simulator starts, as a multiple of the target's values; only the cases friction and mass use it."""
+    truth: tuple[str, ...] = ()
+    """True values of the target, name=value, in place of what the case says; parameters that are left out are
+    nominal."""
     target: str | None = None
-    """Engine of the target: mjx, mujoco_c or bullet; the case's own if not given."""
+    """Engine of the target: mjx, mujoco_c or bullet; the case's own if not given. Robots but biteno have mjx alone."""
     methods: tuple[str, ...] = ("ours", "dr")
     """Methods to compare: ours, spm (the paper's update without the gate), dr (wide domain randomisation without
     tuning), oracle (trained with the target's parameters)."""
@@ -53,11 +58,13 @@ class Args:
     """Number of random seeds; they count from 0."""
     preset: str = "cpu"
     """Size of the run: smoke (a minute, to see that it works), cpu (two cores) or gpu (one GPU)."""
-    policy: str = "walk"
-    """Starting policy: walk (ships with the package), scratch (trained first), or a folder of experiments.train."""
-    parameters: str = "legs6"
-    """Parameters that are tuned: legs6 (foot friction and the six link masses), whole_body (friction, trunk mass, link
-    masses with left and right tied), or names joined by commas."""
+    policy: str | None = None
+    """Starting policy: walk (biteno's, ships with the package), scratch (trained first), or a folder of
+    experiments.train; if not given, the one that ships, or scratch where none does."""
+    parameters: str | None = None
+    """Parameters that are tuned: names joined by commas, or a set: for biteno legs6 (foot friction and the six link
+    masses; its default) or whole_body (friction, trunk mass, link masses with left and right tied), for other robots
+    all, their default."""
     radius: float = 0.2
     """First radius (half width of the distribution) of ours and spm, in log space: 0.2 spans 0.82 to 1.22 times the
     centre."""
@@ -77,34 +84,30 @@ class Args:
     """Fixed threshold of the gate, a mean rank between 0 and 1, instead of the calibrated one."""
 
 
-def check(args: Args) -> tuple[Preset, dict[str, Entry], tuner.Knobs]:
+def check(args: Args) -> tuple[Preset, Kind, dict[str, Entry], Case, tuner.Knobs]:
     """Checks the arguments before anything is compiled.
 
     Returns:
-      Sizes, the table of parameters that are tuned, and the tuner's knobs.
+      Sizes, the robot, the table of its parameters that are tuned, the case, and the tuner's knobs.
 
     Raises:
       ValueError: names the field, the value and what is allowed.
     """
-    sizes, entries = preset(args.preset), chosen(args.parameters)
+    sizes, robot = preset(args.preset), kind(args.robot)
+    entries = robot.chosen(args.parameters)
     for option, values, allowed in (("update", (args.update,), UPDATES), ("methods", args.methods, METHODS)):
         for value in values:
             if value not in allowed:
                 raise ValueError(f"{option}: got '{value}', expected one of {', '.join(allowed)}")
     if not args.methods:
         raise ValueError(f"methods: got none, expected some of {', '.join(METHODS)}")
-    check_case(args.case, args.start, entries, args.parameters, args.target)
+    truth = named_values("truth", args.truth, robot.entries)
+    case = checked_case(args.case, args.start, entries, engines=robot.engines, target=args.target, truth=truth)
     check_positive(radius=args.radius, dr_radius=args.dr_radius, seeds=args.seeds)
     knobs = tuner.knobs(
         step_size=args.step_size, widen_factor=args.widen_factor, level=args.level, threshold=args.threshold
     )
-    return sizes, entries, knobs
-
-
-def make_target(args: Args, learner: Learner) -> Target:
-    """Makes the target of the case that the arguments name, in its engine."""
-    case = CASES[args.case]
-    return TARGETS[args.target or case.target](learner.robot, case.true_params(learner.entries, args.start))
+    return sizes, robot, entries, case, knobs
 
 
 class Runner:
@@ -205,16 +208,16 @@ def main(args: Args) -> None:
       ValueError: an option is wrong, the folder holds another run, or no measured episode lasts as long as a window.
     """
     checkpoint.set_up_compiler(preset(args.preset).xla_flags)
-    sizes, entries, knobs = check(args)
+    sizes, robot, entries, case, knobs = check(args)
+    args = dataclasses.replace(args, policy=args.policy or default_policy(robot))
     identity = {**dataclasses.asdict(args), "sizes": sizes}
     # A later call may add methods and seeds to the same folder.
     for option in ("out", "methods", "seeds"):
         del identity[option]
-    case = CASES[args.case]
-    hidden = parameters.select(constants.ENTRIES, [name for name in case.hidden if name not in entries])
-    learner = Learner(sizes, entries, hidden)
+    hidden = parameters.select(robot.entries, [name for name in case.hidden if name not in entries])
+    learner = Learner(sizes, entries, hidden, kind=robot)
     checkpoint.open_run(args.out, identity)
-    target = make_target(args, learner)
+    target = robot.engines[case.target](learner.robot, case.true_params(entries, args.start))
     runner = Runner(args, learner, target, starting_policy(args.policy, learner, args.out), knobs)
     with bars() as progress:
         results = {name: [runner(name, seed, progress) for seed in range(args.seeds)] for name in args.methods}

@@ -20,10 +20,11 @@ from rich.table import Table
 from envs.targets.mjx import MjxTarget
 from experiments.common import checkpoint, plots
 from experiments.common.cli import console, run
-from experiments.common.config import Preset, chosen, preset
-from experiments.walking.cases import CASES, check_case, check_positive
+from experiments.common.config import Preset, named_values, preset
+from experiments.walking.cases import Case, check_positive, checked_case
 from experiments.walking.learner import Learner, Policy
-from experiments.walking.policies import starting_policy
+from experiments.walking.policies import default_policy, starting_policy
+from experiments.walking.robots import Kind, kind
 from jaxtune import dist as dists
 from jaxtune import tuner
 from jaxtune.mjx import Entry, parameters
@@ -36,10 +37,16 @@ class Args:
 
     out: Path = Path("runs/sweep")
     """Folder of summary.json and heat_map.png."""
+    robot: str = "biteno"
+    """Robot and task: biteno, playground:NAME (an environment of MuJoCo Playground), or path/to/file.py:function, which
+    returns a jaxtune.mjx.Simulator or an environment."""
     case: str = "mass"
     """How the target differs: friction or mass."""
     start: float = 0.5
     """Where the simulator starts, as a multiple of the target's values."""
+    truth: tuple[str, ...] = ()
+    """True values of the target, name=value, in place of what the case says; parameters that are left out are
+    nominal."""
     step_sizes: tuple[float, ...] = (0.25, 0.5, 1.0)
     """Steps of the paper's update, in radii per unit of vote."""
     widen_factors: tuple[float, ...] = (1.5, 2.0)
@@ -52,32 +59,36 @@ class Args:
     """Number of random seeds of every combination; they count from 0."""
     preset: str = "cpu"
     """Size of the run: smoke (a minute, to see that it works), cpu (two cores) or gpu (one GPU)."""
-    policy: str = "walk"
-    """Policy, which stays fixed: walk (ships with the package), scratch (trained first), or a folder of
-    experiments.train."""
-    parameters: str = "legs6"
-    """Parameters that are tuned: legs6 (foot friction and the six link masses), whole_body (friction, trunk mass, link
-    masses with left and right tied), or names joined by commas."""
+    policy: str | None = None
+    """Policy, which stays fixed: walk (biteno's, ships with the package), scratch (trained first), or a folder of
+    experiments.train; if not given, the one that ships, or scratch where none does."""
+    parameters: str | None = None
+    """Parameters that are tuned: names joined by commas, or a set: for biteno legs6 (foot friction and the six link
+    masses; its default) or whole_body (friction, trunk mass, link masses with left and right tied), for other robots
+    all, their default."""
 
 
-def check(args: Args) -> tuple[Preset, dict[str, Entry]]:
+def check(args: Args) -> tuple[Preset, Kind, dict[str, Entry], Case]:
     """Checks the arguments, and every combination of the tuner's settings, before anything is compiled.
 
     Returns:
-      Sizes, with those of a sweep in the place of a single tuning's, and the table of parameters that are tuned.
+      Sizes, with those of a sweep in the place of a single tuning's, the robot, the table of its parameters that are
+      tuned, and the case.
 
     Raises:
       ValueError: names the field, the value and what is allowed.
     """
-    sizes, entries = preset(args.preset), chosen(args.parameters)
-    check_case(args.case, args.start, entries, args.parameters)
+    sizes, robot = preset(args.preset), kind(args.robot)
+    entries = robot.chosen(args.parameters)
+    truth = named_values("truth", args.truth, entries)
+    case = checked_case(args.case, args.start, entries, engines=robot.engines, truth=truth)
     combinations = itertools.product(args.step_sizes, args.widen_factors, args.radii, args.levels)
     for step_size, widen_factor, radius, level in combinations:
         check_positive(radius=radius, seeds=args.seeds)
         tuner.knobs(step_size=step_size, widen_factor=widen_factor, level=level)
-    if CASES[args.case].target != "mjx":
+    if case.target != "mjx":
         raise ValueError(f"case: got '{args.case}', expected friction or mass: a sweep needs a target in mjx")
-    return dataclasses.replace(sizes, tuner=sizes.sweep, episode_steps=sizes.sweep_steps), entries
+    return dataclasses.replace(sizes, tuner=sizes.sweep, episode_steps=sizes.sweep_steps), robot, entries, case
 
 
 def lanes(args: Args) -> np.ndarray:
@@ -90,15 +101,15 @@ def lanes(args: Args) -> np.ndarray:
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
 
 
-def program(args: Args, learner: Learner, policy: Policy) -> Callable:
+def program(learner: Learner, truth: Mapping[str, float], policy: Policy) -> Callable:
     """Makes the sweep one compiled function of its lanes, [lanes, 5] -> (distribution, info), both [lanes, ...].
 
     Args:
-      args: options of the command.
       learner: gives the tuner its functions.
+      truth: the target's physical values by name.
       policy: what walks in every lane; it is never trained.
     """
-    target = MjxTarget(robot=learner.robot, params=CASES[args.case].true_params(learner.entries, args.start))
+    target = MjxTarget(robot=learner.robot, params=truth)
     fixed = dataclasses.replace(learner.tuner(target), train_policy=_keep, update=tuner.vote_update)
     dist = learner.dist(parameters.nominal(learner.entries), 1.0)  # each lane sets a radius of its own
 
@@ -142,19 +153,20 @@ def main(args: Args) -> None:
       ValueError: an option is wrong, or the folder holds another run.
     """
     checkpoint.set_up_compiler(preset(args.preset).xla_flags)
-    sizes, entries = check(args)
-    learner = Learner(sizes, entries)
+    sizes, robot, entries, case = check(args)
+    args = dataclasses.replace(args, policy=args.policy or default_policy(robot))
+    learner = Learner(sizes, entries, kind=robot)
     checkpoint.open_run(args.out, {**dataclasses.asdict(args), "out": None, "sizes": sizes})
     policy = starting_policy(args.policy, learner, args.out)
     grid = lanes(args)
-    sweep = program(args, learner, policy)
+    truth = case.true_params(entries, args.start)
+    sweep = program(learner, truth, policy)
     begin = time.monotonic()
     dist, info = jax.block_until_ready(sweep(jnp.asarray(grid.reshape(-1, grid.shape[-1]))))
     seconds = time.monotonic() - begin
 
-    case = CASES[args.case]
     off = case.off(entries)
-    final = mean_error(learner, case.true_params(entries, args.start), dist.centre, off).reshape(grid.shape[:-1])
+    final = mean_error(learner, truth, dist.centre, off).reshape(grid.shape[:-1])
     calls = np.asarray(info.calls).sum(axis=-1).reshape(grid.shape[:-1])
     names = ("step_size", "widen_factor", "radius", "level")
     rows = [

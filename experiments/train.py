@@ -1,4 +1,4 @@
-"""Trains a walking policy and saves it: `python -m experiments.train --out DIR`."""
+"""Trains a policy and saves it: `python -m experiments.train --out DIR`."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,25 +9,30 @@ from envs import corrected
 from experiments.common import checkpoint, plots
 from experiments.common.checkpoint import write_json
 from experiments.common.cli import bars, console, run
-from experiments.common.config import chosen, preset
+from experiments.common.config import preset
 from experiments.walking.learner import Learner
 from experiments.walking.policies import policy_config, walk
+from experiments.walking.robots import kind
 
 
 @dataclass(frozen=True, kw_only=True)
 class Args:
-    """Trains BITeno to walk from scratch with PPO, and saves the policy for the other commands."""
+    """Trains a policy from scratch with PPO, and saves it for the other commands."""
 
     out: Path
     """Folder of the policy: orbax checkpoint, config.json, curve.json, curve.png."""
+    robot: str = "biteno"
+    """Robot and task: biteno, playground:NAME (an environment of MuJoCo Playground), or path/to/file.py:function, which
+    returns a jaxtune.mjx.Simulator or an environment."""
     preset: str = "cpu"
     """Size of the run: smoke (seconds, to see that it works), cpu (two cores) or gpu (one GPU)."""
-    parameters: str = "legs6"
-    """Parameters that are randomised in training, a little (the preset's policy_radius): legs6 (foot friction and the
-    six link masses), whole_body (friction, trunk mass, link masses with left and right tied), or names joined by
-    commas."""
+    parameters: str | None = None
+    """Parameters that are randomised in training, a little (the preset's policy_radius): names joined by commas, or a
+    set: for biteno legs6 (foot friction and the six link masses; its default) or whole_body (friction, trunk mass, link
+    masses with left and right tied), for other robots all, their default."""
     model: Path | None = None
-    """Folder of a corrected model that discovery wrote (`OUT/model`), to train in instead of the nominal model."""
+    """Folder of a corrected model that discovery wrote (`OUT/model`), to train in instead of the nominal model; for
+    biteno alone."""
     updates: int | None = None
     """Number of PPO updates; the preset's scratch_updates if not given."""
     seed: int = 0
@@ -41,16 +46,17 @@ def main(args: Args) -> None:
       ValueError: an option is wrong, or the corrected model cannot be read.
     """
     checkpoint.set_up_compiler(preset(args.preset).xla_flags)
-    sizes, entries = preset(args.preset), chosen(args.parameters)
+    sizes, robot = preset(args.preset), kind(args.robot)
+    entries = robot.chosen(args.parameters)
     updates = sizes.scratch_updates if args.updates is None else args.updates
     if updates < 1:
         raise ValueError(f"updates: got {updates}, expected 1 or more")
-    learner = Learner(sizes, entries, correction=args.model and corrected.read(args.model))
+    learner = Learner(sizes, entries, correction=args.model and corrected.read(args.model), kind=robot)
     with bars() as progress:
         policy, curve = walk(jax.random.PRNGKey(args.seed), learner, updates, progress)
     checkpoint.save(args.out, policy.learner, policy_config(learner))
     write_json(args.out / "curve.json", {"args": args, "curve": curve})
-    plots.training(args.out / "curve.png", curve)
+    plots.training(args.out / "curve.png", curve, robot.control_s, robot.shown)
     first, last = curve[0], curve[-1]
     # The first chunk includes compilation, so the speed is that of the others.
     if len(curve) > 1:

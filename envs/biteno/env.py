@@ -135,6 +135,11 @@ class Biteno:
         )
         return state.replace(obs=self._observe(state, key_noise))
 
+    @staticmethod
+    def observed(obs: jax.Array) -> jax.Array:
+        """Returns the observation as it is; other robots (`jaxtune.mjx.Robot`) may have several arrays."""
+        return obs
+
     def step(self, params: parameters.Params, state: State, action: jax.Array) -> State:
         """Moves the robot by one policy step of 10 ms.
 

@@ -63,7 +63,7 @@ class HostTarget:
         self._reset = jax.jit(jax.vmap(lambda key: robot.reset({}, key)))
         self._with_command = jax.jit(jax.vmap(robot.with_command))
         self._drive = jax.jit(jax.vmap(lambda state, action: robot.drive(params, state, action)))
-        self._choose = jax.jit(lambda act, obs, keys: jax.vmap(lambda *one: act(*one)[0])(obs, keys))
+        self._choose = jax.jit(lambda act, obs, keys: jax.vmap(act)(obs, keys))
         self._settle = jax.jit(jax.vmap(robot.settle))
 
     def episodes(self, key: jax.Array, act: Act, count: int, steps: int) -> Trajectory:

@@ -12,7 +12,8 @@ import jax.numpy as jnp
 
 from envs.biteno import Biteno
 from envs.targets.protocol import Act, Commands, Recording, watch
-from jaxtune.mjx import in_chunks, parameters
+from jaxtune import mjx
+from jaxtune.mjx import parameters
 from jaxtune.types import Coords, Trajectory
 
 
@@ -25,9 +26,7 @@ def rollout(
     commands: Commands | None = None,
     watch: Callable[..., Any] = lambda before, after, motion: (),
 ) -> tuple[Trajectory, Any]:
-    """Simulates one episode for every draw of the parameters.
-
-    An episode ends where the robot falls or a number is not finite; that step is counted in `not_finite` and masked.
+    """Simulates one episode for every draw of the parameters (`jaxtune.mjx.rollout`).
 
     Args:
       robot: robot and task.
@@ -41,35 +40,14 @@ def rollout(
     Returns:
       The episodes, and what was recorded of them, [episodes, time, ...].
     """
-    # Without the barrier the compiler would fold constant parameters into every derived field of every model, and take
-    # minutes.
-    params = jax.lax.optimization_barrier(dict(params))
-    keys = jax.random.split(key, next(iter(params.values())).shape[0])
-    inputs = (keys, params) + (() if commands is None else (commands,))
-    return in_chunks(lambda *drawn: _episode(robot, act, steps, watch, *drawn), inputs)
+    if commands is None:
+        return mjx.rollout(robot, key, act, params, steps, watch=watch)
 
+    def prepare(state, commands, step):
+        phase = state.phase if commands.phase is None else jnp.where(step == 0, commands.phase, state.phase)
+        return robot.with_command(state, commands.command[step], phase)
 
-def _episode(robot, act, steps, watch, key, params, commands=None) -> tuple[Trajectory, Any]:
-    key_reset, key_act = jax.random.split(key)
-    state = robot.reset(params, key_reset)
-    if commands is not None and commands.phase is not None:
-        state = robot.with_command(state, commands.command[0], commands.phase)
-
-    def step(carry, now):
-        (state, alive), (key, command) = carry, now
-        state = state if command is None else robot.with_command(state, command, state.phase)
-        action, _ = act(state.obs, key)
-        following, motion = robot.move(params, state, action)
-        broke = alive & (following.not_finite > 0)
-        score = jnp.where(alive & ~broke, following.score, 0.0)
-        record = (state.obs, action, alive & ~broke, score, broke), watch(state, following, motion)
-        return (following, alive & (following.done == 0)), record
-
-    during = (jax.random.split(key_act, steps), None if commands is None else commands.command)
-    (_, alive), (record, watched) = jax.lax.scan(step, (state, jnp.asarray(True)), during)
-    obs, action, valid, score, broke = record
-    trajectory = Trajectory(obs=obs, action=action, alive=valid, score=score, fell=~alive, not_finite=broke.any())
-    return trajectory, watched
+    return mjx.rollout(robot, key, act, params, steps, given=commands, prepare=prepare, watch=watch)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,9 +9,8 @@ import jax
 from envs.biteno import Motion, State
 from jaxtune.types import Trajectory
 
-Act = Callable[[jax.Array, jax.Array], tuple[jax.Array, dict]]
-"""A policy: `(observation [obs], key) -> (action [act], extras)`. Extras are what PPO wants recorded; targets ignore
-them."""
+Act = Callable[[jax.Array, jax.Array], jax.Array]
+"""A policy: `(observation [obs], key) -> action [act]`."""
 
 
 @chex.dataclass(frozen=True)

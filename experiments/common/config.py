@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from envs.biteno import TaskConfig, constants
+from envs.biteno import TaskConfig
 from jaxtune.dvm import DVMConfig
 from jaxtune.mjx import Entry, select
 from jaxtune.ppo import PPOConfig
@@ -132,22 +132,6 @@ def preset(name: str) -> Preset:
     if name not in PRESETS:
         raise ValueError(f"preset: got '{name}', expected one of {', '.join(PRESETS)}")
     return PRESETS[name]
-
-
-def chosen(parameters: str) -> dict[str, Entry]:
-    """Returns the rows of BITeno's parameter table that `--parameters` names.
-
-    Args:
-      parameters: the name of a set (`legs6`, `whole_body`), or names of parameters joined by commas.
-
-    Returns:
-      The rows (`jaxtune.mjx.Entry`) by name, in the order given.
-
-    Raises:
-      ValueError: a name is neither; the message lists those that exist.
-    """
-    names = constants.PARAMETER_SETS.get(parameters) or tuple(name.strip() for name in parameters.split(","))
-    return select(constants.ENTRIES, names)
 
 
 def named_values(option: str, items: Sequence[str], entries: Mapping[str, Entry]) -> dict[str, float]:

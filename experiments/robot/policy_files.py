@@ -1,7 +1,8 @@
 """Writes policy files that a robot's computer can run without JAX.
 
 `policy.onnx` is the network from observation to action, with its normaliser. `policy.npz` holds the same numbers for
-`player.py`, which needs only NumPy. Both contain under `meta`, as JSON, everything around the network.
+`network.py`, which needs only NumPy. Both contain under `meta`, as JSON, everything around the network. A robot with a
+player of its own (`Kind.player`) gets that too.
 """
 
 import json
@@ -10,48 +11,11 @@ from pathlib import Path
 from types import ModuleType
 
 import jax
-import mujoco
 import numpy as np
 
-from envs import sensing
-from envs.biteno import constants, env
-from experiments.common.config import Preset
-from experiments.robot import player
+from experiments.walking.learner import Learner
+from jaxtune import network
 from jaxtune.ppo import PPO, PPOState
-
-
-def meta(sizes: Preset) -> dict:
-    """Describes everything around the network, for the metadata of the exported files.
-
-    Args:
-      sizes: the preset that the policy was trained with.
-
-    Returns:
-      Joints, rate, layout and scales of the observation, the gait clock, the reference that an action is added to, and
-      the joint controller's gains; all of it JSON.
-    """
-    model = mujoco.MjModel.from_xml_path(str(constants.MODEL_PATH))
-    kp, kd, limit = model.actuator_gainprm[:, 0], -model.actuator_biasprm[:, 2], model.actuator_forcerange[:, 1]
-    return {
-        "robot": "biteno",
-        "joints": list(constants.JOINTS),
-        "rate_hz": 1.0 / constants.POLICY_DT_S,
-        "observation": [
-            {"name": name, "size": len(scale), "scale": scale.tolist()} for name, scale in sensing.LAYOUT.items()
-        ],
-        "stand_rad": constants.STAND_RAD.tolist(),
-        "action_limit": env.ACTION_LIMIT,
-        "action_scale": sizes.task.action_scale,
-        "base": sizes.task.base,
-        "clock": {"hz": constants.CLOCK_HZ, "duty": constants.DUTY, "offsets": [0.0, 0.5]},
-        "leg": {
-            "hip_y_m": constants.HIP_Y_M.tolist(),
-            "link_m": constants.LINK_M,
-            "stance_depth_m": constants.STANCE_DEPTH_M,
-            "swing_height_m": constants.SWING_HEIGHT_M,
-        },
-        "controller": {"type": "pd", "kp": kp.tolist(), "kd": kd.tolist(), "torque_limit_nm": limit.tolist()},
-    }
 
 
 def require_onnx() -> ModuleType:
@@ -69,20 +33,21 @@ def require_onnx() -> ModuleType:
     return onnx
 
 
-def export(out: Path, ppo: PPOState, sizes: Preset) -> None:
-    """Writes the three files that a robot needs: `policy.onnx`, `policy.npz` and `player.py`.
+def export(out: Path, ppo: PPOState, learner: Learner) -> None:
+    """Writes the files that a robot needs: `policy.onnx`, `policy.npz`, `network.py`, and its player if it has one.
 
     Args:
       out: folder for them, made where it is missing.
       ppo: the learnt policy.
-      sizes: the preset that it was trained with; `meta` takes reference and action scale from it.
+      learner: of the robot and the preset that it was trained with.
 
     Raises:
       ValueError: the package `onnx` is not installed.
     """
     onnx = require_onnx()
     (mean, std), layers = jax.device_get(PPO.layers(ppo))
-    text = json.dumps(meta(sizes) | {"layers": len(layers)})
+    kind = learner.kind
+    text = json.dumps(kind.meta(learner.preset, learner.robot) | {"layers": len(layers)})
     out.mkdir(parents=True, exist_ok=True)
     onnx.save(_graph(onnx, mean, std, layers, text), out / "policy.onnx")
     arrays = {
@@ -91,7 +56,9 @@ def export(out: Path, ppo: PPOState, sizes: Preset) -> None:
         for name, part in zip(("kernel", "bias"), layer, strict=True)
     }
     np.savez(out / "policy.npz", meta=np.array(text), mean=mean, std=std, **arrays)
-    shutil.copy(player.__file__, out / "player.py")
+    shutil.copy(network.__file__, out / "network.py")
+    if kind.player:
+        shutil.copy(kind.player, out / "player.py")
 
 
 def _graph(onnx, mean: np.ndarray, std: np.ndarray, layers, text: str):

@@ -81,7 +81,7 @@ class Programs:
         self.train = jax.jit(learner.tuner().train)
         self.predict = jax.jit(learner.predict, static_argnums=(3, 4))
         self.act = jax.jit(
-            lambda policy, obs: jax.vmap(lambda one: learner.act(policy)(one, jax.random.PRNGKey(0))[0])(obs)
+            lambda policy, obs: jax.vmap(lambda one: learner.act(policy)(one, jax.random.PRNGKey(0)))(obs)
         )
 
 
@@ -219,7 +219,7 @@ class Rounds:
         place = self._place(index)
         if (place / "request.json").exists():
             return
-        policy_files.export(place / "policy", state.policy.learner, self._learner.preset)
+        policy_files.export(place / "policy", state.policy.learner, self._learner)
         episodes, seconds = self._learner.preset.tuner.set_episodes, self._terms.walk_s
         request(place, episodes, seconds, 1000 * self._terms.seed + index)
         console.print(f"round {index}: requested {episodes} walks of {seconds:g} s in {place}, waiting for the log")

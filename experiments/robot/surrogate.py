@@ -12,9 +12,9 @@ import mujoco
 import numpy as np
 
 from envs.biteno import TaskConfig, constants, env
+from envs.biteno.player import Player
 from envs.logs import Controller, Run
 from envs.models import suspended as fixed_base
-from experiments.robot.player import Player
 
 _STEP_S = 0.0005  # of the physics; shorter than the learner's, so that the engine differs too
 _TICK_S = 0.001  # period of the joint controllers

@@ -14,12 +14,13 @@ from envs import corrected
 from envs.biteno import constants
 from experiments.common import checkpoint
 from experiments.common.cli import console
-from experiments.common.config import Preset, chosen, named_values, preset
+from experiments.common.config import Preset, named_values, preset
 from experiments.robot import policy_files, report
 from experiments.robot.records import Round
 from experiments.robot.rounds import STRATEGIES, Programs, Rounds, Terms
 from experiments.walking.learner import Learner
 from experiments.walking.policies import starting_policy
+from experiments.walking.robots import BITENO
 from jaxtune.mjx import Entry, nominal
 
 
@@ -70,7 +71,7 @@ def check(transfer: Transfer) -> tuple[Preset, dict[str, Entry], dict[str, float
     Raises:
       ValueError: names the field, the value and what is allowed.
     """
-    sizes, entries = preset(transfer.preset), chosen(transfer.parameters)
+    sizes, entries = preset(transfer.preset), BITENO.chosen(transfer.parameters)
     if transfer.method not in STRATEGIES:
         raise ValueError(f"method: got '{transfer.method}', expected one of {', '.join(STRATEGIES)}")
     epochs = 2 * sizes.epochs if transfer.epochs is None else transfer.epochs

@@ -1,9 +1,8 @@
 """The cases of `sim2sim`: how the target differs from the simulator, after the paper's Figs. 3.1 to 3.4."""
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field, replace
 
-from experiments.walking.targets import TARGETS
 from jaxtune.mjx import Entry, parameters
 
 
@@ -16,26 +15,35 @@ class Case:
     means that the target's masses are twice the nominal ones.
     """
 
-    scaled: Callable[[str], bool] = lambda name: False
-    """Tells by the name of a parameter whether the target has its nominal value divided by `start`."""
+    scaled: str = ""
+    """Field of the model; the target has the nominal value divided by `start` of every multiplier of this field."""
     hidden: Mapping[str, float] = field(default_factory=dict)
-    """Further physical values of the target, by name. They do not depend on `start`, and need not be tuned."""
+    """Physical values of the target, by name. They do not depend on `start`, and need not be tuned."""
     target: str = "mjx"
     """Engine of the target."""
+
+    def with_truth(self, truth: Mapping[str, float]) -> "Case":
+        """Returns the case with these physical values of the target, by name; where given, they alone differ."""
+        return replace(self, scaled="", hidden=dict(truth)) if truth else self
+
+    def scales(self, entry: Entry) -> bool:
+        """Tells whether the target has a nominal value divided by `start` of this parameter."""
+        return entry.log and self.scaled in entry.field_names
 
     def true_params(self, entries: Mapping[str, Entry], start: float) -> dict[str, float]:
         """Returns the target's physical values by name: all parameters of `entries`, and those of `hidden`."""
         nominal = parameters.nominal(entries)
-        return {name: value / start if self.scaled(name) else value for name, value in nominal.items()} | self.hidden
+        scaled = {name: value / start for name, value in nominal.items() if self.scales(entries[name])}
+        return {**nominal, **scaled, **self.hidden}
 
     def off(self, entries: Mapping[str, Entry]) -> tuple[str, ...]:
         """Returns the names of tuned parameters whose true value is not nominal: those that tuning has to find."""
-        return tuple(name for name in entries if self.scaled(name) or name in self.hidden)
+        return tuple(name for name, entry in entries.items() if self.scales(entry) or name in self.hidden)
 
 
 CASES = {
-    "friction": Case(scaled=lambda name: name == "foot_friction"),
-    "mass": Case(scaled=lambda name: name.endswith("_mass")),
+    "friction": Case(scaled="geom_friction"),
+    "mass": Case(scaled="body_mass"),
     "bullet": Case(target="bullet"),
     "weak_motor": Case(hidden={"torque_scale": 0.75}, target="bullet"),
     "weaker_motor": Case(hidden={"torque_scale": 0.6}, target="bullet"),
@@ -43,37 +51,48 @@ CASES = {
 """The paper's four cases, Figs. 3.1 to 3.4, and a weaker motor, since this walk loses little with the paper's."""
 
 
-def check_case(
-    name: str, start: float, entries: Mapping[str, Entry], parameter_option: str, target: str | None = None
-) -> None:
-    """Checks that the target of a case differs from the simulator in something that can be tuned or measured.
+def checked_case(
+    name: str,
+    start: float,
+    entries: Mapping[str, Entry],
+    *,
+    engines: Collection[str],
+    target: str | None = None,
+    truth: Mapping[str, float] | None = None,
+) -> Case:
+    """Returns a case whose target differs from the simulator in something that can be tuned or measured.
 
     Args:
       name: of the case.
       start: where the simulator starts, as a multiple of the target.
       entries: the parameter table that is tuned.
-      parameter_option: value of `--parameters`, for the message.
+      engines: those that have a target of this robot.
       target: engine of the target; None means the case's own.
+      truth: physical values of the target by name, in place of the case's; empty or None for the case's.
 
     Raises:
       ValueError: names the option, the value and what is allowed.
     """
-    for option, value, allowed in (("case", name, CASES), ("target", target, TARGETS)):
+    for option, value, allowed in (("case", name, CASES), ("target", target, engines)):
         if value is not None and value not in allowed:
             raise ValueError(f"{option}: got '{value}', expected one of {', '.join(allowed)}")
-    case = CASES[name]
-    # In another engine, or with hidden values, a target differs even if no tuned parameter does.
-    about_parameters = case.target == "mjx" or ((target or case.target) == "mjx" and not case.hidden)
+    case = CASES[name].with_truth(truth or {})
+    case = replace(case, target=target or case.target)
+    if case.target not in engines:
+        raise ValueError(f"case: got '{name}', whose target is in {case.target}; this robot has {', '.join(engines)}")
+    # A case of another engine, or of values that nobody need tune, has a gap even if no tuned parameter differs.
+    about_parameters = "mjx" in (case.target, CASES[name].target) and not case.hidden
     if about_parameters and not case.off(entries):
         raise ValueError(
-            f"parameters: got '{parameter_option}', but case '{name}' needs one whose value differs in its target"
+            f"parameters: got {', '.join(entries)}, but case '{name}' needs one whose value differs in its target"
         )
     check_positive(start=start)
     # A true value outside the bounds could never be found.
-    for parameter in filter(case.scaled, entries):
-        low, high = entries[parameter].bounds
-        if not low <= 1.0 / start <= high:
+    for parameter, entry in entries.items():
+        low, high = entry.bounds
+        if case.scales(entry) and not low <= 1.0 / start <= high:
             raise ValueError(f"start: got {start}, expected {1 / high:g} to {1 / low:g} ({parameter}'s bounds)")
+    return case
 
 
 def check_positive(**options: float) -> None:

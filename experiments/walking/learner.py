@@ -1,4 +1,4 @@
-"""Connects BITeno to the tuner: how its policy learns, and how episodes are simulated, measured and scored.
+"""Connects a robot to the tuner: how its policy learns, and how episodes are simulated, measured and scored.
 
 `Learner` binds one robot, one preset and one parameter table together. It offers the pure functions that
 `jaxtune.tuner.Tuner` needs (`train`, `simulate`, a target's `measure`), and further ones for the commands (`evaluate`,
@@ -8,21 +8,21 @@
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from types import MappingProxyType
+from typing import Any
 
 import chex
 import jax
 import jax.numpy as jnp
 from brax.envs.base import State
 
-from envs import corrected
-from envs.biteno import BraxBiteno, constants, gait
 from envs.corrected import Correction
 from envs.targets.mjx import MjxTarget, rollout, simulate
 from envs.targets.protocol import Act, Commands, Target
 from experiments.common.config import Preset
+from experiments.walking.robots import BITENO, Kind
 from jaxtune import dist as dists
 from jaxtune.baselines import Untuned
-from jaxtune.mjx import Entry, parameters
+from jaxtune.mjx import Entry, TrainingBatch, parameters
 from jaxtune.ppo import PPO, PPOState
 from jaxtune.tuner import Tuner
 from jaxtune.types import Coords, ParamDist, Trajectory
@@ -46,7 +46,7 @@ class Policy:
 class Learner:
     """Trains, simulates and evaluates policies of one robot, as pure functions.
 
-    Use it wherever a command needs BITeno: run the tuner that `learner.tuner(target)` makes, or jit single methods.
+    Use it wherever a command needs a robot: run the tuner that `learner.tuner(target)` makes, or jit single methods.
     All runs of the same preset and table can share one learner, and with it the programs that were compiled for it.
 
     Args:
@@ -54,6 +54,7 @@ class Learner:
       entries: the parameter table that is tuned.
       hidden: parameters that are not tuned, but may differ from nominal in training. `oracle` uses them.
       correction: a corrected model that discovery wrote; None means the nominal model.
+      kind: the robot.
     """
 
     def __init__(
@@ -62,13 +63,17 @@ class Learner:
         entries: Mapping[str, Entry],
         hidden: Mapping[str, Entry] = MappingProxyType({}),
         correction: Correction | None = None,
+        kind: Kind = BITENO,
     ):
-        self.preset = preset
+        self.preset = preset = replace(preset, episode_steps=min(preset.episode_steps, kind.episode_steps))
+        self.kind = kind
         self.entries = entries
         self._hidden = hidden
-        self.robot = corrected.make(preset.task, {**entries, **hidden}, correction)
-        pushed = replace(preset.task, push_mps=preset.push_mps)
-        self._env = BraxBiteno(corrected.make(pushed, self.robot.entries, correction))
+        self.robot = kind.make(preset, {**entries, **hidden}, correction)
+        self.longest = round(preset.task.episode_s / kind.control_s)
+        """Control steps of an episode of the full time limit."""
+        trained = kind.make(kind.trained(preset), self.robot.entries, correction)
+        self._env = TrainingBatch(trained, self.robot.entries, self.longest)
         self._ppo = PPO(preset.ppo, self.robot.observation_size, self.robot.action_size)
         # One compiled program serves all methods, because they differ only in its arguments.
         self._train = jax.jit(lambda key, policy, dist: self.train(key, policy, dist, preset.epochs))
@@ -180,8 +185,7 @@ class Learner:
         Returns:
           Mean return under the weights of Table I, and number of episodes that ended in a fall.
         """
-        steps = round(self.preset.task.episode_s / constants.POLICY_DT_S)
-        trajectory = play(key, policy, self.preset.evaluation_episodes, steps)
+        trajectory = play(key, policy, self.preset.evaluation_episodes, self.longest)
         return float(trajectory.score.sum(axis=-1).mean()), int(trajectory.fell.sum())
 
     def predict(self, key: jax.Array, policy: Policy, dist: ParamDist, count: int, steps: int) -> dict[str, jax.Array]:
@@ -207,7 +211,7 @@ class Learner:
             self.act(policy),
             params,
             steps,
-            watch=lambda before, after, motion: gait.power(motion.torque, motion.qvel[6:]),
+            watch=lambda before, after, motion: self.kind.power(motion),
         )
         return summarise_walks(trajectory, power)
 
@@ -253,15 +257,15 @@ class Learner:
         return step
 
     def act(self, policy: Policy) -> Act:
-        """Makes the policy's action function, `(observation [obs], key) -> (action [act], extras)`.
+        """Makes the policy's action function, `(observation [obs], key) -> action [act]`.
 
         It has no exploration noise. Targets and simulators take it to play episodes.
         """
         # A pytree, so that a program which takes it as an argument is not compiled again for the next policy.
         return jax.tree_util.Partial(self._act, policy.learner)
 
-    def _act(self, ppo: PPOState, obs: jax.Array, key: jax.Array):
-        return self._ppo.act(ppo)(obs, key)
+    def _act(self, ppo: PPOState, obs: Any, key: jax.Array) -> jax.Array:
+        return self._ppo.act(ppo)(self.robot.observed(obs), key)[0]
 
 
 def summarise_walks(trajectory: Trajectory, power: jax.Array) -> dict[str, jax.Array]:

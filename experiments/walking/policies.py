@@ -14,8 +14,8 @@ from rich.progress import Progress
 from experiments.common import checkpoint
 from experiments.common.checkpoint import write_json
 from experiments.common.cli import bars
-from experiments.common.config import WALK
 from experiments.walking.learner import Learner, Policy
+from experiments.walking.robots import Kind
 from jaxtune.mjx import parameters
 
 
@@ -25,8 +25,7 @@ def policy_config(learner: Learner) -> dict:
     With another reference pose, action scale or network, the same weights would be another policy. So `starting_policy`
     refuses a folder whose config differs.
     """
-    task, ppo = learner.preset.task, learner.preset.ppo
-    return {"base": task.base, "action_scale": task.action_scale, "hidden": list(ppo.hidden)}
+    return {**learner.kind.config(learner.preset), "hidden": list(learner.preset.ppo.hidden)}
 
 
 def walk(
@@ -60,6 +59,11 @@ def walk(
     return policy, curve
 
 
+def default_policy(kind: Kind) -> str:
+    """Returns the name of the policy that a command begins with where its user names none."""
+    return "scratch" if kind.policy is None else "walk"
+
+
 def starting_policy(name: str, learner: Learner, out: Path | None = None) -> Policy:
     """Loads the policy that a command begins with.
 
@@ -73,10 +77,15 @@ def starting_policy(name: str, learner: Learner, out: Path | None = None) -> Pol
       The policy, on freshly reset training robots.
 
     Raises:
-      ValueError: the folder holds no policy, or one of another config; names the field that differs.
+      ValueError: the robot ships no policy, the folder holds none, or one of another config; names the field that
+        differs.
     """
     fresh = learner.init(jax.random.PRNGKey(0))
-    place = WALK if name == "walk" else Path(name)
+    place = Path(name)
+    if name == "walk":
+        place = learner.kind.policy
+        if place is None:
+            raise ValueError(f"policy: got 'walk', but {learner.kind.name} ships none; expected scratch or a folder")
     if name == "scratch":
         place = out / "policy"
         if not (place / "config.json").exists():

@@ -16,6 +16,7 @@ This package is the only one in jaxtune that imports MuJoCo; the tuner does with
 """
 
 from jaxtune.mjx.derived_fields import set_const
+from jaxtune.mjx.episodes import Robot, in_chunks, rollout
 from jaxtune.mjx.parameters import (
     Entry,
     Params,
@@ -29,12 +30,15 @@ from jaxtune.mjx.parameters import (
     to_coords,
 )
 from jaxtune.mjx.rows import action_delay, field, friction, mass, parameters_of, strength
-from jaxtune.mjx.simulator import Simulator, in_chunks, with_model
+from jaxtune.mjx.simulator import Simulator, model_of, with_model
+from jaxtune.mjx.training import TrainingBatch
 
 __all__ = [
     "Entry",
     "Params",
+    "Robot",
     "Simulator",
+    "TrainingBatch",
     "action_delay",
     "apply",
     "apply_mujoco",
@@ -45,8 +49,10 @@ __all__ = [
     "from_coords",
     "in_chunks",
     "mass",
+    "model_of",
     "nominal",
     "parameters_of",
+    "rollout",
     "select",
     "set_const",
     "strength",

@@ -13,8 +13,10 @@ import copy
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property, partial
 from typing import Any
 
+import chex
 import jax
 import jax.numpy as jnp
 from mujoco import mjx
@@ -22,10 +24,9 @@ from mujoco import mjx
 from jaxtune import dist as dists
 from jaxtune.mjx import parameters
 from jaxtune.mjx.derived_fields import DERIVED
+from jaxtune.mjx.episodes import rollout
 from jaxtune.mjx.parameters import Entry, Params
 from jaxtune.types import Coords, ParamDist, Trajectory
-
-_CHUNK = 256  # small batches are fastest on a CPU; larger ones are simulated in turn
 
 Act = Callable[[Any, Any, jax.Array], jax.Array]
 """A policy: `(policy, observation of one environment, key) -> action [act]`."""
@@ -48,27 +49,20 @@ def with_model(env: Any, model: mjx.Model) -> Any:
     return env
 
 
-def in_chunks(function: Callable[..., Any], inputs: Any) -> Any:
-    """Maps a function over the first axis of its inputs, `_CHUNK` at a time in parallel.
+@chex.dataclass(frozen=True)
+class State:
+    """A robot between two control steps, and what the last one earned."""
 
-    Args:
-      function: of one item; it is vmapped.
-      inputs: tuple of arguments, pytrees whose leaves are all [count, ...].
-
-    Returns:
-      What the function returns, [count, ...].
-    """
-    several = jax.vmap(function)
-    count = len(jax.tree.leaves(inputs)[0])
-    if count <= _CHUNK:
-        return several(*inputs)
-    # Chunks of equal size need one compilation; the last one is filled up with repetitions.
-    chunks = -(-count // _CHUNK)
-    size = -(-count // chunks)
-    fill = jnp.arange(chunks * size) % count
-    inputs = jax.tree.map(lambda x: x[fill].reshape(chunks, size, *x.shape[1:]), inputs)
-    stacked = jax.lax.map(lambda item: several(*item), inputs)
-    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:count], stacked)
+    env: Any  # the environment's own state
+    obs: Any  # what the policy is given
+    past: jax.Array  # [time, act] latest actions, newest first, as many as a delay needs
+    reward: jax.Array
+    score: jax.Array  # the same: what is trained is what is scored
+    done: jax.Array
+    not_finite: jax.Array  # 1 where observation or reward is not finite
+    steps: jax.Array  # control steps since the reset
+    terms: dict  # the environment's metrics that are single numbers
+    key: jax.Array
 
 
 @dataclass(frozen=True)
@@ -98,7 +92,7 @@ class Simulator:
 
     def __post_init__(self) -> None:
         if self.model is None:
-            object.__setattr__(self, "model", _model_of(self.env))
+            object.__setattr__(self, "model", model_of(self.env))
         if self.steps < 1:
             raise ValueError(f"steps: got {self.steps}, expected at least 1")
         if not self.parameters:
@@ -109,6 +103,11 @@ class Simulator:
             raise ValueError(f"parameters: got {' and '.join(delays)}, expected one action_delay at most")
         if delays and not hasattr(self.env, "dt"):
             raise ValueError(f"parameter '{delays[0]}': the environment has no dt, the control period in seconds")
+
+    @property
+    def entries(self) -> Mapping[str, Entry]:
+        """The table, by the name that other robots have it under."""
+        return self.parameters
 
     def dist(self, radius: float = 0.2, centre: Params | None = None) -> ParamDist:
         """Makes the distribution that a search begins with.
@@ -157,13 +156,77 @@ class Simulator:
         Parameters that are left out stay nominal. An episode ends where the environment is done or a number is not
         finite; the latter is counted in `not_finite`.
         """
-        # Without the barrier the compiler would fold constant parameters into every derived field of every model, and
-        # take minutes.
-        params = jax.lax.optimization_barrier({name: jnp.asarray(value) for name, value in params.items()})
-        count = len(next(iter(params.values())))
-        return in_chunks(
-            lambda key, params: self._episode(act, policy, key, params), (jax.random.split(key, count), params)
+        return rollout(self, key, partial(act, policy), params, self.steps)[0]
+
+    def reset(self, params: Params, key: jax.Array) -> State:
+        """Starts an episode of one robot with these parameters; those that are left out are nominal."""
+        key_reset, key = jax.random.split(key)
+        # Environments of Playground and Brax keep raw keys in their states.
+        start = self._env(params).reset(_raw(key_reset))
+        nothing = jnp.zeros(())
+        return self._as_state(
+            start,
+            past=jnp.zeros((len(self._delay_weights(params)), self.action_size)),
+            reward=nothing,
+            done=nothing,
+            not_finite=nothing,
+            steps=jnp.zeros((), jnp.int32),
+            key=key,
         )
+
+    def move(self, params: Params, state: State, action: jax.Array) -> tuple[State, Any]:
+        """Moves one robot by a control step under its action [act].
+
+        Returns:
+          Its state, and the environment's own.
+        """
+        # Before the first action there was none: it is as if it had been given all along.
+        past = jnp.where(state.steps == 0, action, jnp.roll(state.past, 1, axis=0).at[0].set(action))
+        following = self._env(params).step(state.env, jnp.sum(self._delay_weights(params)[:, None] * past, axis=0))
+        finite = jnp.isfinite(self.observed(following.obs)).all() & jnp.isfinite(following.reward)
+        state = self._as_state(
+            following,
+            past=past,
+            reward=jnp.where(finite, jnp.asarray(following.reward, jnp.float32), 0.0),
+            done=jnp.where(finite, jnp.asarray(following.done, jnp.float32), 1.0),
+            not_finite=(~finite).astype(jnp.float32),
+            steps=state.steps + 1,
+            key=jax.random.split(state.key, 1)[0],
+        )
+        return state, following
+
+    @cached_property
+    def action_size(self) -> int:
+        """Number of components of an action: the environment's `action_size`, or the number of actuators."""
+        return int(getattr(self.env, "action_size", self.model.nu))
+
+    @property
+    def observation_size(self) -> int:
+        """Number of components of what is observed (`observe`)."""
+        return sum(self.layout.values())
+
+    @cached_property
+    def layout(self) -> dict[str, int]:
+        """Parts of what is observed and their sizes, in order: the keys of a dictionary observation, else `obs`."""
+        start = jax.eval_shape(lambda: self.env.reset(jax.random.PRNGKey(0)).obs)
+        whole = jax.eval_shape(self.observed, start).shape[0]
+        return {name: start[name].shape[0] for name in self._keys} if self._keys else {"obs": whole}
+
+    def observed(self, obs: Any) -> jax.Array:
+        """Makes one array of an observation, by `observe`.
+
+        Raises:
+          ValueError: a dictionary has no such key.
+        """
+        if callable(self.observe):
+            return self.observe(obs)
+        if isinstance(obs, Mapping):
+            if not self._keys or not set(self._keys) <= obs.keys():
+                raise ValueError(f"observe: got {self.observe!r}, expected some of {', '.join(obs)}")
+            return jnp.concatenate([obs[name] for name in self._keys], axis=-1)
+        if self.observe is not None:
+            raise ValueError(f"observe: got {self.observe!r}, but the environment's observation is one array")
+        return obs
 
     def randomization_fn(self, dist: ParamDist) -> Callable[[mjx.Model, jax.Array], tuple[mjx.Model, mjx.Model]]:
         """Makes the `randomization_fn` of Brax's and Playground's training: robots drawn from a distribution.
@@ -190,28 +253,19 @@ class Simulator:
 
         return randomize
 
-    def _episode(self, act, policy, key, params) -> Trajectory:
-        key_reset, key_act = jax.random.split(key)
-        env = self.with_model(self.env, parameters.apply(self.model, params, self.parameters))
-        # Environments of Playground and Brax keep raw keys in their states.
-        start = env.reset(key_reset if key_reset.dtype == jnp.uint32 else jax.random.key_data(key_reset))
-        weights = self._delay_weights(params)
+    @property
+    def _keys(self) -> tuple[str, ...]:
+        if callable(self.observe):
+            return ()
+        return (self.observe,) if isinstance(self.observe, str) else tuple(self.observe or ())
 
-        def step(carry, now):
-            (state, alive, past), (key, first) = carry, now
-            action = act(policy, state.obs, key)
-            # Before the first action there was none: it is as if it had been given all along.
-            past = jnp.where(first, action, jnp.roll(past, 1, axis=0).at[0].set(action))
-            following = env.step(state, jnp.sum(weights[:, None] * past, axis=0))
-            broke = alive & ~(jnp.isfinite(self._observed(following.obs)).all() & jnp.isfinite(following.reward))
-            lives = alive & ~broke
-            record = self._observed(state.obs), action, lives, jnp.where(lives, following.reward, 0.0), broke
-            return (following, lives & (following.done == 0), past), record
+    def _env(self, params: Params) -> Any:
+        return self.with_model(self.env, parameters.apply(self.model, params, self.parameters))
 
-        past = jnp.zeros((len(weights), *jax.eval_shape(act, policy, start.obs, key_act).shape))
-        during = jax.random.split(key_act, self.steps), jnp.arange(self.steps) == 0
-        (_, alive, _), (obs, action, lives, score, broke) = jax.lax.scan(step, (start, jnp.asarray(True), past), during)
-        return Trajectory(obs=obs, action=action, alive=lives, score=score, fell=~alive, not_finite=broke.any())
+    @staticmethod
+    def _as_state(own, *, reward, **fields) -> State:
+        terms = {name: value for name, value in getattr(own, "metrics", {}).items() if jnp.ndim(value) == 0}
+        return State(env=own, obs=own.obs, reward=reward, score=reward, terms=terms, **fields)
 
     def _delay_weights(self, params) -> jax.Array:
         """Shares of the latest actions in what the environment is given, newest first: two of them interpolate."""
@@ -221,20 +275,13 @@ class Simulator:
                 return jnp.maximum(1.0 - jnp.abs(jnp.arange(longest + 1) - params.get(name, 0.0) / self.env.dt), 0.0)
         return jnp.ones(1)
 
-    def _observed(self, obs: Any) -> jax.Array:
-        if callable(self.observe):
-            return self.observe(obs)
-        if isinstance(obs, Mapping):
-            keys = (self.observe,) if isinstance(self.observe, str) else self.observe or ()
-            if not keys or not set(keys) <= obs.keys():
-                raise ValueError(f"observe: got {self.observe!r}, expected some of {', '.join(obs)}")
-            return jnp.concatenate([obs[name] for name in keys], axis=-1)
-        if self.observe is not None:
-            raise ValueError(f"observe: got {self.observe!r}, but the environment's observation is one array")
-        return obs
 
+def model_of(env: Any) -> mjx.Model:
+    """Finds the model of an environment of MuJoCo Playground or of Brax's MJX backend.
 
-def _model_of(env: Any) -> mjx.Model:
+    Raises:
+      ValueError: it has none where theirs have it.
+    """
     for place in (env, getattr(env, "unwrapped", env)):
         for name in ("mjx_model", "sys"):
             model = getattr(place, name, None)
@@ -244,6 +291,10 @@ def _model_of(env: Any) -> mjx.Model:
         f"env: got {type(env).__name__}, which has no MJX model in 'mjx_model' (MuJoCo Playground) or 'sys' (Brax with "
         "backend='mjx'); hand over model= and with_model="
     )
+
+
+def _raw(key: jax.Array) -> jax.Array:
+    return key if key.dtype == jnp.uint32 else jax.random.key_data(key)
 
 
 def _get(model: mjx.Model, path: str) -> jax.Array:

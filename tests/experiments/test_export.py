@@ -14,11 +14,11 @@ import pytest
 
 from envs import logs, sensing
 from envs.biteno import constants, env, gait
+from envs.biteno.player import Player
 from envs.targets import recorded
 from experiments import robot_stub
 from experiments.common.config import preset
 from experiments.robot import policy_files
-from experiments.robot.player import Player
 from experiments.robot.surrogate import Body, Robot
 from experiments.walking.learner import Learner
 from experiments.walking.policies import starting_policy
@@ -35,7 +35,7 @@ def walk():
 def folder(walk, tmp_path_factory):
     learner, policy = walk
     out = tmp_path_factory.mktemp("export") / "policy"
-    policy_files.export(out, policy.learner, learner.preset)
+    policy_files.export(out, policy.learner, learner)
     return out
 
 
@@ -46,8 +46,7 @@ def played(walk):
     act = learner.act(policy)
 
     def step(state, key):
-        action, _ = act(state.obs, key)
-        drive = learner.robot.drive({}, state, action)
+        drive = learner.robot.drive({}, state, act(state.obs, key))
         return learner.robot.settle(state, drive, learner.robot.simulate({}, state, drive)), (state, drive)
 
     start = jax.vmap(lambda key: learner.robot.reset({}, key))(jax.random.split(jax.random.PRNGKey(0), 8))
@@ -60,7 +59,7 @@ def test_onnxruntime_does_what_flax_does(walk, folder, played):
     session = onnxruntime.InferenceSession(folder / "policy.onnx", providers=["CPUExecutionProvider"])
     obs = np.concatenate([played[0].obs.reshape(-1, 40), np.random.default_rng(0).normal(0, 1, (500, 40))])
     obs = obs.astype(np.float32)
-    expected = learner.act(policy)(jnp.asarray(obs), jax.random.PRNGKey(0))[0]
+    expected = learner.act(policy)(jnp.asarray(obs), jax.random.PRNGKey(0))
     (found,) = session.run(None, {"obs": obs})
     assert np.abs(expected).max() > 1.0
     np.testing.assert_allclose(found, expected, atol=1e-5, rtol=1e-5)
@@ -165,7 +164,7 @@ def test_the_ideal_robot_walks_as_well_as_the_simulator(folder, tmp_path):
     # The row of a tick is what the policy saw: it does the same again.
     player = Player(folder / "policy.npz")
     for step in range(0, 390, 13):
-        action = player.network(np.asarray(found.trajectory.obs[0, step], float))
+        action = player(np.asarray(found.trajectory.obs[0, step], float))
         np.testing.assert_allclose(action, found.trajectory.action[0, step], atol=1e-4)
 
 

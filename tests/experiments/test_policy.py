@@ -8,15 +8,16 @@ import numpy as np
 import pytest
 
 from experiments.common import checkpoint
-from experiments.common.config import PRESETS, WALK, chosen
+from experiments.common.config import PRESETS, WALK
 from experiments.walking.learner import Learner
 from experiments.walking.policies import policy_config
+from experiments.walking.robots import BITENO
 from jaxtune.mjx import parameters
 
 
 @pytest.fixture(scope="module")
 def learner():
-    return Learner(PRESETS["smoke"], chosen("foot_friction"), chosen("torque_scale"))
+    return Learner(PRESETS["smoke"], BITENO.chosen("foot_friction"), BITENO.chosen("torque_scale"))
 
 
 @pytest.fixture(scope="module")

@@ -10,9 +10,10 @@ import pytest
 from experiments import sim2sim, sweep
 from experiments.common import checkpoint, plots
 from experiments.common.cli import bars
-from experiments.common.config import PRESETS, chosen
+from experiments.common.config import PRESETS
 from experiments.walking import comparison
 from experiments.walking.cases import CASES
+from experiments.walking.robots import BITENO
 
 
 @pytest.mark.parametrize(
@@ -57,7 +58,7 @@ def test_sweep_lanes_are_all_combinations():
 
 
 def test_target_is_nominal_over_start():
-    entries = chosen("legs6")
+    entries = BITENO.chosen("legs6")
     truth = CASES["mass"].true_params(entries, start=0.5)
     assert truth["left_thigh_mass"] == 2.0
     assert truth["foot_friction"] == 1.0

@@ -13,9 +13,10 @@ import toys
 import envs.targets
 from experiments import evaluate, sim2sim
 from experiments.common import film
-from experiments.common.config import chosen, preset
+from experiments.common.config import preset
 from experiments.walking.cases import CASES
 from experiments.walking.learner import Learner
+from experiments.walking.robots import BITENO
 from experiments.walking.targets import TARGETS
 from jaxtune import tuner as tuners
 from jaxtune.types import Verdict
@@ -70,23 +71,20 @@ def test_a_run_whose_every_measured_episode_fails_stops_with_the_reason():
 
 
 def test_cases_have_the_target_of_their_figure():
-    truth = CASES["weak_motor"].true_params(chosen("whole_body"), start=0.5)
+    truth = CASES["weak_motor"].true_params(BITENO.chosen("whole_body"), start=0.5)
     assert truth["torque_scale"] == 0.75
     assert all(value == 1.0 for name, value in truth.items() if name != "torque_scale")
     assert CASES["weak_motor"].target == CASES["bullet"].target == "bullet"
     assert CASES["mass"].target == CASES["friction"].target == "mjx"
 
 
-def test_the_target_is_played_by_the_engine_that_is_asked_for(monkeypatch):
-    learner = types.SimpleNamespace(robot=None, entries=chosen("whole_body"))
-    for name in TARGETS:
-        monkeypatch.setitem(TARGETS, name, lambda robot, params, name=name: name)
-    assert sim2sim.make_target(sim2sim.Args(case="weak_motor"), learner) == "bullet"
-    assert sim2sim.make_target(sim2sim.Args(case="weak_motor", target="mujoco_c"), learner) == "mujoco_c"
+def test_the_target_is_played_by_the_engine_that_is_asked_for():
+    assert sim2sim.check(sim2sim.Args(case="weak_motor"))[3].target == "bullet"
+    assert sim2sim.check(sim2sim.Args(case="weak_motor", target="mujoco_c"))[3].target == "mujoco_c"
 
 
 def test_a_hidden_parameter_that_is_tuned_is_off_and_hidden_no_more():
-    entries = chosen("foot_friction,torque_scale")
+    entries = BITENO.chosen("foot_friction,torque_scale")
     assert CASES["weak_motor"].off(entries) == ("torque_scale",)
     assert CASES["mass"].off(entries) == ()
     assert CASES["friction"].off(entries) == ("foot_friction",)

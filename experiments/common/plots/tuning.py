@@ -1,7 +1,7 @@
 """Plots of training, of tuning to another simulator, and of rounds with a robot."""
 
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -12,36 +12,26 @@ from experiments.common.plots.base import COLOURS, save, spread
 _MARKS = {"accept": "o", "widen": "^", "unexplained": "X", "radius_exhausted": "s", "not_finite": "x"}
 
 
-def training(path: Path, curve: Sequence[dict]) -> None:
-    """Draws a training run over its environment steps.
-
-    One panel compares the trained reward with the reward of the paper's Table I, one shows how well commands and gait
-    clock are tracked, and one how often episodes end.
+def training(path: Path, curve: Sequence[dict], control_s: float, shown: Mapping[str, Mapping[str, str]]) -> None:
+    """Draws a training run over its environment steps: what the robot's own panels show, and how often episodes end.
 
     Args:
       path: of the PNG.
-      curve: lines of metrics (`experiments.walking.policies.walk`).
+      curve: lines of metrics, means over control steps (`experiments.walking.policies.walk`).
+      control_s: length of a control step in s.
+      shown: metrics by label, by axis label; those of the panel "per second" are divided by `control_s`.
     """
     steps = np.array([line["steps"] for line in curve]) / 1e6
-    panels = {
-        "per second": {"trained reward": "reward", "Table I": "score"},
-        "share": {
-            "linear tracking": "linear_tracking",
-            "angular tracking": "angular_tracking",
-            "feet in step with the clock (of 2)": "clock_contact",
-        },
-        "episode ends per 20 s": {"ends": "done"},
-    }
-    # Metrics are means over policy steps of 10 ms.
-    scales = {"per second": 100.0, "share": 1.0, "episode ends per 20 s": 2000.0}
-    figure, axes = plt.subplots(1, 3, figsize=(12, 3.2), layout="constrained")
+    panels = {**shown, "episode ends per 20 s": {"ends": "done"}}
+    scales = {"per second": 1.0 / control_s, "episode ends per 20 s": 20.0 / control_s}
+    figure, axes = plt.subplots(1, len(panels), figsize=(4 * len(panels), 3.2), layout="constrained")
     for axis, (label, series) in zip(axes, panels.items(), strict=True):
         for name, key in series.items():
-            axis.plot(steps, scales[label] * np.array([line[key] for line in curve]), label=name)
+            axis.plot(steps, scales.get(label, 1.0) * np.array([line[key] for line in curve]), label=name)
         axis.set(xlabel="million steps", ylabel=label)
         axis.grid(alpha=0.3)
         axis.legend()
-    axes[2].set_yscale("log")
+    axes[-1].set_yscale("symlog", linthresh=0.1)
     save(figure, path)
 
 

@@ -8,7 +8,8 @@ import pytest
 import reference
 from mujoco import mjx
 
-from envs.biteno import Biteno, BraxBiteno, Motion, TaskConfig, constants
+from envs.biteno import Biteno, Motion, TaskConfig, constants
+from jaxtune.mjx import TrainingBatch
 
 NOMINAL = reference.params()
 STILL = np.zeros(6, np.float32)
@@ -204,7 +205,7 @@ def test_a_step_without_jit_is_the_same_down_to_the_physics(robot, start, step):
 @pytest.fixture(scope="module")
 def brax(robot):
     """The robot behind Brax's interface, its step and how often that was traced."""
-    env = BraxBiteno(robot)
+    env = TrainingBatch(robot, robot.entries, 2000)
     traces = []
 
     @jax.jit

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from envs import corrected, models
-from envs.biteno import Biteno, BraxBiteno, TaskConfig, constants
+from envs.biteno import Biteno, TaskConfig, constants
 from envs.corrected import CorrectedBiteno, Correction
-from jaxtune.mjx import select
+from jaxtune.mjx import TrainingBatch, select
 
 ENTRIES = select(constants.ENTRIES, ("torque_scale",))
 STEPS = 20
@@ -105,7 +105,7 @@ def test_a_biased_encoder_is_seen_by_the_policy_and_by_the_controller(plain):
 
 def test_it_trains_behind_braxs_interface():
     effects = {"torque_lag": everywhere({"seconds": 0.01}), "backlash": {"left_hip": {"rad": 0.02}}}
-    env = BraxBiteno(robot(**effects, load_friction=everywhere({"ratio": 0.1})))
+    env = TrainingBatch(robot(**effects, load_friction=everywhere({"ratio": 0.1})), ENTRIES, 2000)
     state = jax.jit(env.reset)(jax.random.split(jax.random.PRNGKey(0), 3))
     state = jax.jit(env.step)(state, jnp.zeros((3, 6)))
     assert np.isfinite(state.obs).all()

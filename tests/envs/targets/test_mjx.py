@@ -35,6 +35,7 @@ class Script:
     """
 
     entries: Mapping[str, Entry] = field(default_factory=dict)
+    observed = staticmethod(lambda obs: obs)
 
     def reset(self, params, key):
         start = jax.random.uniform(key)
@@ -59,7 +60,7 @@ class Script:
 
 def act(obs, key):
     """An action that says which observation and which key it was made of."""
-    return jnp.stack([obs[0], obs[1], jax.random.uniform(key)]), {}
+    return jnp.stack([obs[0], obs[1], jax.random.uniform(key)])
 
 
 def scripted(count, falls=NEVER, breaks=NEVER, pay=0.0):
@@ -110,7 +111,7 @@ def test_chunks_change_nothing(monkeypatch, count):
     chunked = mjx.rollout(Script(), jax.random.key(1), act, params, 8)[0]
     assert chunked.fell.shape == (count,)
     assert chunked.obs.shape == (count, 8, 2)
-    monkeypatch.setattr("jaxtune.mjx.simulator._CHUNK", count)
+    monkeypatch.setattr("jaxtune.mjx.episodes._CHUNK", count)
     whole = mjx.rollout(Script(), jax.random.key(1), act, params, 8)[0]
     for got, expected in zip(jax.tree.leaves(chunked), jax.tree.leaves(whole), strict=True):
         np.testing.assert_array_equal(got, expected)
@@ -142,7 +143,7 @@ HEAVY, BROKEN, LIGHT = range(3)
 
 def statue(obs, key):
     """Asks for the standing pose, on which point feet topple after some 1.3 s."""
-    return jnp.zeros(6), {}
+    return jnp.zeros(6)
 
 
 @pytest.fixture(scope="module")

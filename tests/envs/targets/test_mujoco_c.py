@@ -65,7 +65,7 @@ def test_given_commands_are_observed_and_rewarded(recorded):
 
 def test_falls_are_masked_as_in_mjx(robot):
     def collapse(obs, key):
-        return jnp.array([0.0, 0.0, 10.0] * 2), {}
+        return jnp.array([0.0, 0.0, 10.0] * 2)
 
     steps = 150
     here = mujoco_c.target(robot, VALUES, threads=1).episodes(KEY, collapse, COUNT, steps)
@@ -108,13 +108,14 @@ def test_a_time_step_that_does_not_fit_is_named(robot):
 
 
 def test_the_shipped_policy_walks_20_seconds():
-    from experiments.common.config import chosen, preset
+    from experiments.common.config import preset
     from experiments.walking.learner import Learner
     from experiments.walking.policies import starting_policy
+    from experiments.walking.robots import BITENO
 
     sizes = preset("cpu")
     learner = Learner(
-        dataclasses.replace(sizes, task=dataclasses.replace(sizes.task, physics="exact")), chosen("legs6")
+        dataclasses.replace(sizes, task=dataclasses.replace(sizes.task, physics="exact")), BITENO.chosen("legs6")
     )
     assert isinstance(learner.robot, Biteno)
     act = learner.act(starting_policy("walk", learner))

@@ -26,7 +26,7 @@ def simulated():
     """Two episodes of a walk and two of a fall in MuJoCo C, as episodes and as a log of one row a policy step."""
     learner = Learner(preset("smoke"), {})
     walk = learner.act(starting_policy("walk", learner))
-    flail = lambda obs, key: (0.5 * jax.random.normal(key, (6,)), {})  # noqa: E731
+    flail = lambda obs, key: 0.5 * jax.random.normal(key, (6,))  # noqa: E731
     target = mujoco_c.target(learner.robot, {})
     found = [target.record(jax.random.PRNGKey(3), act, 2, STEPS) for act in (walk, flail)]
     trajectory, recording = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *found)

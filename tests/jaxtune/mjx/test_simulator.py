@@ -1,5 +1,4 @@
 import warnings
-from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
@@ -9,82 +8,12 @@ import pytest
 import toys
 from brax import envs
 from brax.envs.wrappers.training import DomainRandomizationVmapWrapper
-from mujoco import mjx
+from sled import SUBSTEPS, TABLE, Keyed, Sled
 
 from jaxtune import dist as dists
 from jaxtune import tuner
-from jaxtune.mjx import Simulator, action_delay, apply_mujoco, field, from_coords, mass, strength
+from jaxtune.mjx import Simulator, apply_mujoco, field, from_coords, mass
 
-SLED = """
-<mujoco>
-  <option timestep="0.005"><flag contact="disable"/></option>
-  <worldbody>
-    <body name="sled"><joint name="rail" type="slide" axis="1 0 0" damping="0.5"/><geom size="0.1" mass="2"/></body>
-  </worldbody>
-  <actuator><motor name="push" joint="rail"/></actuator>
-</mujoco>
-"""
-SUBSTEPS = 4
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class State:
-    data: mjx.Data
-    obs: jax.Array
-    reward: jax.Array
-    done: jax.Array
-
-
-class Sled:
-    """A pushed mass: an environment as a user writes one, with a model where `with_model` looks for it.
-
-    It observes position, velocity and the force that it was given, is rewarded for speed, and ends beyond 1.5 m.
-    """
-
-    dt = 0.02
-
-    def __init__(self):
-        self.mj_model = mujoco.MjModel.from_xml_string(SLED)
-        self._mjx_model = mjx.put_model(self.mj_model)
-
-    @property
-    def mjx_model(self):
-        return self._mjx_model
-
-    @property
-    def unwrapped(self):
-        return self
-
-    def reset(self, key):
-        data = mjx.make_data(self.mj_model)
-        data = data.replace(qvel=0.1 * jax.random.normal(key, (1,)))
-        return self._state(data, jnp.zeros(1))
-
-    def step(self, state, action):
-        data = state.data.replace(ctrl=action)
-        data = jax.lax.fori_loop(0, SUBSTEPS, lambda _, data: mjx.step(self._mjx_model, data), data)
-        return self._state(data, action)
-
-    def _state(self, data, action):
-        obs = jnp.concatenate([data.qpos, data.qvel, action])
-        return State(data=data, obs=obs, reward=data.qvel[0], done=(jnp.abs(data.qpos[0]) > 1.5).astype(float))
-
-
-class Keyed(Sled):
-    """The same with a dictionary of observations."""
-
-    def _state(self, data, action):
-        plain = super()._state(data, action)
-        return State(data=data, obs={"state": plain.obs[:2], "told": action}, reward=plain.reward, done=plain.done)
-
-
-TABLE = {
-    "mass": mass("sled", bounds=(0.5, 2.0)),
-    "damping": field("dof_damping", joints="rail", bounds=(0.2, 5.0)),
-    "strength": strength("push", bounds=(0.5, 2.0)),
-    "delay": action_delay(bounds_s=(0.0, 0.05)),
-}
 STEPS = 60
 
 
@@ -184,7 +113,7 @@ def test_simulate_takes_coordinates_and_measure_hides_parameters(sim, play):
 def test_chunks_change_nothing(sim, monkeypatch):
     params = {"mass": jnp.linspace(0.5, 2.0, 5)}
     whole = sim.rollout(jax.random.key(1), act, 1.0, params)
-    monkeypatch.setattr("jaxtune.mjx.simulator._CHUNK", 2)
+    monkeypatch.setattr("jaxtune.mjx.episodes._CHUNK", 2)
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5),
         whole,

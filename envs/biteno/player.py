@@ -1,4 +1,4 @@
-"""Runs an exported policy on a robot's computer, which needs only NumPy and this file.
+"""Runs an exported policy on BITeno's computer, which needs only NumPy, this file and `network.py` beside it.
 
     player = Player("policy.npz")
     while walking:  # 100 times per second
@@ -9,13 +9,17 @@
 exist a second time in this file, without JAX; tests compare them with the simulator's own.
 """
 
-import json
 from pathlib import Path
 
 import numpy as np
 
+try:
+    from jaxtune.network import Network
+except ImportError:  # on a robot's computer, where the exported copy lies beside this file
+    from network import Network
 
-class Player:
+
+class Player(Network):
     """A policy with its gait clock and its memory of the last step (action and joint target, which it observes).
 
     Call `step` and then `tick`, once per policy period, and send the targets to the joint controllers.
@@ -26,11 +30,7 @@ class Player:
     """
 
     def __init__(self, path: str | Path, phase: float = 0.0):
-        with open(path, "rb") as file, np.load(file, allow_pickle=False) as stored:
-            self.meta = json.loads(str(stored["meta"]))
-            arrays = {name: stored[name] for name in stored.files if name != "meta"}
-        self._mean, self._std = arrays["mean"], arrays["std"]
-        self._layers = [(arrays[f"kernel_{i}"], arrays[f"bias_{i}"]) for i in range(self.meta["layers"])]
+        super().__init__(path)
         self.reset(phase)
 
     def reset(self, phase: float = 0.0) -> None:
@@ -75,11 +75,7 @@ class Player:
         meta = self.meta
         error = np.zeros(len(joint)) if self.target is None else self.target - joint
         obs = self.observe(velocity, command, gyro, gravity, joint, joint_velocity, self.action, error, self.phase)
-        if not np.isfinite(obs).all():
-            names = [row["name"] for row in meta["observation"] for _ in range(row["size"])]
-            bad = dict.fromkeys(name for name, value in zip(names, obs, strict=True) if not np.isfinite(value))
-            raise ValueError(f"{', '.join(bad)}: got a number that is not finite")
-        self.action = np.clip(self.network(obs), -meta["action_limit"], meta["action_limit"])
+        self.action = np.clip(self(obs), -meta["action_limit"], meta["action_limit"])
         base = self.reference(self.phase, command) if meta["base"] == "raibert" else np.array(meta["stand_rad"])
         self.target = base + meta["action_scale"] * self.action
         return self.target.copy()
@@ -88,16 +84,6 @@ class Player:
         """Advances the gait clock by one policy period; call it once after every `step`."""
         clock = self.meta["clock"]
         self.phase = np.mod(self.phase + clock["hz"] / self.meta["rate_hz"], 1.0)
-
-    def network(self, obs: np.ndarray) -> np.ndarray:
-        """Returns the action [act] for an observation [obs]: a normaliser, then dense layers with ELU in between."""
-        value = (obs - self._mean) / self._std
-        for number, (kernel, bias) in enumerate(self._layers):
-            value = value @ kernel + bias
-            if number + 1 < len(self._layers):
-                # ELU. Without the minimum, the exponential would overflow in the branch that `where` discards.
-                value = np.where(value > 0, value, np.expm1(np.minimum(value, 0.0)))
-        return value
 
     def observe(self, velocity, command, gyro, gravity, joint, joint_velocity, action, error, phase) -> np.ndarray:
         """Returns the observation [obs], with the order and the scales that `meta["observation"]` lists.

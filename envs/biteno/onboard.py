@@ -1,0 +1,41 @@
+"""What BITeno's computer must know around an exported policy; `player.py` is the code that runs there."""
+
+import mujoco
+
+from envs import sensing
+from envs.biteno import constants
+from envs.biteno.env import ACTION_LIMIT, TaskConfig
+
+
+def meta(task: TaskConfig) -> dict:
+    """Describes everything around the network, for the metadata of an exported policy.
+
+    Args:
+      task: in which the policy was trained.
+
+    Returns:
+      Joints, rate, layout and scales of the observation, the gait clock, the reference that an action is added to, and
+      the joint controller's gains; all of it JSON.
+    """
+    model = mujoco.MjModel.from_xml_path(str(constants.MODEL_PATH))
+    kp, kd, limit = model.actuator_gainprm[:, 0], -model.actuator_biasprm[:, 2], model.actuator_forcerange[:, 1]
+    return {
+        "robot": "biteno",
+        "joints": list(constants.JOINTS),
+        "rate_hz": 1.0 / constants.POLICY_DT_S,
+        "observation": [
+            {"name": name, "size": len(scale), "scale": scale.tolist()} for name, scale in sensing.LAYOUT.items()
+        ],
+        "stand_rad": constants.STAND_RAD.tolist(),
+        "action_limit": ACTION_LIMIT,
+        "action_scale": task.action_scale,
+        "base": task.base,
+        "clock": {"hz": constants.CLOCK_HZ, "duty": constants.DUTY, "offsets": [0.0, 0.5]},
+        "leg": {
+            "hip_y_m": constants.HIP_Y_M.tolist(),
+            "link_m": constants.LINK_M,
+            "stance_depth_m": constants.STANCE_DEPTH_M,
+            "swing_height_m": constants.SWING_HEIGHT_M,
+        },
+        "controller": {"type": "pd", "kp": kp.tolist(), "kd": kd.tolist(), "torque_limit_nm": limit.tolist()},
+    }

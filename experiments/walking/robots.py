@@ -1,0 +1,186 @@
+"""The robots that commands work with, by the name that `--robot` takes.
+
+`biteno` ships with the package. `playground:NAME` is an environment of MuJoCo Playground. `path/to/file.py:function` is
+a robot of one's own: the function returns a `jaxtune.mjx.Simulator`, or an environment, for which a parameter table is
+then proposed (`jaxtune.mjx.parameters_of`).
+"""
+
+import importlib.util
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from envs import corrected
+from envs.biteno import constants, gait, onboard
+from envs.corrected import Correction
+from envs.targets.mjx import MjxTarget
+from envs.targets.protocol import Target
+from experiments.common.config import WALK, Preset
+from experiments.walking.targets import TARGETS
+from jaxtune.mjx import Entry, Robot, Simulator, model_of, parameters_of, select
+
+_LONGEST = 1000  # control steps of a compared episode, where a preset has no fewer
+
+
+@dataclass(frozen=True, kw_only=True)
+class Kind:
+    """What the commands need to know of one robot."""
+
+    name: str
+    """As `--robot` names it."""
+    entries: Mapping[str, Entry]
+    """Every parameter that can be tuned, by name."""
+    sets: Mapping[str, tuple[str, ...]]
+    """Sets of parameters by the name that `--parameters` takes; the first is its default."""
+    make: Callable[[Preset, Mapping[str, Entry], Correction | None], Robot]
+    """Makes robot and task with a parameter table, as they are simulated and measured."""
+    engines: Mapping[str, Callable[[Robot, Mapping[str, float]], Target]]
+    """Targets by engine, `(robot, physical values) -> target`."""
+    control_s: float
+    """Control period in seconds."""
+    power: Callable[[Any], jax.Array]
+    """Mechanical power in W, from what a robot's `move` returns beside its state."""
+    meta: Callable[[Preset, Robot], dict]
+    """What the robot's computer must know around an exported policy, as JSON."""
+    trained: Callable[[Preset], Preset] = lambda preset: preset
+    """Changes the preset of the robots that a policy trains on."""
+    config: Callable[[Preset], dict] = lambda preset: {}
+    """Settings that a saved policy depends on, beside the network's."""
+    shown: Mapping[str, Mapping[str, str]] = field(default_factory=lambda: {"per second": {"reward": "reward"}})
+    """Metrics that a training curve shows: names by label, by panel."""
+    player: Path | None = None
+    """A file that is exported beside a policy, to run it on the robot's computer."""
+    policy: Path | None = None
+    """Folder of a policy that ships with the robot."""
+    episode_steps: int = _LONGEST
+    """Largest number of control steps of an episode that the tuner compares; a preset may have fewer."""
+
+    def chosen(self, parameters: str | None) -> dict[str, Entry]:
+        """Returns the rows of the robot's parameter table that `--parameters` names.
+
+        Args:
+          parameters: the name of a set, names of parameters joined by commas, or None for the robot's first set.
+
+        Returns:
+          The rows (`jaxtune.mjx.Entry`) by name, in the order given.
+
+        Raises:
+          ValueError: a name is neither; the message lists those that exist.
+        """
+        if parameters is None:
+            parameters = next(iter(self.sets))
+        names = self.sets.get(parameters) or tuple(name.strip() for name in parameters.split(","))
+        return select(self.entries, names)
+
+
+def kind(name: str) -> Kind:
+    """Returns the robot that `--robot` names.
+
+    Raises:
+      ValueError: there is no such robot, file or function, or the function returns something else.
+    """
+    if name in _SHIPPED:
+        return _SHIPPED[name]
+    place, colon, what = name.rpartition(":")
+    if colon and place == "playground":
+        return _foreign(name, _playground(what))
+    if colon and place.endswith(".py"):
+        return _foreign(name, _from_file(Path(place), what))
+    raise ValueError(
+        f"robot: got '{name}', expected {', '.join(_SHIPPED)}, playground:NAME or path/to/file.py:function"
+    )
+
+
+def _foreign(name: str, made: Any) -> Kind:
+    """Makes a kind of a simulator, or of an environment without a table."""
+    try:
+        if not isinstance(made, Simulator):
+            model = model_of(made)
+            made = Simulator(made, _LONGEST, parameters_of(model, control_s=float(getattr(made, "dt", 0.0))))
+        made.observation_size  # noqa: B018  so that a missing `observe` is named before anything compiles
+    except ValueError as error:
+        raise ValueError(f"robot '{name}': {error}") from error
+    return Kind(
+        name=name,
+        entries=made.parameters,
+        sets={"all": tuple(made.parameters)},
+        make=lambda preset, entries, correction: _uncorrected(replace(made, parameters=entries), correction),
+        engines={"mjx": lambda robot, params: MjxTarget(robot=robot, params=params)},
+        control_s=float(made.env.dt),
+        power=_power,
+        config=lambda preset: {"robot": name},
+        meta=lambda preset, robot: {
+            "robot": name,
+            "rate_hz": 1.0 / float(robot.env.dt),
+            "observation": [{"name": part, "size": size} for part, size in robot.layout.items()],
+            "action": robot.action_size,
+        },
+        episode_steps=made.steps,
+    )
+
+
+def _uncorrected(robot: Simulator, correction: Correction | None) -> Simulator:
+    if correction is not None:
+        raise ValueError("model: got a corrected model, which can be simulated with --robot biteno alone")
+    return robot
+
+
+def _power(state: Any) -> jax.Array:
+    """Mechanical power of the joints in W, from the state of an environment of Playground or Brax."""
+    data = getattr(state, "data", None) or getattr(state, "pipeline_state", None)
+    return jnp.zeros(()) if data is None else jnp.maximum(data.qfrc_actuator * data.qvel, 0.0).sum()
+
+
+def _playground(name: str) -> Any:
+    try:
+        from mujoco_playground import registry
+    except ModuleNotFoundError as error:
+        raise ValueError("robot: MuJoCo Playground is not installed; expected `pip install playground`") from error
+    if name not in registry.ALL_ENVS:
+        raise ValueError(f"robot: got 'playground:{name}', expected one of {', '.join(registry.ALL_ENVS)}")
+    return registry.load(name, config_overrides={"impl": "jax"})
+
+
+def _from_file(path: Path, function: str) -> Any:
+    if not path.exists():
+        raise ValueError(f"robot: {path} does not exist")
+    # As for a script: its folder is searched for what it imports, and its classes find their module by name.
+    sys.path.append(str(path.parent.resolve()))
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    module = sys.modules[path.stem] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    if not callable(getattr(module, function, None)):
+        raise ValueError(f"robot: {path} has no function '{function}'")
+    return getattr(module, function)()
+
+
+BITENO = Kind(
+    name="biteno",
+    entries=constants.ENTRIES,
+    sets=constants.PARAMETER_SETS,
+    make=lambda preset, entries, correction: corrected.make(preset.task, entries, correction),
+    engines=TARGETS,
+    control_s=constants.POLICY_DT_S,
+    power=lambda motion: gait.power(motion.torque, motion.qvel[6:]),
+    trained=lambda preset: replace(preset, task=replace(preset.task, push_mps=preset.push_mps)),
+    config=lambda preset: {"base": preset.task.base, "action_scale": preset.task.action_scale},
+    meta=lambda preset, robot: onboard.meta(preset.task),
+    shown={
+        "per second": {"trained reward": "reward", "Table I": "score"},
+        "share": {
+            "linear tracking": "linear_tracking",
+            "angular tracking": "angular_tracking",
+            "feet in step with the clock (of 2)": "clock_contact",
+        },
+    },
+    player=Path(onboard.__file__).with_name("player.py"),
+    policy=WALK,
+)
+"""The paper's biped."""
+
+_SHIPPED = {"biteno": BITENO}

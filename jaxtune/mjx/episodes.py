@@ -1,0 +1,121 @@
+"""Simulated episodes of any robot whose physical parameters are an argument, batched and compiled."""
+
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import jax
+import jax.numpy as jnp
+
+from jaxtune.mjx.parameters import Params
+from jaxtune.types import Trajectory
+
+_CHUNK = 256  # small batches are fastest on a CPU; larger ones are simulated in turn
+
+
+class State(Protocol):
+    """What an episode reads of a robot's state; a robot's own has more."""
+
+    obs: Any
+    """What the policy is given."""
+    score: jax.Array
+    """Reward of the last step."""
+    done: jax.Array
+    """1 where the episode has ended, otherwise 0."""
+    not_finite: jax.Array
+    """1 where it ended because the simulation broke."""
+
+
+class Robot(Protocol):
+    """One robot and its task as pure functions, unbatched: `Simulator` is one, of anyone's environment."""
+
+    observation_size: int
+    action_size: int
+
+    def reset(self, params: Params, key: jax.Array) -> State:
+        """Starts an episode."""
+
+    def observed(self, obs: Any) -> jax.Array:
+        """Makes one array of an observation: what the tuner compares, and what a policy learns on."""
+
+    def move(self, params: Params, state: State, action: jax.Array) -> tuple[State, Any]:
+        """Moves the robot by one control step; returns its state, and anything that a `watch` may want to see."""
+
+
+def rollout(
+    robot: Robot,
+    key: jax.Array,
+    act: Callable[[Any, jax.Array], jax.Array],
+    params: Params,
+    steps: int,
+    *,
+    given: Any = None,
+    prepare: Callable[[State, Any, jax.Array], State] = lambda state, given, step: state,
+    watch: Callable[[State, State, Any], Any] = lambda before, after, motion: (),
+) -> tuple[Trajectory, Any]:
+    """Simulates one episode for every draw of the parameters.
+
+    An episode ends where the robot is done or a number is not finite. The latter is counted in `not_finite`, and the
+    step masked.
+
+    Args:
+      robot: robot and task.
+      key: random key; resets and everything random in an episode depend on it alone.
+      act: the policy, `(observation, key) -> action [act]`.
+      params: physical values by name, each [episodes].
+      steps: length of an episode in control steps.
+      given: pytree, [episodes, ...], of what else differs between episodes, such as commands.
+      prepare: changes a state before a step, `(state, given, number of the step) -> state`.
+      watch: what else is recorded of a step, `(state before, state after, motion) -> pytree`.
+
+    Returns:
+      The episodes, and what was watched of them, [episodes, time, ...].
+    """
+    # Without the barrier the compiler would fold constant parameters into every derived field of every model, and take
+    # minutes.
+    params = jax.lax.optimization_barrier({name: jnp.asarray(value) for name, value in params.items()})
+
+    def episode(key, params, given):
+        key_reset, key_act = jax.random.split(key)
+
+        def step(carry, now):
+            (state, alive), (key, number) = carry, now
+            state = prepare(state, given, number)
+            action = act(state.obs, key)
+            following, motion = robot.move(params, state, action)
+            broke = alive & (following.not_finite > 0)
+            lives = alive & ~broke
+            record = robot.observed(state.obs), action, lives, jnp.where(lives, following.score, 0.0), broke
+            return (following, alive & (following.done == 0)), (record, watch(state, following, motion))
+
+        start = robot.reset(params, key_reset)
+        during = jax.random.split(key_act, steps), jnp.arange(steps)
+        (_, alive), (record, watched) = jax.lax.scan(step, (start, jnp.asarray(True)), during)
+        obs, action, lives, score, broke = record
+        episodes = Trajectory(obs=obs, action=action, alive=lives, score=score, fell=~alive, not_finite=broke.any())
+        return episodes, watched
+
+    keys = jax.random.split(key, len(next(iter(params.values()))))
+    return in_chunks(episode, (keys, params, given))
+
+
+def in_chunks(function: Callable[..., Any], inputs: Any) -> Any:
+    """Maps a function over the first axis of its inputs, `_CHUNK` at a time in parallel.
+
+    Args:
+      function: of one item; it is vmapped.
+      inputs: tuple of arguments, pytrees whose leaves are all [count, ...].
+
+    Returns:
+      What the function returns, [count, ...].
+    """
+    several = jax.vmap(function)
+    count = len(jax.tree.leaves(inputs)[0])
+    if count <= _CHUNK:
+        return several(*inputs)
+    # Chunks of equal size need one compilation; the last one is filled up with repetitions.
+    chunks = -(-count // _CHUNK)
+    size = -(-count // chunks)
+    fill = jnp.arange(chunks * size) % count
+    inputs = jax.tree.map(lambda x: x[fill].reshape(chunks, size, *x.shape[1:]), inputs)
+    stacked = jax.lax.map(lambda item: several(*item), inputs)
+    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:count], stacked)

@@ -1,0 +1,46 @@
+"""A policy's network in NumPy alone: what `policy.npz` of an exported policy holds, for any robot.
+
+    network = Network("policy.npz")
+    while running:  # network.meta["rate_hz"] times per second
+        action = network(observation)
+
+A robot's computer needs NumPy and a copy of this file, which `python -m experiments.export` writes beside the policy.
+"""
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+
+class Network:
+    """A policy's network: a normaliser, then dense layers with ELU in between.
+
+    Args:
+      path: of the `.npz` that was exported.
+    """
+
+    def __init__(self, path: str | Path):
+        with open(path, "rb") as file, np.load(file, allow_pickle=False) as stored:
+            self.meta = json.loads(str(stored["meta"]))
+            arrays = {name: stored[name] for name in stored.files if name != "meta"}
+        self._mean, self._std = arrays["mean"], arrays["std"]
+        self._layers = [(arrays[f"kernel_{i}"], arrays[f"bias_{i}"]) for i in range(self.meta["layers"])]
+
+    def __call__(self, obs: np.ndarray) -> np.ndarray:
+        """Returns the action [act] for an observation [obs], in the order of `meta["observation"]`.
+
+        Raises:
+          ValueError: a component is not finite; names the part of the observation.
+        """
+        if not np.isfinite(obs).all():
+            names = [row["name"] for row in self.meta["observation"] for _ in range(row["size"])]
+            bad = dict.fromkeys(name for name, value in zip(names, obs, strict=True) if not np.isfinite(value))
+            raise ValueError(f"{', '.join(bad)}: got a number that is not finite")
+        value = (obs - self._mean) / self._std
+        for number, (kernel, bias) in enumerate(self._layers):
+            value = value @ kernel + bias
+            if number + 1 < len(self._layers):
+                # ELU. Without the minimum, the exponential would overflow in the branch that `where` discards.
+                value = np.where(value > 0, value, np.expm1(np.minimum(value, 0.0)))
+        return value

@@ -1,0 +1,145 @@
+"""Robots of another hand in the commands: `--robot` takes a name, an environment of a package, or a file."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from experiments import export, sim2sim, sweep, train
+from experiments.common.config import PRESETS
+from experiments.walking.learner import Learner
+from experiments.walking.policies import default_policy, starting_policy
+from experiments.walking.robots import kind
+from jaxtune.network import Network
+
+FILE = Path(__file__).parents[1] / "sled.py"
+ROBOT = f"{FILE}:simulator"
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("go3", "robot: got 'go3', expected biteno, playground:NAME or path/to/file.py:function"),
+        ("no/file.py:make", "robot: no/file.py does not exist"),
+        (f"{FILE}:sledge", "has no function 'sledge'"),
+        (f"{FILE}:nothing", "robot '.*:nothing': env: got NoneType, which has no MJX model"),
+        (f"{FILE}:without_keys", r"robot '.*:without_keys': observe: got None, expected some of state, told"),
+        ("biteno:fast", "robot: got 'biteno:fast'"),
+    ],
+)
+def test_a_robot_that_cannot_be_is_named(name, message):
+    with pytest.raises(ValueError, match=message):
+        kind(name)
+
+
+def test_a_playground_that_is_missing_is_named(monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "mujoco_playground", None)
+    with pytest.raises(ValueError, match="MuJoCo Playground is not installed; expected `pip install playground`"):
+        kind("playground:CheetahRun")
+
+
+def test_a_simulator_brings_its_table_and_an_environment_is_proposed_one():
+    assert list(kind(ROBOT).chosen(None)) == ["mass", "damping", "strength", "delay"]
+    assert list(kind(f"{FILE}:environment").chosen("sled_mass,strength")) == ["sled_mass", "strength"]
+    with pytest.raises(ValueError, match="gravity"):
+        kind(ROBOT).chosen("mass,gravity")
+
+
+@pytest.mark.parametrize("name", ["simulator", "keyed"])
+def test_a_policy_trains_on_robots_that_start_anew(name):
+    robot = kind(f"{FILE}:{name}")
+    learner = Learner(PRESETS["smoke"], robot.chosen("mass,delay"), kind=robot)
+    assert learner.longest == 40  # 0.8 s of steps of 0.02 s
+    assert learner.preset.episode_steps == 60  # the smaller of the preset's 80 and the simulator's
+    policy = learner.init(jax.random.PRNGKey(0))
+    before = policy.robots
+    dist = learner.dist({"mass": 1.2}, 0.1)
+    step = jax.jit(lambda key, policy: learner.train(key, policy, dist, 6))
+    policy, metrics = step(jax.random.PRNGKey(1), policy)
+    assert np.isfinite(metrics["loss"]).all()
+    # 6 rollouts of 8 steps are longer than an episode.
+    assert (np.asarray(policy.robots.pipeline_state.steps) < 40).all()
+    assert not np.array_equal(policy.robots.obs, before.obs)
+    drawn = np.asarray(policy.robots.info["params"]["mass"])
+    assert np.abs(np.log(drawn / 1.2)).max() <= 0.1 + 1e-6
+    assert np.ptp(drawn) > 0.05
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    out = tmp_path_factory.mktemp("sled") / "policy"
+    train.main(train.Args(robot=ROBOT, preset="smoke", out=out))
+    return out
+
+
+def test_the_whole_comparison_runs_on_another_robot(trained, tmp_path):
+    out = tmp_path / "run"
+    sim2sim.main(
+        sim2sim.Args(
+            robot=ROBOT,
+            truth=("mass=1.3", "strength=0.8"),
+            parameters="mass,damping",
+            methods=("ours",),
+            policy=str(trained),
+            preset="smoke",
+            out=out,
+        )
+    )
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["off"] == ["mass"]
+    first = json.loads((out / "results" / "ours_0.json").read_text())["lines"][0]
+    np.testing.assert_allclose(first["param_error"]["mass"], abs(1 / 1.3 - 1), rtol=1e-5)
+    assert first["param_error"]["damping"] == 0
+    assert len(summary["methods"]["ours"]["verdicts"][0]) >= 2
+
+
+def test_lanes_of_a_sweep_are_of_another_robot(trained):
+    options = {"step_sizes": (0.5,), "widen_factors": (1.5,), "radii": (0.2, 0.3), "levels": (0.9,), "seeds": 1}
+    args = sweep.Args(robot=ROBOT, parameters="mass,damping", truth=("damping=2",), preset="smoke", **options)
+    sizes, robot, entries, case = sweep.check(args)
+    learner = Learner(sizes, entries, kind=robot)
+    assert case.off(entries) == ("damping",)
+    program = sweep.program(learner, case.true_params(entries, 0.5), starting_policy(str(trained), learner))
+    dist, info = jax.eval_shape(program, sweep.lanes(args).reshape(-1, 5))
+    assert dist.centre["damping"].shape == (2,)
+    assert info.calls.shape == (2, sizes.sweep_tunings)
+
+
+def test_what_is_exported_acts_as_what_was_trained(trained, tmp_path):
+    export.main(export.Args(robot=ROBOT, policy=str(trained), preset="smoke", out=tmp_path))
+    assert {file.name for file in tmp_path.iterdir()} == {"policy.onnx", "policy.npz", "network.py"}
+    network = Network(tmp_path / "policy.npz")
+    assert network.meta["observation"] == [{"name": "obs", "size": 3}]
+    assert network.meta["rate_hz"] == 50
+    robot = kind(ROBOT)
+    learner = Learner(PRESETS["smoke"], robot.chosen(None), kind=robot)
+    act = learner.act(starting_policy(str(trained), learner))
+    for obs in np.random.default_rng(0).normal(size=(5, 3)).astype(np.float32):
+        np.testing.assert_allclose(network(obs), act(obs, jax.random.PRNGKey(0)), atol=1e-5)
+    with pytest.raises(ValueError, match="obs: got a number that is not finite"):
+        network(np.array([0.0, np.nan, 0.0]))
+
+
+def test_what_another_robot_does_not_have_is_named(trained, tmp_path):
+    robot = kind(ROBOT)
+    learner = Learner(PRESETS["smoke"], robot.chosen(None), kind=robot)
+    assert default_policy(robot) == "scratch"
+    with pytest.raises(ValueError, match=r"policy: got 'walk', but .*sled.py:simulator ships none"):
+        starting_policy("walk", learner)
+    with pytest.raises(ValueError, match="case: got 'bullet', whose target is in bullet; this robot has mjx"):
+        sim2sim.check(sim2sim.Args(robot=ROBOT, case="bullet"))
+    with pytest.raises(ValueError, match="target: got 'mujoco_c', expected one of mjx"):
+        sim2sim.check(sim2sim.Args(robot=ROBOT, target="mujoco_c"))
+    with pytest.raises(ValueError, match=r"truth: got 'mass=9', expected 0.5 to 2"):
+        sim2sim.check(sim2sim.Args(robot=ROBOT, truth=("mass=9",)))
+    with pytest.raises(ValueError, match="case 'mass' needs one whose value differs"):
+        sim2sim.check(sim2sim.Args(robot=ROBOT, parameters="damping"))
+    with pytest.raises(ValueError, match="corrected model, which can be simulated with --robot biteno alone"):
+        Learner(PRESETS["smoke"], robot.chosen(None), correction=object(), kind=robot)
+    # A policy of another robot, even of the same sizes, is another policy.
+    other = kind(f"{FILE}:environment")
+    with pytest.raises(ValueError, match="robot"):
+        starting_policy(str(trained), Learner(replace(PRESETS["smoke"]), other.chosen(None), kind=other))

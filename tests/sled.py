@@ -1,0 +1,105 @@
+"""A pushed mass: a robot of another hand for the tests, as a user writes one for `--robot tests/sled.py:simulator`."""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import mujoco
+from mujoco import mjx
+
+from jaxtune.mjx import Simulator, action_delay, field, mass, strength
+
+SLED = """
+<mujoco>
+  <option timestep="0.005"><flag contact="disable"/></option>
+  <worldbody>
+    <body name="sled"><joint name="rail" type="slide" axis="1 0 0" damping="0.5"/><geom size="0.1" mass="2"/></body>
+  </worldbody>
+  <actuator><motor name="push" joint="rail"/></actuator>
+</mujoco>
+"""
+SUBSTEPS = 4
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class State:
+    data: mjx.Data
+    obs: jax.Array
+    reward: jax.Array
+    done: jax.Array
+
+
+class Sled:
+    """An environment as a user writes one, with a model where `with_model` looks for it.
+
+    It observes position, velocity and the force that it was given, is rewarded for speed, and ends beyond 1.5 m.
+    """
+
+    dt = 0.02
+
+    def __init__(self):
+        self.mj_model = mujoco.MjModel.from_xml_string(SLED)
+        self._mjx_model = mjx.put_model(self.mj_model)
+
+    @property
+    def mjx_model(self):
+        return self._mjx_model
+
+    @property
+    def unwrapped(self):
+        return self
+
+    def reset(self, key):
+        data = mjx.make_data(self.mj_model)
+        data = data.replace(qvel=0.1 * jax.random.normal(key, (1,)))
+        return self._state(data, jnp.zeros(1))
+
+    def step(self, state, action):
+        data = state.data.replace(ctrl=action)
+        data = jax.lax.fori_loop(0, SUBSTEPS, lambda _, data: mjx.step(self._mjx_model, data), data)
+        return self._state(data, action)
+
+    def _state(self, data, action):
+        obs = jnp.concatenate([data.qpos, data.qvel, action])
+        return State(data=data, obs=obs, reward=data.qvel[0], done=(jnp.abs(data.qpos[0]) > 1.5).astype(float))
+
+
+class Keyed(Sled):
+    """The same with a dictionary of observations."""
+
+    def _state(self, data, action):
+        plain = super()._state(data, action)
+        return State(data=data, obs={"state": plain.obs[:2], "told": action}, reward=plain.reward, done=plain.done)
+
+
+TABLE = {
+    "mass": mass("sled", bounds=(0.5, 2.0)),
+    "damping": field("dof_damping", joints="rail", bounds=(0.2, 5.0)),
+    "strength": strength("push", bounds=(0.5, 2.0)),
+    "delay": action_delay(bounds_s=(0.0, 0.05)),
+}
+
+
+def simulator():
+    """The robot, with its table."""
+    return Simulator(Sled(), steps=60, parameters=TABLE)
+
+
+def environment():
+    """The environment alone, for which a table is proposed."""
+    return Sled()
+
+
+def keyed():
+    """Dictionary observations, of which both parts are compared."""
+    return Simulator(Keyed(), steps=60, parameters=TABLE, observe=("state", "told"))
+
+
+def without_keys():
+    """Dictionary observations, of which nobody says what is compared."""
+    return Keyed()
+
+
+def nothing():
+    """What a function returns that forgot to."""
