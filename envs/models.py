@@ -9,12 +9,13 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from envs import pendulum
+from envs import go2, pendulum
 from envs.biteno import constants
 
 BUILT_IN = {
     "biteno": (constants.MODEL_PATH, constants.JOINTS),
     "pendulum": (pendulum.MODEL_PATH, pendulum.JOINTS),
+    "go2": (go2.MODEL_PATH, go2.JOINTS),
 }
 """Path of the MJCF and the joints that may be logged; any other robot is the path of an MJCF file."""
 

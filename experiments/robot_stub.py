@@ -1,9 +1,10 @@
 """Plays a simulated robot that answers through files: `python -m experiments.robot_stub --folder RUN`.
 
-It stands in for a real robot, so that `sim2real` can be tried without one; `experiments.robot.surrogate` describes its
-body. For every `RUN/**/round_*/request.json` beside an exported policy it walks with that policy and writes
-`round_*/log`. For targets of `experiments.excite` in `RUN/**/hung/targets` it plays them suspended and writes
-`hung/log`. The learner sees nothing of it but these files.
+It stands in for a real robot, so that `sim2real` can be tried without one; `experiments.robot.surrogate` describes
+BITeno's body. Another robot (`--robot`) is its own simulation with parameters that are hidden. For every
+`RUN/**/round_*/request.json` beside an exported policy it walks with that policy and writes `round_*/log`. For targets
+of `experiments.excite` in `RUN/**/hung/targets` BITeno plays them suspended and writes `hung/log`. The learner sees
+nothing of it but these files.
 """
 
 import json
@@ -19,28 +20,36 @@ from pathlib import Path
 import numpy as np
 
 from envs.biteno import constants
-from envs.biteno.player import Player
 from envs.logs import Log, read, write
 from experiments.common.cli import console, run
-from experiments.robot.surrogate import ROW_S, Body, Robot
+from experiments.robot.simulated import SimulatedRobot
+from experiments.robot.surrogate import Body, Robot
+from experiments.walking.robots import BITENO, kind
+
+_BODIES = (BITENO.name,)  # robots that have a body of their own, `Body`
 
 
 @dataclass(frozen=True, kw_only=True)
 class Args:
     """Plays a simulated robot: walks with the policies in a folder, plays targets while suspended, and writes logs."""
 
+    robot: str = "biteno"
+    """Robot and task: biteno, go2, playground:NAME (an environment of MuJoCo Playground), or path/to/file.py:function,
+    which returns a jaxtune.mjx.Simulator or an environment."""
     folder: Path
     """Folder that is searched, at any depth, for requests to walk (`round_*/request.json` beside `round_*/policy`) and
     for targets to play while suspended (`hung/targets`)."""
     body: Body = field(default_factory=Body)
-    """Properties of the robot's body; masses, friction and torque are multiples of the nominal model's."""
+    """Properties of biteno's body; masses, friction and torque are multiples of the nominal model's."""
+    truth: tuple[str, ...] = ()
+    """True values of another robot's parameters, name=value; those that are left out are nominal."""
     idle_s: float = 3600.0
     """The program ends after this many seconds without a request."""
     seed: int = 0
     """Random seed of its noise and, together with the request's own seed, of its commands."""
 
 
-def answer(place: Path, robot: Robot, seed: int) -> Sequence[bool]:
+def answer(place: Path, robot: Robot | SimulatedRobot, seed: int) -> Sequence[bool]:
     """Answers a request: walks as often and as long as it says, and writes the log.
 
     Args:
@@ -57,22 +66,13 @@ def answer(place: Path, robot: Robot, seed: int) -> Sequence[bool]:
     request = _request(place / "request.json")
     exported = place / "policy" / "policy.npz"
     try:
-        player = Player(exported)
+        policy = robot.load(exported)
     except (KeyError, TypeError, zipfile.BadZipFile) as error:
         raise ValueError(f"{exported}: {error!r}, expected what experiments.export writes") from error
     # A generator for every walk, so that a walk does not depend on how long the one before it lasted.
     rngs = [np.random.default_rng((seed, request["seed"], index)) for index in range(request["episodes"])]
-    walked = [robot.walk(f"run_{index:03d}", player, request["seconds"], rng) for index, rng in enumerate(rngs)]
-    meta = player.meta
-    log = Log(
-        robot=meta["robot"],
-        base="free",
-        rate_hz=1.0 / ROW_S,
-        joints=tuple(meta["joints"]),
-        policy={name: meta[name] for name in ("rate_hz", "action_scale", "base")},
-        runs=tuple(run for run, _ in walked),
-    )
-    _put(log, place)
+    walked = [robot.walk(f"run_{index:03d}", policy, request["seconds"], rng) for index, rng in enumerate(rngs)]
+    _put(robot.log(policy.meta, tuple(run for run, _ in walked)), place)
     return [fell for _, fell in walked]
 
 
@@ -118,15 +118,25 @@ def _put(log: Log, place: Path) -> None:
     draft.rename(place / "log")
 
 
+def stand_in(args: Args) -> tuple[Robot | SimulatedRobot, Robot | None]:
+    """Makes the robot that walks, and the same robot suspended if it can be.
+
+    Raises:
+      ValueError: there is no such robot, or a true value is not in its table.
+    """
+    if args.robot in _BODIES:
+        return Robot(args.body), Robot(args.body, suspended=True)
+    return SimulatedRobot(kind(args.robot), args.truth), None
+
+
 def main(args: Args) -> None:
     """Answers requests until none has come for `idle_s`; the reason of a refusal goes into `refused.txt`."""
-    standing, suspended = Robot(args.body), Robot(args.body, suspended=True)
+    standing, suspended = stand_in(args)
     last = time.monotonic()
     while time.monotonic() - last < args.idle_s:
         jobs = [(path.parent, answer, standing) for path in args.folder.glob("**/round_*/request.json")]
-        jobs += [
-            (path.parent.parent, play_targets, suspended) for path in args.folder.glob("**/hung/targets/meta.yaml")
-        ]
+        hung = args.folder.glob("**/hung/targets/meta.yaml") if suspended else ()
+        jobs += [(path.parent.parent, play_targets, suspended) for path in hung]
         for place, does, robot in sorted(jobs, key=lambda job: job[0]):
             if (place / "log").exists() or (place / "refused.txt").exists():
                 continue

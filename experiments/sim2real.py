@@ -1,4 +1,4 @@
-"""Tunes BITeno's simulator to a robot that answers through log files: `python -m experiments.sim2real --out RUN`.
+"""Tunes a simulator to a robot that answers through log files: `python -m experiments.sim2real --out RUN`.
 
 A round predicts how the policy will walk, exports it, requests walks and waits for their log. The log doctor checks the
 log and the gate verifies it. The tuner moves the distribution, the policy trains in it, and a report is written.

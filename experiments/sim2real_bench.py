@@ -152,7 +152,7 @@ def prepare(args: Args, programs: Programs, seed: int) -> None:
     if (place / "config.json").exists():
         return
     learner = programs.learner
-    start = transfers.check(transfer_of(args, "ours", seed))[2]
+    start = transfers.check(transfer_of(args, "ours", seed))[3]
     dist = learner.dist(start, learner.preset.policy_radius)
     state = programs.machines["ours"].init(starting_policy("walk", learner), dist, knobs())
     state, _ = programs.train(jax.random.PRNGKey(_EVALUATION_SEED + seed), state)

@@ -38,8 +38,8 @@ class Args:
     out: Path = Path("runs/sweep")
     """Folder of summary.json and heat_map.png."""
     robot: str = "biteno"
-    """Robot and task: biteno, playground:NAME (an environment of MuJoCo Playground), or path/to/file.py:function, which
-    returns a jaxtune.mjx.Simulator or an environment."""
+    """Robot and task: biteno, go2, playground:NAME (an environment of MuJoCo Playground), or path/to/file.py:function,
+    which returns a jaxtune.mjx.Simulator or an environment."""
     case: str = "mass"
     """How the target differs: friction or mass."""
     start: float = 0.5

@@ -46,10 +46,6 @@ class Sled:
     def mjx_model(self):
         return self._mjx_model
 
-    @property
-    def unwrapped(self):
-        return self
-
     def reset(self, key):
         data = mjx.make_data(self.mj_model)
         data = data.replace(qvel=0.1 * jax.random.normal(key, (1,)))

@@ -7,7 +7,7 @@ those of the model: joint positions and targets in rad, velocities in rad/s, tor
 """
 
 from envs.logs.controller import Controller, Impedance
-from envs.logs.files import read, write
+from envs.logs.files import read, read_observed, write
 from envs.logs.format import Log, Run, splits, with_halves_swapped
 from envs.logs.xl330 import read_any, read_xl330
 
@@ -18,6 +18,7 @@ __all__ = [
     "Run",
     "read",
     "read_any",
+    "read_observed",
     "read_xl330",
     "splits",
     "with_halves_swapped",

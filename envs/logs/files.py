@@ -13,12 +13,14 @@ from envs.logs.format import (
     FACTS,
     JOINT_SIGNALS,
     MEASURED,
+    OBSERVATION,
     SCALAR_SIGNALS,
     VECTOR_SIGNALS,
     Controller,
     Log,
     Run,
     column_names,
+    is_observation,
 )
 from envs.logs.meta import Meta
 from envs.logs.tables import READERS, WRITERS, check_time, check_values, refuse_first
@@ -43,6 +45,22 @@ def read(folder: Path, measured: bool = True) -> Log:
     """
     folder = Path(folder)
     meta = Meta(folder, {name: joints for name, (_, joints) in BUILT_IN.items()})
+    return _read(folder, meta, "q" if measured else "target")
+
+
+def read_observed(folder: Path) -> Log:
+    """Reads a log of what a policy observed and did, of any robot: `t`, `obs.*` and `action.*` are enough.
+
+    `robot` may be any name, `joints` names the components of the action, and `base` and `controller` may be missing.
+
+    Raises:
+      ValueError: as `read`.
+    """
+    folder = Path(folder)
+    return _read(folder, Meta(folder, None), OBSERVATION)
+
+
+def _read(folder: Path, meta: Meta, needed: str) -> Log:
     paths = sorted(folder.glob("run_*"))
     for path in paths:
         if not (path.suffix in READERS and path.is_file()) and not is_bag(path):
@@ -64,7 +82,7 @@ def read(folder: Path, measured: bool = True) -> Log:
         rate_hz=meta.rate_hz,
         joints=meta.joints,
         policy=meta.policy,
-        runs=tuple(_run(path, meta, "q" if measured else "target") for path in paths),
+        runs=tuple(_run(path, meta, needed) for path in paths),
     )
 
 
@@ -95,7 +113,7 @@ def write(log: Log, folder: Path, suffix: str = ".csv") -> None:
         "base": log.base,
         "rate_hz": log.rate_hz,
         "joints": list(log.joints),
-        "controller": _as_meta(log.runs[0].controller),
+        **_as_meta(log.runs[0].controller),
         "runs": {},
     }
     if known := _facts_as_meta(log):
@@ -103,12 +121,14 @@ def write(log: Log, folder: Path, suffix: str = ".csv") -> None:
     if log.policy is not None:
         meta["policy"] = dict(log.policy)
     for run in log.runs:
-        entry = {"condition": run.condition, "controller": _as_meta(run.controller)}
+        entry = {"condition": run.condition, **_as_meta(run.controller)}
         meta["runs"][run.name] = entry | ({"split": run.split} if run.split else {})
         columns = {"t": run.time} | dict(run.other)
         for signal, values in run.signals.items():
-            names = column_names(signal, log.joints)
-            columns |= dict(zip(names, values.reshape(len(run.time), -1).T, strict=True))
+            values = values.reshape(len(run.time), -1)
+            numbered = [f"{OBSERVATION}.{number}" for number in range(values.shape[1])]
+            names = numbered if signal == OBSERVATION else column_names(signal, log.joints)
+            columns |= dict(zip(names, values.T, strict=True))
         WRITERS[suffix](folder / f"{run.name}{suffix}", columns)
     # Renaming makes it appear complete, and after all runs.
     draft = folder / "meta.yaml.partial"
@@ -116,11 +136,13 @@ def write(log: Log, folder: Path, suffix: str = ".csv") -> None:
     draft.rename(folder / "meta.yaml")
 
 
-def _as_meta(controller: Controller) -> dict:
+def _as_meta(controller: Controller | None) -> dict:
+    if controller is None:
+        return {}
     # No limit is an infinite one, which `meta.yaml` expresses by leaving it out.
     gains = {name: values.tolist() for name, values in controller.gains.items() if np.isfinite(values).all()}
     own = {"type": controller.kind, "rate_hz": controller.rate_hz, "target_between_rows": controller.between_rows}
-    return own | gains
+    return {"controller": own | gains}
 
 
 def _facts_as_meta(log: Log) -> dict:
@@ -155,9 +177,13 @@ def _run(path: Path, meta: Meta, needed: str) -> Run:
     entry = meta.runs.get(path.stem, {"controller": meta.controller})
     known = {signal: dict(facts) for signal, facts in meta.facts.items() if signal in signals}
     _convert(path, signals, known, meta, entry["controller"])
-    if needed not in signals:
+    if needed == OBSERVATION:
+        for name, column in ((OBSERVATION, "obs.0"), ("action", column_names("action", meta.joints)[0])):
+            if name not in signals:
+                raise ValueError(f"{path}, column '{column}': is missing, which a log of what a policy did needs")
+    elif needed not in signals:
         raise ValueError(f"{path}, column '{column_names(needed, meta.joints)[0]}': is missing")
-    if not {"target", "tau"} & set(signals):
+    elif not {"target", "tau"} & set(signals):
         raise ValueError(f"{path}: there is neither '{column_names('target', meta.joints)[0]}' nor 'tau' or 'current'")
     return Run(
         name=path.stem,
@@ -186,6 +212,15 @@ def _signals(path: Path, columns: dict[str, np.ndarray], meta: Meta) -> dict[str
         for name, one in zip(names, values, strict=True):
             check_values(path, signal, meta.columns.get(name, name), one)
         signals[signal] = np.stack(values, axis=1) if len(names) > 1 or "." in names[0] else values[0]
+    numbered = [name for name in columns if is_observation(name)]
+    for number in range(len(numbered)):
+        if f"{OBSERVATION}.{number}" not in columns:
+            raise ValueError(
+                f"{path}, column '{OBSERVATION}.{number}': is missing, although '{max(numbered)}' is there"
+            )
+    if numbered:
+        values = [columns.pop(f"{OBSERVATION}.{number}") for number in range(len(numbered))]
+        signals[OBSERVATION] = np.stack(values, axis=1)
     for signal in ("gravity", "quat"):
         if signal in signals:
             norm = np.linalg.norm(signals[signal], axis=1)
@@ -193,7 +228,7 @@ def _signals(path: Path, columns: dict[str, np.ndarray], meta: Meta) -> dict[str
     return signals
 
 
-def _convert(path: Path, signals: dict, known: dict, meta: Meta, controller: Controller) -> None:
+def _convert(path: Path, signals: dict, known: dict, meta: Meta, controller: Controller | None) -> None:
     """Converts signals, and what is known of them, to the model's units and signs, and currents to torques."""
     # Actions keep their unit and sign: they are the policy's, not the model's.
     unit = dict.fromkeys(("q", "dq", "target"), meta.angle) | dict.fromkeys(("tau", "abs_tau"), meta.torque)
@@ -204,7 +239,7 @@ def _convert(path: Path, signals: dict, known: dict, meta: Meta, controller: Con
             signals[signal] = signals[signal] * factor * (1.0 if signal == "abs_tau" else sign)
             _scale(known.get(signal, {}), factor)
     if "current" in signals and "tau" not in signals:
-        if "kt" not in controller.gains:
+        if controller is None or "kt" not in controller.gains:
             name = column_names("current", meta.joints)[0]
             raise ValueError(f"{path}, column '{name}': {meta.path}: controller.kt: is missing, in Nm/A at the joint")
         signals["tau"] = controller.gains["kt"] * signals.pop("current")

@@ -30,6 +30,9 @@ VECTOR_SIGNALS = {
 SCALAR_SIGNALS = ("enabled", "volts")
 """Signals with one column."""
 
+OBSERVATION = "obs"
+"""The policy's own observation, with as many columns (`obs.0`, `obs.1`, ...) as it has components."""
+
 MEASURED = ("q", "dq", "tau", "abs_tau", "current", "gyro", "acc", "gravity", "vel", "pos", "quat", "volts")
 """Signals that sensors read, of which `meta.yaml` may say what is known (`Run.known`)."""
 
@@ -58,7 +61,8 @@ class Run:
     of one condition are always in the same split."""
     split: str | None
     """train, select or sealed, where `meta.yaml` sets it."""
-    controller: Controller
+    controller: Controller | None
+    """None only in a log of observations and actions (`envs.logs.read_observed`) that does not say."""
     time: np.ndarray
     """[rows] s, strictly increasing."""
     signals: Mapping[str, np.ndarray]
@@ -172,3 +176,9 @@ def column_names(signal: str, joints: Sequence[str]) -> list[str]:
     """
     parts = joints if signal in JOINT_SIGNALS else VECTOR_SIGNALS.get(signal)
     return [signal] if parts is None else [f"{signal}.{part}" for part in parts]
+
+
+def is_observation(column: Any) -> bool:
+    """Tells whether a column is a component of the policy's observation, such as `obs.7`."""
+    head, _, number = str(column).partition(".")
+    return head == OBSERVATION and number.isdecimal()

@@ -22,6 +22,7 @@ from envs.logs.format import (
     SPLITS,
     VECTOR_SIGNALS,
     column_names,
+    is_observation,
 )
 
 _ANGLE = {"rad": 1.0, "deg": np.pi / 180.0}  # factors to rad
@@ -70,13 +71,14 @@ class Meta:
 
     Args:
       folder: of the log.
-      robots: joints that may be logged, by the name of the built-in robot.
+      robots: joints that may be logged, by the name of the built-in robot; None for a log of observations and actions,
+        whose robot may have any name, any joints and an unknown controller.
 
     Raises:
       ValueError: names the file and the key, what was found and what was expected.
     """
 
-    def __init__(self, folder: Path, robots: Mapping[str, Sequence[str]]):
+    def __init__(self, folder: Path, robots: Mapping[str, Sequence[str]] | None):
         self.path = folder / "meta.yaml"
         if not self.path.is_file():
             raise ValueError(f"{self.path}: there is no such file")
@@ -84,13 +86,15 @@ class Meta:
             meta = yaml.load(self.path.read_text(encoding="utf-8"), _Loader)
         except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
             raise ValueError(f"{self.path}: {error}") from error
-        meta = self._mapping("", meta, _META)
-        self.robot, movable = self._robot(folder, self._text("robot", meta["robot"]), robots)
-        self.base = self._one_of("base", meta["base"], ("fixed", "free"))
+        meta = self._mapping("", meta, _META if robots is not None else _META | {"base": False, "controller": False})
+        self.robot, movable = self._text("robot", meta["robot"]), None
+        if robots is not None:
+            self.robot, movable = self._robot(folder, self.robot, robots)
+        self.base = self._one_of("base", meta.get("base", "free"), ("fixed", "free"))
         self.rate_hz = self._number("rate_hz", meta["rate_hz"])
         self.joints = self._names("joints", meta["joints"])
         for joint in self.joints:
-            if joint not in movable:
+            if movable is not None and joint not in movable:
                 raise ValueError(f"{self.path}: joints: '{self.robot}' has no '{joint}'; expected {', '.join(movable)}")
         self.signs = dict.fromkeys(self.joints, 1.0)
         for joint, sign in self._mapping("sign", meta.get("sign"), dict.fromkeys(self.joints)).items():
@@ -99,6 +103,9 @@ class Meta:
         self.angle = _ANGLE[self._one_of("units.angle", units.get("angle", "rad"), _ANGLE)]
         self.torque = _TORQUE[self._one_of("units.torque", units.get("torque", "Nm"), _TORQUE)]
         self.known = {"t": None, **dict.fromkeys(self._all_columns())}
+        # An observation has as many columns as the log says.
+        named = meta["columns"] if isinstance(meta.get("columns"), dict) else {}
+        self.known |= {ours: None for ours in named if is_observation(ours)}
         self.columns = {
             ours: self._text(f"columns.{ours}", theirs)
             for ours, theirs in self._mapping("columns", meta.get("columns"), self.known).items()
@@ -117,8 +124,8 @@ class Meta:
                 else:
                     self._number(f"policy.{name}", value)
         # Kept as written, because a run may override single numbers of it.
-        self._controller = meta["controller"]
-        self.controller = self._read_controller("controller", self._controller)
+        self._controller = meta.get("controller")
+        self.controller = self._controller and self._read_controller("controller", self._controller)
         runs = meta.get("runs")
         names = dict.fromkeys(runs if isinstance(runs, dict) else ())
         self.runs = {name: self._read_run(name, entry) for name, entry in self._mapping("runs", runs, names).items()}
@@ -156,7 +163,7 @@ class Meta:
         if "controller" in entry:
             override = self._mapping(f"{where}.controller", entry["controller"], None)
             # Another type of controller has other numbers, so it inherits none from the log's own controller.
-            base = {} if "type" in override else self._controller
+            base = {} if "type" in override else self._controller or {}
             read["controller"] = self._read_controller(f"{where}.controller", {**base, **override})
         return read
 

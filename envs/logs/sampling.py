@@ -5,7 +5,7 @@ Bags need it to bring all topics to one clock, and recorded walks to find what a
 
 import numpy as np
 
-SENT = ("action", "target", "phase")
+SENT = ("action", "target", "phase", "obs")
 """Signals that a policy sends in one of its steps (a tick)."""
 COMMANDED = (*SENT, "enabled", "cmd")
 """Signals of commands, which hold until the next one is sent."""

@@ -128,6 +128,10 @@ def _read_npz(path: Path) -> dict[str, np.ndarray]:
             columns = {name: arrays[name] for name in arrays.files}
     except Exception as error:  # a damaged archive fails in many ways
         raise ValueError(f"{path}: {type(error).__name__}: {error}") from error
+    observation = columns.get("obs")
+    if isinstance(observation, np.ndarray) and observation.ndim == 2:
+        del columns["obs"]
+        columns |= {f"obs.{number}": values for number, values in enumerate(observation.T)}
     for name, values in columns.items():
         # NumPy returns members of an archive that are not arrays as bytes.
         if not isinstance(values, np.ndarray):

@@ -27,7 +27,7 @@ _READINGS = {"velocity": "vel", "gyro": "gyro", "gravity": "gravity", "joint": "
 _SAME_RATE = 0.02  # a row is a tick where the two periods differ by a smaller share
 _FASTER = 1.5  # rows must be faster than ticks by this factor, so that ticks can be found among them
 _SILENCE = 10.5  # periods of the policy without a new action, after which it has stopped
-_HOLE = 1.5  # periods of the policy between two ticks, from which on rows are missing
+HOLE = 1.5  # periods of the policy between two ticks, from which on rows are missing
 _UP_S = 0.5  # time for which a robot must be up after a fall to count as standing again
 _STEADY = 0.95  # share of ticks that are equally many rows apart where rows and ticks are synchronous
 
@@ -41,8 +41,8 @@ class Recorded:
     """
 
     trajectory: Trajectory
-    commands: Commands  # from the run's first tick on, one or two steps before the trajectory
-    power: jax.Array  # [episodes, time] W, mechanical; braking is not regained
+    commands: Commands | None  # from the run's first tick on, one or two steps before the trajectory
+    power: jax.Array  # [episodes, time] W, mechanical; braking is not regained; nan where it was not recorded
     run: jax.Array  # [episodes] index of the run, increasing; every run has at least one episode
     begin: jax.Array  # [episodes] policy steps from the run's first step to the episode's first
 
@@ -81,7 +81,7 @@ def episodes(log: Log, steps: int) -> Recorded:
             raise ValueError(f"{run.name}: got no two consecutive ticks with the robot on its feet, expected a walk")
         begins = np.round((ticks["time"] - ticks["time"][pieces[0][0][0]]) / constants.POLICY_DT_S).astype(int)
         for rows, fell in pieces:
-            found += [one | {"run": index} for one in _chunks(_steps(ticks, rows, fell), steps, begins[rows[0]])]
+            found += [one | {"run": index} for one in cut(_steps(ticks, rows, fell), steps, begins[rows[0]])]
         # Among faster rows ticks are found by changes of the action, so the run's first tick is not among them.
         first_missing = 0.5 < (ticks["time"][0] - run.time[0]) / constants.POLICY_DT_S < 1.5
         leads.append(2 if first_missing else 1)
@@ -99,15 +99,13 @@ def beginning(recorded: Recorded, steps: int) -> Recorded:
     first = np.unique(np.asarray(recorded.run), return_index=True)[1]
     one = jax.tree.map(lambda leaf: leaf[first], recorded)
     trajectory, commands = one.trajectory, one.commands
-    lead = commands.command.shape[1] - trajectory.alive.shape[1]
     # A fall after the cut does not count: the robot was still up.
     fell = trajectory.fell & ~trajectory.alive[:, steps:].any(axis=1)
-    cut = {name: trajectory[name][:, :steps] for name in ("obs", "action", "alive", "score")}
-    return one.replace(
-        trajectory=trajectory.replace(fell=fell, **cut),
-        commands=commands.replace(command=commands.command[:, : lead + steps]),
-        power=one.power[:, :steps],
-    )
+    kept = {name: trajectory[name][:, :steps] for name in ("obs", "action", "alive", "score")}
+    if commands is not None:
+        lead = commands.command.shape[1] - trajectory.alive.shape[1]
+        commands = commands.replace(command=commands.command[:, : lead + steps])
+    return one.replace(trajectory=trajectory.replace(fell=fell, **kept), commands=commands, power=one.power[:, :steps])
 
 
 def whole(recorded: Recorded, steps: int) -> tuple[Trajectory, np.ndarray]:
@@ -160,7 +158,7 @@ def _at_ticks(run: Run, order: list[int]) -> dict[str, np.ndarray]:
     by_legs = lambda: np.asarray(jax.vmap(gait.trunk_height)(signals["gravity"], signals["q"]))  # noqa: E731
     height = signals["pos"][:, 2] if "pos" in signals else by_legs()
     down = np.asarray(env.fallen(signals["gravity"], height)) | (signals.get("enabled", np.ones(len(height))) == 0)
-    rows, aligned = _ticks(run.name, run.time, signals["action"])
+    rows, aligned = find_ticks(run.name, run.time, signals["action"], constants.POLICY_DT_S)
     # After a fall the policy may send no more actions, so the fall itself is made a tick.
     rows = np.union1d(rows, 1 + np.flatnonzero(down[1:] & ~down[:-1]))
     if aligned:
@@ -177,12 +175,21 @@ def _at_ticks(run: Run, order: list[int]) -> dict[str, np.ndarray]:
     return seen | {"up": ~down[rows]}
 
 
-def _ticks(name: str, time: np.ndarray, action: np.ndarray) -> tuple[np.ndarray, bool]:
+def find_ticks(name: str, time: np.ndarray, action: np.ndarray, period: float) -> tuple[np.ndarray, bool]:
     """Finds the rows in which the policy sent an action, and whether it observed the robot in these very rows.
 
     If rows come at the policy's rate, every row is a tick. Among faster rows a tick is where the action changes.
+
+    Args:
+      name: of the run, for messages.
+      time: [rows] s.
+      action: [rows, act].
+      period: of the policy, in s.
+
+    Raises:
+      ValueError: rows are too slow for the policy, or actions change at another rate.
     """
-    period, width = constants.POLICY_DT_S, float(np.median(np.diff(time)))
+    width = float(np.median(np.diff(time)))
     changes = 1 + np.flatnonzero((np.diff(action, axis=0) != 0).any(axis=1))
     if abs(width / period - 1.0) < _SAME_RATE:
         # Every row is a tick, unless the action has stayed the same for so long that the policy must have stopped.
@@ -223,7 +230,7 @@ def _wanted_torque(run: Run, seen: dict[str, np.ndarray], order: list[int]) -> n
 def _pieces(ticks: dict[str, np.ndarray]) -> list[tuple[np.ndarray, bool]]:
     """Finds pieces of consecutive ticks with the robot on its feet, and whether each ends in a fall."""
     up = ticks["up"]
-    hole = np.append(False, np.diff(ticks["time"]) > _HOLE * constants.POLICY_DT_S)
+    hole = np.append(False, np.diff(ticks["time"]) > HOLE * constants.POLICY_DT_S)
     found, down = [], False
     # Split at holes, and wherever the robot falls or stands up.
     for rows in np.split(np.arange(len(up)), np.flatnonzero(hole | np.append(False, up[1:] != up[:-1]))):
@@ -254,16 +261,19 @@ def _steps(ticks: dict[str, np.ndarray], rows: np.ndarray, fell: bool) -> dict:
     return moments | {"alive": np.ones(len(ends), bool), "fell": ends}
 
 
-def _chunks(steps: dict, length: int, begin: int) -> list[dict]:
-    """Divides a piece into episodes of a length; `begin` is the piece's first step in its run."""
+def cut(steps: dict, length: int, begin: int) -> list[dict]:
+    """Divides a piece of a run, whose leaves are [steps, ...], into episodes of a length; the last one is filled up.
+
+    `begin` is the piece's first step in its run; it becomes that of every episode.
+    """
     count = len(steps["alive"])
 
-    def cut(start: int) -> dict:
+    def episode(start: int) -> dict:
         fill = max(0, start + length - count)
         filled = lambda leaf: np.pad(leaf[start : start + length], [(0, fill)] + [(0, 0)] * (leaf.ndim - 1))  # noqa: E731
         return jax.tree.map(filled, steps) | {"begin": begin + start}
 
-    return [cut(start) for start in range(0, count, length)]
+    return [episode(start) for start in range(0, count, length)]
 
 
 @partial(jax.jit, static_argnums=1)

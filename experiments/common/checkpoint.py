@@ -172,7 +172,7 @@ def save(path: Path, state: Any, config: Any) -> None:
         the program that loads it has other ones.
     """
     with ocp.StandardCheckpointer() as checkpointer:
-        checkpointer.save(path.absolute() / "state", state, force=True)
+        checkpointer.save(path.absolute() / "state", _with_numbers(state), force=True)
     write_json(path / "config.json", {"config": as_json(config), "versions": versions()})
 
 
@@ -195,9 +195,16 @@ def load(path: Path, like: Any, config: Any) -> Any:
         raise ValueError(f"policy: {path} holds no config.json; expected a folder that experiments.train has written")
     _same(f"policy: {path} was made with another config", json.loads(stored.read_text())["config"], as_json(config))
     with ocp.StandardCheckpointer() as checkpointer:
-        state = checkpointer.restore(path.absolute() / "state", jax.tree.map(ocp.utils.to_shape_dtype_struct, like))
+        wanted = jax.tree.map(ocp.utils.to_shape_dtype_struct, _with_numbers(like))
+        state = checkpointer.restore(path.absolute() / "state", wanted)
     # Orbax commits arrays to a device, and a step with committed input and uncommitted output would compile twice.
-    return jax.tree.map(jnp.asarray, jax.device_get(state))
+    found = iter(jax.tree.map(jnp.asarray, jax.device_get(jax.tree.leaves(state))))
+    return jax.tree.map(lambda leaf: next(found) if jnp.size(leaf) else leaf, like)
+
+
+def _with_numbers(state: Any) -> Any:
+    """Leaves out arrays without elements, such as a simulator has for what its model lacks: orbax cannot save them."""
+    return jax.tree.map(lambda leaf: leaf if jnp.size(leaf) else None, state)
 
 
 def _same(message: str, found: Any, wanted: Any, where: str = "config") -> None:

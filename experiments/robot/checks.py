@@ -2,11 +2,11 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
 
-from envs.biteno import TaskConfig
 from envs.diagnosis import Finding
 from envs.logs import Log
 from jaxtune.types import Trajectory
@@ -40,7 +40,7 @@ def check_meaning(
     place: Path,
     log: Log,
     walks: Trajectory,
-    task: TaskConfig,
+    policy: Mapping[str, Any],
     act: Callable[[jax.Array], jax.Array],
     suspicions: Sequence[tuple[Finding, list[str]]],
 ) -> None:
@@ -52,7 +52,7 @@ def check_meaning(
       place: folder of the log, for messages.
       log: as it was read.
       walks: its episodes, [episodes, time].
-      task: of the policy that was exported.
+      policy: settings of the policy that was exported, such as its reference and scale.
       act: actions [steps, act] of that policy for observations [steps, obs], without noise.
       suspicions: findings of the log doctor, each with the names of the runs that share it.
 
@@ -61,7 +61,7 @@ def check_meaning(
         reference or scale, or its actions are not the policy's. Names everything that is wrong.
     """
     wrong = [finding.sentence for finding, runs in suspicions if finding.wrong and 2 * len(runs) > len(log.runs)]
-    wrong += _other_policy(log.policy or {}, {"action_scale": task.action_scale, "base": task.base})
+    wrong += _other_policy(log.policy or {}, policy)
     strange = _difference(walks, act)
     if strange > _STRANGE:
         wrong.append(f"actions differ from what this round's policy does by {strange:.0%} of their size")

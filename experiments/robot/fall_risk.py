@@ -7,7 +7,6 @@ expected rate is at least the measured one.
 
 from scipy.stats import binom
 
-from envs.biteno import constants
 from envs.targets.recorded import Recorded, whole
 from experiments.robot.records import Measured, Prediction, Suspicion, Tuning
 from experiments.walking.learner import summarise_walks
@@ -17,12 +16,13 @@ _SURPRISE = 0.2
 can refute little: to trust a wrong simulator may cost a robot, to doubt a right one costs a few walks."""
 
 
-def summarise_log(recorded: Recorded, steps: int, suspected: tuple[Suspicion, ...] = ()) -> Measured:
+def summarise_log(recorded: Recorded, steps: int, control_s: float, suspected: tuple[Suspicion, ...] = ()) -> Measured:
     """Summarises the walks of a log: return, falls, power, and records that end too early.
 
     Args:
       recorded: episodes of the log.
       steps: policy steps of a walk as it was requested.
+      control_s: length of a policy step in s.
       suspected: findings of the log doctor, which are passed on to the report.
     """
     walks, power = whole(recorded, steps)
@@ -32,7 +32,7 @@ def summarise_log(recorded: Recorded, steps: int, suspected: tuple[Suspicion, ..
         fall_rate=float(means["fall_rate"]),
         power_w=float(means["power_w"]),
         episodes=len(walks.fell),
-        seconds=float(walks.alive.sum()) * constants.POLICY_DT_S,
+        seconds=float(walks.alive.sum()) * control_s,
         cut_short=int((~walks.alive[:, -1] & ~walks.fell).sum()),
         suspected=suspected,
     )

@@ -12,12 +12,12 @@ from dataclasses import dataclass, field
 class WalkMeans:
     """Means over walks, the same for simulated and measured ones, so that they compare."""
 
-    mean_return: float = field(metadata={"key": "return"})
-    """Return of a walk, with the reward weights of the paper's Table I."""
+    mean_return: float | None = field(metadata={"key": "return"})
+    """Return of a walk, BITeno's with the reward weights of the paper's Table I; None where no reward was recorded."""
     fall_rate: float
     """Share of walks that end in a fall."""
-    power_w: float
-    """Mechanical power in W while the robot is on its feet."""
+    power_w: float | None
+    """Mechanical power in W while the robot is on its feet; None where it is not known."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -78,7 +78,7 @@ def show(console: Console, last: Round) -> None:
     table = Table("", "predicted", "measured", "same policy, tuned simulator", "predicted for the next round")
     columns = [as_json(one) for one in (last.predicted, last.measured, last.tuning.explained, last.next_predicted)]
     for name, label in _QUANTITIES.items():
-        table.add_row(label, *(f"{column[name]:.2f}" for column in columns))
+        table.add_row(label, *("-" if column[name] is None else f"{column[name]:.2f}" for column in columns))
     console.print(table)
     table = Table("parameter", "before", "after", "90 % interval")
     for name, ends in last.tuning.moved.items():

@@ -19,14 +19,12 @@ them are expected to end in a fall (`experiments.robot.fall_risk`).
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 
-from envs import logs
-from envs.biteno import constants
-from envs.diagnosis import diagnose_log, shared_findings
 from envs.targets import recorded
 from experiments.common import checkpoint, report
 from experiments.common.checkpoint import from_json, write_json
@@ -66,7 +64,7 @@ _KEYS = 7  # keeps the random keys of rounds different from others that begin wi
 
 
 class Programs:
-    """A learner with the compiled programs of a round: tune, train, predict, act.
+    """A learner with the compiled programs of a round: tune, train, predict, actions.
 
     Compiling takes minutes. A benchmark that plays many runs shares one `Programs`, so that each is compiled once.
 
@@ -80,9 +78,7 @@ class Programs:
         self.tune = {name: jax.jit(machine.tune) for name, machine in self.machines.items()}
         self.train = jax.jit(learner.tuner().train)
         self.predict = jax.jit(learner.predict, static_argnums=(3, 4))
-        self.act = jax.jit(
-            lambda policy, obs: jax.vmap(lambda one: learner.act(policy)(one, jax.random.PRNGKey(0)))(obs)
-        )
+        self.actions = jax.jit(learner.actions)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,7 +126,8 @@ class Rounds:
         self._tune = programs.tune[method]
         policy = STRATEGIES[method].policy(policy, radius)
         self._first = programs.machines[method].init(policy, self._learner.dist(start, radius), tuner.knobs())
-        self._steps = round(terms.walk_s / constants.POLICY_DT_S)
+        self._kind = self._learner.kind
+        self._steps = round(terms.walk_s / self._kind.control_s)
 
     def play(self, index: int, last: Round | None) -> Round:
         """Plays a round: predict, request, wait, check, tune, and train the policy for the next one.
@@ -227,15 +224,15 @@ class Rounds:
     def _learn(self, index: int, state: TunerState) -> None:
         """Turns the robot's log into the next distribution, and writes what was measured and what moved."""
         place, preset = self._place(index), self._learner.preset
-        log = logs.read(place / "log")
+        log = self._kind.read(place / "log")
         check_runs(place, log, preset.tuner.set_episodes)
-        walks = recorded.episodes(log, self._steps)
-        suspicions = shared_findings(diagnose_log(log))
+        walks = self._kind.episodes(log, self._steps)
+        suspicions = self._kind.findings(log)
         if not self._terms.trust_log:
-            act = lambda obs: self._programs.act(state.policy, obs)  # noqa: E731
-            check_meaning(place / "log", log, walks.trajectory, preset.task, act, suspicions)
+            act = partial(self._programs.actions, state.policy)
+            check_meaning(place / "log", log, walks.trajectory, self._kind.config(preset), act, suspicions)
         suspected = tuple(Suspicion(sentence=one.sentence, runs=tuple(runs)) for one, runs in suspicions)
-        write_json(place / "measured.json", summarise_log(walks, self._steps, suspected))
+        write_json(place / "measured.json", summarise_log(walks, self._steps, self._kind.control_s, suspected))
         start = recorded.beginning(walks, preset.episode_steps)
         # Simulated episodes must have the robot's commands; otherwise the gate would measure these and not the physics.
         repeating = state.replace(policy=state.policy.replace(asked=start.commands))
@@ -246,7 +243,7 @@ class Rounds:
         tuning = Tuning(
             **report.tuning(info),
             moved={name: Moved(**ends) for name, ends in moved.items()},
-            compared_s=preset.episode_steps * constants.POLICY_DT_S,
+            compared_s=preset.episode_steps * self._kind.control_s,
             explained=self._predict(self._key(index, 3), tuned),
         )
         # Written last, because a round with this file counts as learnt.

@@ -6,14 +6,16 @@ the IMU is noisy and biased, the velocity estimate drifts, and the feet have ano
 """
 
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import mujoco
 import numpy as np
 
 from envs.biteno import TaskConfig, constants, env
 from envs.biteno.player import Player
-from envs.logs import Controller, Run
+from envs.logs import Controller, Log, Run
 from envs.models import suspended as fixed_base
 
 _STEP_S = 0.0005  # of the physics; shorter than the learner's, so that the engine differs too
@@ -95,6 +97,20 @@ class Robot:
         self._qpos = np.array([joint.qposadr[0] for joint in joints])
         self._dof = np.array([joint.dofadr[0] for joint in joints])
         self._feet = [model.geom(foot).id for foot in constants.FEET]
+
+    load = staticmethod(Player)
+    """Loads an exported policy."""
+
+    def log(self, meta: Mapping[str, Any], runs: tuple[Run, ...]) -> Log:
+        """Makes the log of walks with a policy that has this `meta`."""
+        return Log(
+            robot=meta["robot"],
+            base="free",
+            rate_hz=1.0 / ROW_S,
+            joints=tuple(meta["joints"]),
+            policy={name: meta[name] for name in ("rate_hz", "action_scale", "base")},
+            runs=runs,
+        )
 
     def walk(self, name: str, player: Player, seconds: float, rng: np.random.Generator) -> tuple[Run, bool]:
         """Walks with a policy from a standing start until the time is over or the robot has fallen.

@@ -11,7 +11,6 @@ from typing import Annotated
 import tyro
 
 from envs import corrected
-from envs.biteno import constants
 from experiments.common import checkpoint
 from experiments.common.cli import console
 from experiments.common.config import Preset, named_values, preset
@@ -19,27 +18,32 @@ from experiments.robot import policy_files, report
 from experiments.robot.records import Round
 from experiments.robot.rounds import STRATEGIES, Programs, Rounds, Terms
 from experiments.walking.learner import Learner
-from experiments.walking.policies import starting_policy
-from experiments.walking.robots import BITENO
+from experiments.walking.policies import default_policy, starting_policy
+from experiments.walking.robots import Kind, kind
 from jaxtune.mjx import Entry, nominal
 
 
 @dataclass(frozen=True, kw_only=True)
 class Transfer:
-    """Options of a run that tunes BITeno's simulator to a robot that answers through log files, round by round."""
+    """Options of a run that tunes a simulator to a robot that answers through log files, round by round."""
 
     out: Path = Path("runs/sim2real")
     """Folder of the run. The same command with the same folder continues where it was."""
+    robot: str = "biteno"
+    """Robot and task: biteno, go2, playground:NAME (an environment of MuJoCo Playground), or path/to/file.py:function,
+    which returns a jaxtune.mjx.Simulator or an environment."""
     rounds: int = 5
     """Number of rounds; a later call may raise it."""
     method: str = "ours"
     """Tuning method: ours, spm (the paper's update without the gate) or dr (wide domain randomisation without
     tuning)."""
-    policy: str = "walk"
-    """First policy: walk (ships with the package), scratch (trained first), or a folder of experiments.train."""
-    parameters: str = "whole_body"
-    """Parameters that are tuned: legs6 (foot friction and the six link masses), whole_body (friction, trunk mass, link
-    masses with left and right tied), or names joined by commas."""
+    policy: str | None = None
+    """First policy: walk (biteno's, ships with the package), scratch (trained first), or a folder of experiments.train;
+    if not given, the one that ships, or scratch where none does."""
+    parameters: str | None = None
+    """Parameters that are tuned: names joined by commas, or a set: for biteno legs6 (foot friction and the six link
+    masses) or whole_body (friction, trunk mass, link masses with left and right tied; its default), for other robots
+    all, their default."""
     start: tuple[str, ...] = ()
     """Centre of the first distribution, as name=value, such as trunk_mass=0.5 (a multiple of nominal); nominal if not
     given."""
@@ -47,10 +51,11 @@ class Transfer:
     """First radius (half width of the distribution), in log space: 0.2 spans 0.82 to 1.22 times the centre. dr trains
     its policy on all of it."""
     model: Path | None = None
-    """Folder of a corrected model that discovery wrote (`OUT/model`), to tune instead of the nominal model."""
+    """Folder of a corrected model that discovery wrote (`OUT/model`), to tune instead of the nominal model; for biteno
+    alone."""
     noise: float = 0.2
-    """Factor of the uniform noise of simulated sensors. At 1 its half widths are 0.1 m/s, 0.2 rad/s, 0.05 (gravity),
-    0.01 rad and 1.5 rad/s (joints)."""
+    """Factor of the uniform noise of biteno's simulated sensors. At 1 its half widths are 0.1 m/s, 0.2 rad/s, 0.05
+    (gravity), 0.01 rad and 1.5 rad/s (joints)."""
     preset: str = "cpu"
     """Size of the run: smoke (minutes, to see that it works), cpu (two cores) or gpu (one GPU)."""
     epochs: int | None = None
@@ -59,32 +64,35 @@ class Transfer:
     """Conditions of the walks."""
 
 
-def check(transfer: Transfer) -> tuple[Preset, dict[str, Entry], dict[str, float]]:
+def check(transfer: Transfer) -> tuple[Preset, Kind, dict[str, Entry], dict[str, float]]:
     """Checks the options before anything is compiled, and looks up what they name.
 
     Args:
       transfer: options of the run.
 
     Returns:
-      Sizes of the run, the table of parameters that are tuned, and where they start (physical values by name).
+      Sizes of the run, the robot, the table of its parameters that are tuned, and where they start (physical values by
+      name).
 
     Raises:
       ValueError: names the field, the value and what is allowed.
     """
-    sizes, entries = preset(transfer.preset), BITENO.chosen(transfer.parameters)
+    sizes, robot = preset(transfer.preset), kind(transfer.robot)
+    # A robot that walks free shows its whole body, where it has such a set.
+    entries = robot.chosen(transfer.parameters or ("whole_body" if "whole_body" in robot.sets else None))
     if transfer.method not in STRATEGIES:
         raise ValueError(f"method: got '{transfer.method}', expected one of {', '.join(STRATEGIES)}")
     epochs = 2 * sizes.epochs if transfer.epochs is None else transfer.epochs
     least = {"rounds": 1, "epochs": 1, "radius": 1e-6, "noise": 0, "timeout_s": 0, "max_fall_rate": 0}
     # A walk is compared with simulated episodes, so it lasts at least as long as one.
-    least["walk_s"] = sizes.episode_steps * constants.POLICY_DT_S
+    least["walk_s"] = min(sizes.episode_steps, robot.episode_steps) * robot.control_s
     for option, value in {**asdict(transfer), **asdict(transfer.terms), "epochs": epochs}.items():
         most = 1 if option == "max_fall_rate" else sys.float_info.max
         if option in least and not least[option] <= value <= most:
             raise ValueError(f"{option}: got {value}, expected {least[option]:g} to {most:g}")
     start = nominal(entries) | named_values("start", transfer.start, entries)
     task = replace(sizes.task, noise=transfer.noise)
-    return replace(sizes, task=task, epochs=epochs), entries, start
+    return replace(sizes, task=task, epochs=epochs), robot, entries, start
 
 
 def compile_programs(transfer: Transfer) -> Programs:
@@ -96,8 +104,8 @@ def compile_programs(transfer: Transfer) -> Programs:
     Raises:
       ValueError: an option is wrong, or the corrected model cannot be read.
     """
-    sizes, entries, _ = check(transfer)
-    return Programs(Learner(sizes, entries, correction=transfer.model and corrected.read(transfer.model)))
+    sizes, robot, entries, _ = check(transfer)
+    return Programs(Learner(sizes, entries, correction=transfer.model and corrected.read(transfer.model), kind=robot))
 
 
 def play(transfer: Transfer, programs: Programs) -> list[Round]:
@@ -113,9 +121,10 @@ def play(transfer: Transfer, programs: Programs) -> list[Round]:
     Raises:
       ValueError: an option is wrong, the folder holds another run, or a round cannot be played.
     """
-    start = check(transfer)[2]
+    start = check(transfer)[3]
     policy_files.require_onnx()
     learner = programs.learner
+    transfer = replace(transfer, policy=transfer.policy or default_policy(learner.kind))
     # A policy that cannot be loaded must be an error before the folder is made. One from scratch is kept in the folder.
     policy = None if transfer.policy == "scratch" else starting_policy(transfer.policy, learner)
     checkpoint.open_run(transfer.out, _identity(transfer, learner.preset))

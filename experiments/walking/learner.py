@@ -183,7 +183,7 @@ class Learner:
           play: what `play` made of the target.
 
         Returns:
-          Mean return under the weights of Table I, and number of episodes that ended in a fall.
+          Mean return (BITeno's under the weights of Table I), and number of episodes that ended in a fall.
         """
         trajectory = play(key, policy, self.preset.evaluation_episodes, self.longest)
         return float(trajectory.score.sum(axis=-1).mean()), int(trajectory.fell.sum())
@@ -201,7 +201,7 @@ class Learner:
           steps: policy steps of a walk.
 
         Returns:
-          By name: mean `return` under the weights of Table I, `fall_rate`, and mean `power_w` while the robot walks.
+          By name: mean `return`, `fall_rate`, and mean `power_w` while the robot walks.
         """
         key_params, key_episodes = jax.random.split(key)
         params = parameters.from_coords(self.entries, dists.sample(key_params, dist, count))
@@ -264,6 +264,10 @@ class Learner:
         # A pytree, so that a program which takes it as an argument is not compiled again for the next policy.
         return jax.tree_util.Partial(self._act, policy.learner)
 
+    def actions(self, policy: Policy, obs: jax.Array) -> jax.Array:
+        """Computes what a policy does, without noise, for observations [steps, obs] of a log: actions [steps, act]."""
+        return self._ppo.act(policy.learner)(obs, jax.random.PRNGKey(0))[0]
+
     def _act(self, ppo: PPOState, obs: Any, key: jax.Array) -> jax.Array:
         return self._ppo.act(ppo)(self.robot.observed(obs), key)[0]
 
@@ -278,8 +282,8 @@ def summarise_walks(trajectory: Trajectory, power: jax.Array) -> dict[str, jax.A
       power: [episodes, time] W, mechanical.
 
     Returns:
-      Scalars by name: mean `return` of a walk under the weights of Table I, `fall_rate` (share of walks that end in a
-      fall), and mean `power_w` over the steps on which the robot was alive.
+      Scalars by name: mean `return` of a walk, `fall_rate` (share of walks that end in a fall), and mean `power_w` over
+      the steps on which the robot was alive; nan where score or power is not known.
     """
     alive = trajectory.alive
     return {

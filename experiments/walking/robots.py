@@ -1,25 +1,30 @@
 """The robots that commands work with, by the name that `--robot` takes.
 
-`biteno` ships with the package. `playground:NAME` is an environment of MuJoCo Playground. `path/to/file.py:function` is
-a robot of one's own: the function returns a `jaxtune.mjx.Simulator`, or an environment, for which a parameter table is
-then proposed (`jaxtune.mjx.parameters_of`).
+`biteno` and `go2` ship with the package. `playground:NAME` is an environment of MuJoCo Playground.
+`path/to/file.py:function` is a robot of one's own: the function returns a `jaxtune.mjx.Simulator`, or an environment,
+for which a parameter table is then proposed (`jaxtune.mjx.parameters_of`).
 """
 
 import importlib.util
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from envs import corrected
+from envs import corrected, go2
 from envs.biteno import constants, gait, onboard
 from envs.corrected import Correction
+from envs.diagnosis import Finding, diagnose_log, shared_findings
+from envs.logs import Log, read, read_observed
+from envs.targets import observed, recorded
 from envs.targets.mjx import MjxTarget
 from envs.targets.protocol import Target
+from envs.targets.recorded import Recorded
 from experiments.common.config import WALK, Preset
 from experiments.walking.targets import TARGETS
 from jaxtune.mjx import Entry, Robot, Simulator, model_of, parameters_of, select
@@ -47,6 +52,12 @@ class Kind:
     """Mechanical power in W, from what a robot's `move` returns beside its state."""
     meta: Callable[[Preset, Robot], dict]
     """What the robot's computer must know around an exported policy, as JSON."""
+    read: Callable[[Path], Log]
+    """Reads a log of the robot, and checks it."""
+    episodes: Callable[[Log, int], Recorded]
+    """Makes episodes of as many control steps of a log."""
+    findings: Callable[[Log], list[tuple[Finding, list[str]]]]
+    """What the log doctor suspects, with the names of the runs that share it."""
     trained: Callable[[Preset], Preset] = lambda preset: preset
     """Changes the preset of the robots that a policy trains on."""
     config: Callable[[Preset], dict] = lambda preset: {}
@@ -85,7 +96,7 @@ def kind(name: str) -> Kind:
       ValueError: there is no such robot, file or function, or the function returns something else.
     """
     if name in _SHIPPED:
-        return _SHIPPED[name]
+        return _SHIPPED[name]()
     place, colon, what = name.rpartition(":")
     if colon and place == "playground":
         return _foreign(name, _playground(what))
@@ -120,6 +131,11 @@ def _foreign(name: str, made: Any) -> Kind:
             "observation": [{"name": part, "size": size} for part, size in robot.layout.items()],
             "action": robot.action_size,
         },
+        read=read_observed,
+        episodes=partial(
+            observed.episodes, control_s=float(made.env.dt), obs=made.observation_size, act=made.action_size
+        ),
+        findings=lambda log: [],
         episode_steps=made.steps,
     )
 
@@ -178,9 +194,12 @@ BITENO = Kind(
             "feet in step with the clock (of 2)": "clock_contact",
         },
     },
+    read=read,
+    episodes=recorded.episodes,
+    findings=lambda log: shared_findings(diagnose_log(log)),
     player=Path(onboard.__file__).with_name("player.py"),
     policy=WALK,
 )
 """The paper's biped."""
 
-_SHIPPED = {"biteno": BITENO}
+_SHIPPED = {"biteno": lambda: BITENO, "go2": lambda: _foreign("go2", go2.simulator())}

@@ -41,7 +41,7 @@ def with_model(env: Any, model: mjx.Model) -> Any:
     made (joint limits, a standing height) stays nominal. Where that matters, or for an environment of another make,
     hand `Simulator` a function of your own.
     """
-    env = copy.copy(env.unwrapped)
+    env = copy.copy(getattr(env, "unwrapped", env))
     if hasattr(env, "_mjx_model"):
         env._mjx_model = model
     else:

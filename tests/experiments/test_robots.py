@@ -5,11 +5,14 @@ from dataclasses import replace
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments import export, sim2sim, sweep, train
+from envs import logs
+from experiments import export, robot_stub, sim2real, sim2sim, sweep, train
 from experiments.common.config import PRESETS
+from experiments.robot.rounds import Terms
 from experiments.walking.learner import Learner
 from experiments.walking.policies import default_policy, starting_policy
 from experiments.walking.robots import kind
@@ -22,7 +25,7 @@ ROBOT = f"{FILE}:simulator"
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("go3", "robot: got 'go3', expected biteno, playground:NAME or path/to/file.py:function"),
+        ("go3", "robot: got 'go3', expected biteno, go2, playground:NAME or path/to/file.py:function"),
         ("no/file.py:make", "robot: no/file.py does not exist"),
         (f"{FILE}:sledge", "has no function 'sledge'"),
         (f"{FILE}:nothing", "robot '.*:nothing': env: got NoneType, which has no MJX model"),
@@ -121,6 +124,36 @@ def test_what_is_exported_acts_as_what_was_trained(trained, tmp_path):
         np.testing.assert_allclose(network(obs), act(obs, jax.random.PRNGKey(0)), atol=1e-5)
     with pytest.raises(ValueError, match="obs: got a number that is not finite"):
         network(np.array([0.0, np.nan, 0.0]))
+
+
+def test_a_round_with_a_robot_that_answers_through_observations(trained, tmp_path):
+    terms = Terms(walk_s=1.2, force=True, timeout_s=0.0)
+    options = {"robot": ROBOT, "parameters": "mass,damping", "policy": str(trained), "preset": "smoke", "rounds": 1}
+    args = sim2real.Args(out=tmp_path / "run", terms=terms, **options)
+    with pytest.raises(ValueError, match="no log after 0 s"):
+        sim2real.main(args)
+    place = args.out / "round_000"
+    robot, _ = robot_stub.stand_in(robot_stub.Args(robot=ROBOT, truth=("mass=1.6",), folder=tmp_path))
+    falls = robot_stub.answer(place, robot, 0)
+    log = logs.read_observed(place / "log")
+    assert [len(run.time) for run in log.runs] == [62] * len(log.runs)  # 1.25 s of steps of 0.02 s
+    sim2real.main(args)
+    (line,) = json.loads((args.out / "summary.json").read_text())["rounds"]
+    measured = line["measured"]
+    assert measured["episodes"] == len(falls)
+    assert measured["fall_rate"] == np.mean(falls)
+    rewards = [run.other["reward"][:60].sum() for run in log.runs]
+    np.testing.assert_allclose(measured["return"], np.mean(rewards), rtol=1e-4)
+    assert line["tuning"]["compared_s"] == pytest.approx(1.2)
+    assert line["tuning"]["moved"].keys() == {"mass", "damping"}
+    # Measured and simulated episodes are of the same kind: on the robot that is simulated they are the same.
+    kind_of = kind(ROBOT)
+    recorded = kind_of.episodes(log, 60).trajectory
+    values = {"mass": jnp.full(1, 1.6), "damping": jnp.ones(1), "strength": jnp.ones(1), "delay": jnp.zeros(1)}
+    again = kind_of.make(None, kind_of.entries, None).rollout(
+        jax.random.key(0), lambda actions, obs, key: actions, recorded.action[0, 0], values
+    )
+    np.testing.assert_allclose(again.obs[0, 1, 2], recorded.obs[0, 1, 2], atol=1e-6)
 
 
 def test_what_another_robot_does_not_have_is_named(trained, tmp_path):

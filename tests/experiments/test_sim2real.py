@@ -24,6 +24,7 @@ from experiments.robot.fall_risk import fall_risk, surprise
 from experiments.robot.records import Prediction, Round
 from experiments.robot.rounds import Rounds, Terms
 from experiments.robot.surrogate import Body, Robot
+from experiments.walking import robots
 from experiments.walking.policies import starting_policy
 
 TERMS = Terms(walk_s=0.8, force=True, timeout_s=0.0, seed=0)
@@ -57,7 +58,7 @@ def test_bad_input_is_named(field, value, named, monkeypatch):
 
 
 def test_masses_start_where_the_options_say():
-    _, entries, start = transfer.check(replace(ARGS, start=("trunk_mass=0.5", "shank_mass=2")))
+    _, _, entries, start = transfer.check(replace(ARGS, start=("trunk_mass=0.5", "shank_mass=2")))
     assert start == {name: {"trunk_mass": 0.5, "shank_mass": 2.0}.get(name, 1.0) for name in entries}
 
 
@@ -247,7 +248,7 @@ def states(out, programs, index):
     """The state that a round begins with."""
     learner = programs.learner
     like = programs.machines["ours"].init(
-        learner.init(jax.random.PRNGKey(0)), learner.dist(transfer.check(ARGS)[2], 0.2), rounds.tuner.knobs()
+        learner.init(jax.random.PRNGKey(0)), learner.dist(transfer.check(ARGS)[3], 0.2), rounds.tuner.knobs()
     )
     return checkpoint.load(out / f"round_{index:03d}" / "start", like, {})
 
@@ -295,7 +296,7 @@ def test_a_run_stopped_after_every_file_is_the_same_run(programs, answered, tmp_
 @pytest.fixture
 def first(programs, tmp_path):
     """A run that has not begun, by its terms."""
-    policy, start = starting_policy("walk", programs.learner), transfer.check(ARGS)[2]
+    policy, start = starting_policy("walk", programs.learner), transfer.check(ARGS)[3]
     return lambda terms: Rounds(tmp_path, terms, programs, "ours", policy, start, 0.2)
 
 
@@ -378,7 +379,7 @@ def test_a_log_that_means_something_else_is_not_learnt_from(first, answered, tmp
     turned = Finding("flipped sign", "q", ("left_knee",), -1.0, "q: left_knee turns the other way")
     late = Finding("late", "dq", (), 10.0, "dq: what was measured is 10 ms late")
     found = {"run_000": [turned, late], "run_001": [late]}
-    monkeypatch.setattr(rounds, "diagnose_log", lambda log: found)
+    monkeypatch.setattr(robots, "diagnose_log", lambda log: found)
     # In half of the runs is not in most.
     assert first(TERMS).play(0, None).measured.suspected[0].runs == ("run_000", "run_001")
     (tmp_path / "round_000" / "tuning.json").unlink()
@@ -426,7 +427,7 @@ def test_simulated_episodes_repeat_what_the_log_says(first, answered, programs, 
 def test_the_stand_in_is_as_heavy_as_is_said(tmp_path):
     args = sim2real_bench.Args(out=tmp_path, preset="smoke", mass=0.5, walk_s=0.8)
     sim2real_bench.check(args)
-    start = {name: transfer.check(sim2real_bench.transfer_of(args, name, 1))[2] for name in sim2real_bench.METHODS}
+    start = {name: transfer.check(sim2real_bench.transfer_of(args, name, 1))[3] for name in sim2real_bench.METHODS}
     half = {"trunk_mass": 0.5, "abductor_mass": 0.5, "thigh_mass": 0.5, "shank_mass": 0.5, "foot_friction": 1.0}
     assert start["ours"] == start["spm"] == start["dr"] == half
     assert start["oracle"] == {**dict.fromkeys(half, 1.0), "foot_friction": 0.75}

@@ -99,10 +99,9 @@ def rounds(history: Sequence[dict]) -> plt.Figure:
         axis.axis("off")
     for axis, (name, label) in zip(axes[0], labels.items(), strict=False):
         predicted = [line["predicted"][name] for line in history] + [history[-1]["next"][name]]
+        measured = np.array([line["measured"][name] for line in history], float)  # nan where it is not known
         axis.plot(when, predicted, "o--", color="tab:gray", ms=4, label="predicted")
-        axis.plot(
-            when[:-1], [line["measured"][name] for line in history], "o-", color="tab:blue", ms=4, label="measured"
-        )
+        axis.plot(when[:-1], measured, "o-", color="tab:blue", ms=4, label="measured")
         axis.set(title=label, xticks=when)
     axes[0, 0].legend(fontsize=8)
     axes[0, 1].set_ylim(-0.05, 1.05)

@@ -18,7 +18,7 @@ KEY = jax.random.PRNGKey(3)
 
 def restless(obs, key):
     """A policy that reads the observation and is not still."""
-    return 0.3 * jax.random.normal(key, (6,)) + 0.1 * obs[12:18], {}
+    return 0.3 * jax.random.normal(key, (6,)) + 0.1 * obs[12:18]
 
 
 @pytest.fixture(scope="module")
