@@ -176,3 +176,24 @@ def test_what_another_robot_does_not_have_is_named(trained, tmp_path):
     other = kind(f"{FILE}:environment")
     with pytest.raises(ValueError, match="robot"):
         starting_policy(str(trained), Learner(replace(PRESETS["smoke"]), other.chosen(None), kind=other))
+
+
+@pytest.mark.slow
+def test_a_go2_goes_through_every_step(tmp_path):
+    common = {"robot": "go2", "preset": "smoke", "policy": str(tmp_path / "policy")}
+    train.main(train.Args(robot="go2", preset="smoke", out=tmp_path / "policy"))
+    tuned = {"parameters": "base_mass,calf_mass,strength", "truth": ("base_mass=1.3",), "methods": ("ours",)}
+    sim2sim.main(sim2sim.Args(**common, **tuned, out=tmp_path / "tuned"))
+    assert json.loads((tmp_path / "tuned" / "summary.json").read_text())["off"] == ["base_mass"]
+    export.main(export.Args(**common, out=tmp_path / "exported"))
+    assert Network(tmp_path / "exported" / "policy.npz")(np.zeros(45)).shape == (12,)
+    terms = Terms(walk_s=1.6, force=True, timeout_s=0.0)
+    args = sim2real.Args(**common, out=tmp_path / "run", parameters="base_mass,strength", rounds=1, terms=terms)
+    with pytest.raises(ValueError, match="no log after 0 s"):
+        sim2real.main(args)
+    robot, _ = robot_stub.stand_in(robot_stub.Args(robot="go2", truth=("base_mass=1.3",), folder=tmp_path))
+    falls = robot_stub.answer(args.out / "round_000", robot, 0)
+    sim2real.main(args)
+    (line,) = json.loads((args.out / "summary.json").read_text())["rounds"]
+    assert line["measured"]["episodes"] == len(falls)
+    assert line["tuning"]["verdicts"]

@@ -79,3 +79,11 @@ def test_logs_alone_are_tuned_to(monkeypatch, tmp_path):
     found = scope["sim"].physical(scope["state"].dist)
     # Strength and mass trade against each other in all but what friction and start show.
     assert abs(found["mass"]["value"] / found["strength"]["value"] - 1.4) < 0.15
+
+
+def test_the_readmes_example_is_the_guides():
+    readme = (GUIDES.parents[1] / "README.md").read_text()
+    first, *_ = re.findall(r"```python\n(.*?)```", readme, re.DOTALL)
+    guide = (GUIDES / "playground.md").read_text().splitlines()
+    assert "Simulator(" in first
+    assert [line for line in first.splitlines() if line not in guide] == []
