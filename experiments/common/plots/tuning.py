@@ -51,6 +51,32 @@ def sim2sim(out: Path, results: dict[str, list[dict]], off: Sequence[str], epoch
         _gate(out / "gate.png", results)
 
 
+def recovery(path: Path, results: Mapping[str, Sequence[dict]]) -> None:
+    """Draws errors of parameters after tuning over those before, a panel for every robot.
+
+    Args:
+      path: of the PNG.
+      results: what `experiments.robots_bench.tuned` returned, by robot and seed.
+    """
+    figure, axes = plt.subplots(
+        1, len(results), figsize=(0.6 + 3.4 * len(results), 3.6), layout="constrained", squeeze=False, sharey=True
+    )
+    for axis, (robot, seeds) in zip(axes[0], results.items(), strict=True):
+        for column, name in enumerate(seeds[0]["truth"]):
+            for inside, marker in ((True, "o"), (False, "x")):
+                chosen = [seed for seed in seeds if seed["in_first_box"][name] == inside]
+                before = [seed["error_before"][name] for seed in chosen]
+                after = [seed["tunings"][-1]["error"][name] for seed in chosen]
+                axis.plot(before, after, marker, ms=5, color=f"C{column}", label=name if inside else None)
+        axis.axline((0.0, 0.0), slope=1.0, color="grey", lw=0.8, label="no change")
+        axis.axline((0.0, 0.0), slope=0.5, color="grey", lw=0.8, ls="--", label="halved")
+        axis.set(xlabel="error before, log", title=f"{robot} (x: outside the first box)")
+        axis.grid(alpha=0.3)
+        axis.legend(fontsize=7)
+    axes[0, 0].set_ylabel("error after, log")
+    save(figure, path)
+
+
 def sweep(path: Path, grid: np.ndarray, rows: Sequence[str], columns: Sequence[str], titles: Sequence[str]) -> None:
     """Draws a sweep as heat maps that share one colour scale, so that all settings compare at a glance.
 

@@ -1,0 +1,189 @@
+"""Counts how well robots of other projects are tuned: `python -m experiments.robots_bench --out DIR`.
+
+Each robot is tuned to itself with hidden parameters, a few tunings long, with a policy that stays as it is. Hidden
+parameters are drawn per seed without regard to the first box, so that some lie outside it.
+"""
+
+import json
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import jax
+import numpy as np
+from rich.table import Table
+
+from experiments.common import checkpoint, plots
+from experiments.common.checkpoint import write_json
+from experiments.common.cli import console, run
+from experiments.common.config import preset
+from experiments.walking import foreign
+from experiments.walking.cases import check_positive
+from jaxtune import dist as dists
+from jaxtune.mjx import parameters
+from jaxtune.tuner import TunerState, knobs
+from jaxtune.types import Verdict
+
+FACTORS = (0.6, 1.5)
+"""Hidden multipliers are drawn between these, evenly in log space."""
+GROUPS = {
+    "in_box": "in the first box",
+    "in_box_identifiable": "in the first box, and identifiable in some tuning",
+    "outside": "outside the first box",
+}
+"""Groups of parameters that are summarised, with what a table calls them."""
+_DELAY_S = 0.02  # largest hidden delay, in s
+_UPDATES = 400  # of PPO, for a policy of the sizes `cpu` and `gpu`
+
+
+@dataclass(frozen=True, kw_only=True)
+class Args:
+    """Tunes robots of MuJoCo Playground, Brax and Gymnasium to themselves with other parameters."""
+
+    out: Path = Path("runs/robots_bench")
+    """Folder of the results. The same command with the same folder continues where it was."""
+    robots: tuple[str, ...] = tuple(foreign.PACKAGES)
+    """Robots: cheetah (MuJoCo Playground), hopper (Brax), half_cheetah (Gymnasium)."""
+    seeds: int = 5
+    """Number of seeds of each robot, from 0; hidden parameters, episodes and models depend on them."""
+    tunings: int = 3
+    """Tunings of each run; each measures new episodes."""
+    radius: float = 0.3
+    """First radius in log space: 0.3 spans 0.74 to 1.35 times nominal."""
+    preset: str = "cpu"
+    """Size of the run: smoke (minutes, to see that it works), cpu (two cores) or gpu (one GPU)."""
+
+
+def draw(world: foreign.World, seed: int) -> dict[str, float]:
+    """Draws hidden physical values by name."""
+    rng = np.random.default_rng(seed)
+    return {
+        name: float(np.exp(rng.uniform(*np.log(FACTORS))) if entry.log else rng.uniform(0.0, _DELAY_S))
+        for name, entry in world.entries.items()
+    }
+
+
+def errors(world: foreign.World, found: dict[str, float], truth: dict[str, float]) -> dict[str, float]:
+    """Computes errors in coordinates by name: of a multiplier, of its logarithm."""
+    found, truth = (parameters.to_coords(world.entries, values) for values in (found, truth))
+    return {name: abs(float(found[name]) - float(truth[name])) for name in truth}
+
+
+def tuned(world: foreign.World, args: Args, policy, seed: int) -> dict:
+    """Runs the tunings of one seed.
+
+    Returns:
+      Hidden values, whether they lie in the first box, and for every tuning its verdict, gate calls, seconds, and by
+      name the estimate, error, end points of the box and whether the parameter was identifiable.
+    """
+    truth = draw(world, seed)
+    first = parameters.distribution(world.entries, args.radius, {})
+    state = TunerState(policy=policy, dist=first, knobs=knobs())
+    before = errors(world, parameters.nominal(world.entries), truth)
+    radius = {name: float(value) for name, value in first.radius.items()}
+    lines = []
+    for index in range(args.tunings):
+        key_measure, key_tune = jax.random.split(jax.random.fold_in(jax.random.PRNGKey(seed), index))
+        measured = world.measure(key_measure, policy, truth)
+        begin = time.monotonic()
+        state, info = jax.block_until_ready(world.tune(key_tune, state, measured))
+        seconds = time.monotonic() - begin
+        low, high = (parameters.from_coords(world.entries, ends) for ends in dists.box(state.dist))
+        estimate = parameters.from_coords(world.entries, state.dist.centre)
+        verdict = Verdict(int(info.verdicts[int(info.calls) - 1]))
+        told = info.update.identifiable if verdict == Verdict.ACCEPT else np.zeros(len(truth), bool)
+        lines.append(
+            {
+                "verdict": verdict.name.lower(),
+                "calls": int(info.calls),
+                "seconds": seconds,
+                "estimate": estimate,
+                "error": errors(world, estimate, truth),
+                "low": low,
+                "high": high,
+                "identifiable": dict(zip(dists.names(state.dist), map(bool, told), strict=True)),
+            }
+        )
+    in_box = {name: before[name] <= radius[name] for name in truth}
+    return {"seed": seed, "truth": truth, "in_first_box": in_box, "error_before": before, "tunings": lines}
+
+
+def summary(results: list[dict]) -> dict:
+    """Summarises the seeds of one robot.
+
+    Returns:
+      For parameters inside the first box, outside it, and inside and called identifiable by the last update: their
+      number, and the median error before and after. Then counts of the verdicts, and seconds of a tuning.
+    """
+
+    def group(keep) -> dict:
+        pairs = [
+            (one["error_before"][name], one["tunings"][-1]["error"][name])
+            for one in results
+            for name in one["truth"]
+            if keep(one, name)
+        ]
+        before, after = np.median(pairs, axis=0) if pairs else (np.nan, np.nan)
+        return {"parameters": len(pairs), "before": float(before), "after": float(after)}
+
+    def excited(one, name):
+        return any(line["identifiable"][name] for line in one["tunings"])
+
+    lines = [line for one in results for line in one["tunings"]]
+    verdicts = [line["verdict"] for line in lines]
+    held = [
+        line["low"][name] <= one["truth"][name] <= line["high"][name]
+        for one in results
+        for line in one["tunings"][-1:]
+        for name in one["truth"]
+    ]
+    return {
+        "in_box": group(lambda one, name: one["in_first_box"][name]),
+        "in_box_identifiable": group(lambda one, name: one["in_first_box"][name] and excited(one, name)),
+        "outside": group(lambda one, name: not one["in_first_box"][name]),
+        "truth_in_last_box": float(np.mean(held)),
+        "verdicts": {name: verdicts.count(name) for name in sorted(set(verdicts))},
+        "gate_calls": [line["calls"] for line in lines],
+        "first_tuning_s": results[0]["tunings"][0]["seconds"],
+        "later_tuning_s": float(np.median([line["seconds"] / line["calls"] for line in lines[1:]])),
+    }
+
+
+def main(args: Args) -> None:
+    """Runs what is missing in the folder, prints a table, and writes summary.json and errors.png.
+
+    Raises:
+      ValueError: an option is wrong, or a robot's package is not installed.
+    """
+    for name in args.robots:
+        if name not in foreign.PACKAGES:
+            raise ValueError(f"robots: got '{name}', expected some of {', '.join(foreign.PACKAGES)}")
+    check_positive(seeds=args.seeds, tunings=args.tunings, radius=args.radius)
+    sizes = preset(args.preset)
+    sizes = replace(sizes, scratch_updates=min(sizes.scratch_updates, _UPDATES))
+    checkpoint.set_up_compiler(sizes.xla_flags)
+    checkpoint.open_run(args.out, {"radius": args.radius, "tunings": args.tunings, "preset": args.preset})
+    results = {}
+    for name in args.robots:
+        place, world, policy = args.out / name, None, None
+        for seed in range(args.seeds):
+            path = place / f"seed_{seed}.json"
+            if not path.exists():
+                world = world or foreign.world(name, sizes)
+                policy = world.policy(place) if policy is None else policy
+                write_json(path, tuned(world, args, policy, seed))
+                console.print(f"{name}, seed {seed}: {path}", markup=False)
+            results.setdefault(name, []).append(json.loads(path.read_text()))
+    summaries = {name: summary(each) for name, each in results.items()}
+    write_json(args.out / "summary.json", {"args": args, "robots": summaries, "versions": checkpoint.versions()})
+    plots.recovery(args.out / "errors.png", results)
+    table = Table("robot", "parameters", "number", "median error before", "after")
+    for name, found in summaries.items():
+        for group in GROUPS:
+            row = found[group]
+            table.add_row(name, GROUPS[group], str(row["parameters"]), f"{row['before']:.3f}", f"{row['after']:.3f}")
+    console.print(table)
+
+
+if __name__ == "__main__":
+    run(main, Args)
