@@ -26,8 +26,6 @@ from experiments.robot.simulated import SimulatedRobot
 from experiments.robot.surrogate import Body, Robot
 from experiments.walking.robots import BITENO, kind
 
-_BODIES = (BITENO.name,)  # robots that have a body of their own, `Body`
-
 
 @dataclass(frozen=True, kw_only=True)
 class Args:
@@ -40,7 +38,8 @@ class Args:
     """Folder that is searched, at any depth, for requests to walk (`round_*/request.json` beside `round_*/policy`) and
     for targets to play while suspended (`hung/targets`)."""
     body: Body = field(default_factory=Body)
-    """Properties of biteno's body; masses, friction and torque are multiples of the nominal model's."""
+    """Properties of biteno's body; masses, friction and torque are multiples of the nominal model's. Other robots take
+    --truth."""
     truth: tuple[str, ...] = ()
     """True values of another robot's parameters, name=value; those that are left out are nominal."""
     idle_s: float = 3600.0
@@ -122,11 +121,27 @@ def stand_in(args: Args) -> tuple[Robot | SimulatedRobot, Robot | None]:
     """Makes the robot that walks, and the same robot suspended if it can be.
 
     Raises:
-      ValueError: there is no such robot, or a true value is not in its table.
+      ValueError: there is no such robot, a true value is not in its table, or the robot does not take the option.
     """
-    if args.robot in _BODIES:
-        return Robot(args.body), Robot(args.body, suspended=True)
+    return _STAND_INS.get(args.robot, _simulated)(args)
+
+
+def _embodied(args: Args) -> tuple[Robot, Robot]:
+    if args.truth:
+        raise ValueError(
+            f"truth: got {' '.join(args.truth)}, but {args.robot} has a body of its own; expected --body.*"
+        )
+    return Robot(args.body), Robot(args.body, suspended=True)
+
+
+def _simulated(args: Args) -> tuple[SimulatedRobot, None]:
+    if args.body != Body():
+        raise ValueError(f"body: got {args.body}, but {args.robot} is its own simulation; expected --truth name=value")
     return SimulatedRobot(kind(args.robot), args.truth), None
+
+
+_STAND_INS = {BITENO.name: _embodied}
+"""Robots that have a body of their own, `Body`."""
 
 
 def main(args: Args) -> None:

@@ -6,6 +6,7 @@ parameters are drawn per seed without regard to the first box, so that some lie 
 
 import json
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -149,6 +150,24 @@ def summary(results: list[dict]) -> dict:
     }
 
 
+def show(summaries: Mapping[str, dict]) -> None:
+    """Prints what `summary` found of every robot as two tables: errors, and verdicts with seconds."""
+    table = Table("robot", "parameters", "number", "median error before", "after")
+    for name, found in summaries.items():
+        for group in GROUPS:
+            row = found[group]
+            table.add_row(name, GROUPS[group], str(row["parameters"]), f"{row['before']:.3f}", f"{row['after']:.3f}")
+    console.print(table)
+    table = Table(
+        "robot", "verdicts", "gate calls a tuning", "first tuning, s", "later gate call, s", "truth in last box"
+    )
+    for name, found in summaries.items():
+        verdicts = ", ".join(f"{verdict} {count}" for verdict, count in found["verdicts"].items())
+        numbers = np.mean(found["gate_calls"]), found["first_tuning_s"], found["later_tuning_s"]
+        table.add_row(name, verdicts, *[f"{number:.1f}" for number in numbers], f"{found['truth_in_last_box']:.2f}")
+    console.print(table)
+
+
 def main(args: Args) -> None:
     """Runs what is missing in the folder, prints a table, and writes summary.json and errors.png.
 
@@ -156,8 +175,7 @@ def main(args: Args) -> None:
       ValueError: an option is wrong, or a robot's package is not installed.
     """
     for name in args.robots:
-        if name not in foreign.PACKAGES:
-            raise ValueError(f"robots: got '{name}', expected some of {', '.join(foreign.PACKAGES)}")
+        foreign.check(name)
     check_positive(seeds=args.seeds, tunings=args.tunings, radius=args.radius)
     sizes = preset(args.preset)
     sizes = replace(sizes, scratch_updates=min(sizes.scratch_updates, _UPDATES))
@@ -177,12 +195,7 @@ def main(args: Args) -> None:
     summaries = {name: summary(each) for name, each in results.items()}
     write_json(args.out / "summary.json", {"args": args, "robots": summaries, "versions": checkpoint.versions()})
     plots.recovery(args.out / "errors.png", results)
-    table = Table("robot", "parameters", "number", "median error before", "after")
-    for name, found in summaries.items():
-        for group in GROUPS:
-            row = found[group]
-            table.add_row(name, GROUPS[group], str(row["parameters"]), f"{row['before']:.3f}", f"{row['after']:.3f}")
-    console.print(table)
+    show(summaries)
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ from experiments.common.checkpoint import as_json, write_json
 from experiments.common.cli import bars, console, run
 from experiments.common.config import Preset, named_values, preset
 from experiments.walking import comparison
-from experiments.walking.cases import Case, check_positive, checked_case
+from experiments.walking.cases import Case, check_positive, checked_case, errors
 from experiments.walking.comparison import METHODS, UPDATES, contenders
 from experiments.walking.learner import Learner, Policy
 from experiments.walking.policies import default_policy, starting_policy
@@ -186,18 +186,12 @@ class Runner:
             )
 
     def _describe(self, dist: ParamDist) -> dict:
-        centre = parameters.from_coords(self._learner.entries, dist.centre)
-        truth = self._target.params
+        entries = self._learner.entries
+        centre = parameters.from_coords(entries, dist.centre)
         return {
             "estimate": {name: float(value) for name, value in centre.items()},
             "radii": {name: float(value) for name, value in dist.radius.items()},
-            # Relative for multipliers, absolute for offsets, which may be zero.
-            "param_error": {
-                name: abs(float(value) / truth[name] - 1)
-                if self._learner.entries[name].log
-                else abs(float(value) - truth[name])
-                for name, value in centre.items()
-            },
+            "param_error": {name: float(error) for name, error in errors(entries, centre, self._target.params).items()},
         }
 
 

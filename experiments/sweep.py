@@ -21,7 +21,7 @@ from envs.targets.mjx import MjxTarget
 from experiments.common import checkpoint, plots
 from experiments.common.cli import console, run
 from experiments.common.config import Preset, named_values, preset
-from experiments.walking.cases import Case, check_positive, checked_case
+from experiments.walking.cases import Case, check_positive, checked_case, errors
 from experiments.walking.learner import Learner, Policy
 from experiments.walking.policies import default_policy, starting_policy
 from experiments.walking.robots import Kind, kind
@@ -131,7 +131,7 @@ def _keep(key, policy, dist):
 
 
 def mean_error(learner: Learner, truth: Mapping[str, float], centre: Coords, off: Sequence[str]) -> np.ndarray:
-    """Averages |estimate / truth - 1| over the parameters whose true value is not nominal.
+    """Averages the error (`experiments.walking.cases.errors`) over the parameters whose true value is not nominal.
 
     Args:
       learner: holds the table that turns coordinates into physical values.
@@ -140,10 +140,10 @@ def mean_error(learner: Learner, truth: Mapping[str, float], centre: Coords, off
       off: names that are averaged over.
 
     Returns:
-      [lanes] mean relative error.
+      [lanes] mean error.
     """
-    estimate = parameters.from_coords(learner.entries, centre)
-    return np.mean([np.abs(np.asarray(estimate[name]) / truth[name] - 1) for name in off], axis=0)
+    found = errors(learner.entries, parameters.from_coords(learner.entries, centre), truth)
+    return np.mean([found[name] for name in off], axis=0)
 
 
 def main(args: Args) -> None:

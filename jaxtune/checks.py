@@ -26,6 +26,16 @@ def check_simulated(trajectory: Trajectory, episodes: int, config: TunerConfig) 
         )
 
 
+def check_set(measured: Trajectory, config: TunerConfig) -> int:
+    """Checks a measured set by itself, before anything is simulated; returns the number of its steps.
+
+    Raises:
+      ValueError: the set has another number of episodes than `config.set_episodes`, or a field another shape than
+        `Trajectory` says.
+    """
+    return _check_shapes("measured", measured, config.set_episodes, "TunerConfig.set_episodes")
+
+
 def check_measured(measured: Trajectory, simulated: Trajectory, config: TunerConfig) -> None:
     """Checks a measured set against the simulated episodes that it will be compared with.
 
@@ -35,10 +45,9 @@ def check_measured(measured: Trajectory, simulated: Trajectory, config: TunerCon
       config: sizes of the tuning.
 
     Raises:
-      ValueError: the set has another number of episodes than `config.set_episodes`, or episodes, observations or
-        actions of another size than the simulated ones.
+      ValueError: as `check_set`, or episodes, observations or actions are of another size than the simulated ones.
     """
-    steps = _check_shapes("measured", measured, config.set_episodes, "TunerConfig.set_episodes")
+    steps = check_set(measured, config)
     expected = np.shape(simulated.alive)[1]
     if steps != expected:
         raise ValueError(f"measured: got episodes of {steps} steps, expected {expected}, as simulated")
@@ -50,6 +59,16 @@ def check_measured(measured: Trajectory, simulated: Trajectory, config: TunerCon
 
 def _check_shapes(source: str, trajectory: Trajectory, episodes: int, why: str) -> int:
     """Checks every field of a trajectory, and returns the number of its steps."""
+    if not isinstance(trajectory, Trajectory):
+        raise ValueError(
+            f"{source}: got {type(trajectory).__name__}, expected a jaxtune.types.Trajectory (Trajectory.from_episodes "
+            "makes one of lists)"
+        )
+    for field in ("alive", "fell", "not_finite"):
+        value = getattr(trajectory, field)
+        kind = getattr(value, "dtype", type(value).__name__)
+        if kind != np.dtype(bool):
+            raise ValueError(f"{source}, {field}: got {kind}, expected an array of bool")
     for field in ("obs", "action"):
         value = getattr(trajectory, field)
         if not hasattr(value, "shape"):

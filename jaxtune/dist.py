@@ -6,6 +6,7 @@ for multipliers) and *radii*, which are distances from the centre divided by the
 so that sizes mean the same for every parameter and after every widening.
 """
 
+import math
 from collections.abc import Sequence
 
 import jax
@@ -23,15 +24,16 @@ def make(centre: Coords, radius: float, lower: Coords, upper: Coords) -> ParamDi
 
     Args:
       centre: scalars by name, in coordinates: 0.0 for a multiplier of one.
-      radius: half width of the distribution, in coordinates. A radius of 0.2 spans multipliers of 0.82 to 1.22.
+      radius: half width of the distribution, in coordinates. A radius of 0.2 spans multipliers of 0.82 to 1.22. Where
+        it exceeds the width of a parameter's bounds, that width is its radius.
       lower: smallest coordinate by name.
       upper: largest coordinate by name.
 
     Raises:
-      ValueError: names differ, the radius is not positive, or a centre lies outside its bounds.
+      ValueError: names differ, the radius is not a positive number, or a centre lies outside its bounds.
     """
-    if not radius > 0:
-        raise ValueError(f"radius: got {radius}, expected a positive number")
+    if isinstance(radius, str) or not 0 < radius < math.inf:
+        raise ValueError(f"radius: got {radius!r}, expected a positive number")
     for field, named in {"lower": lower, "upper": upper}.items():
         if set(named) != set(centre):
             raise ValueError(f"{field}: got {sorted(named)}, expected {sorted(centre)}")
@@ -43,9 +45,9 @@ def make(centre: Coords, radius: float, lower: Coords, upper: Coords) -> ParamDi
     def strong(named) -> dict:
         return {name: jnp.asarray(value, jnp.float32) for name, value in named.items()}
 
-    return ParamDist(
-        centre=strong(centre), radius=strong(dict.fromkeys(centre, radius)), lower=strong(lower), upper=strong(upper)
-    )
+    # As `widen` does: a radius as wide as the bounds fills them from any centre.
+    radii = {name: min(radius, upper[name] - lower[name]) for name in centre}
+    return ParamDist(centre=strong(centre), radius=strong(radii), lower=strong(lower), upper=strong(upper))
 
 
 def names(dist: ParamDist) -> tuple[str, ...]:

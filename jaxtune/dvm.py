@@ -203,7 +203,9 @@ def novelty(
     near = -closeness <= dvm.reach
     mean = jnp.sum(jnp.where(near, dvm.elbo[index], 0.0), axis=-1) / jnp.maximum(near.sum(axis=-1), 1)
     # Observations that never change in simulation say nothing of a robot, so there is no novelty to compute.
-    varies = jnp.any(dvm.scaler.std[: trajectory.obs.shape[-1]] > windows.MIN_STD)
+    channels = trajectory.obs.shape[-1]
+    rounding = 1e-5 * jnp.abs(dvm.scaler.mean[:channels])
+    varies = jnp.any(dvm.scaler.std[:channels] > windows.MIN_STD + rounding)
     elbo = jnp.where(varies, elbo, jnp.nan)
     # A window that is not finite must stay nan for the gate to see it, not pass for one without a neighbour.
     covered = near.any(axis=-1) | jnp.isnan(elbo)

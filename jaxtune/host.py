@@ -1,20 +1,21 @@
 """The tuner for simulators that are not JAX: Gymnasium environments, MuJoCo C, Isaac Lab, or a program of one's own.
 
-Gate and update are the same compiled functions; only the loop runs in Python, so that `simulate` may do anything:
+Gate and update are the same compiled functions; only the loop runs in Python, so that `simulate` may do anything. It is
+given all robots at once, as a vector environment wants them; `one_by_one` makes it of a function that plays a single
+episode:
 
-    def simulate(key, policy, coords):  # coords: NumPy arrays by name, [episodes] each
-        seeds = jax.random.randint(key, (len(coords["mass"]),), 0, 2**31 - 1)
-        played = [play(int(seed), mass) for seed, mass in zip(seeds, np.exp(coords["mass"]))]
-        return Trajectory.from_episodes(played, steps=200)
+    def play(seed, policy, coords):  # coords: numbers by name
+        ...
+        return {"observation": ..., "action": ..., "reward": ..., "terminated": ...}
 
-    machine = HostTuner(config=TunerConfig(), simulate=simulate)
-    state = TunerState(policy=policy, dist=first, knobs=knobs())
+    machine = HostTuner(config=TunerConfig(), simulate=one_by_one(play))
+    state = machine.init(policy, first, knobs())
     state, info = machine.tune(jax.random.key(0), state, measured)
 
 A distribution that changes compiles nothing anew.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -22,13 +23,32 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxtune.checks import check_measured
+from jaxtune.checks import check_measured, check_set
 from jaxtune.rules import TunerConfig, Update, Verify, calibrated_gate, no_update, posterior_update
-from jaxtune.tuner import Info, Tuner, TunerState, keep, make_info
+from jaxtune.tuner import Info, Measure, TrainPolicy, Tuner, TunerState, keep, make_info
 from jaxtune.types import Trajectory, Verdict
 
 HostSimulate = Callable[[jax.Array, Any, dict[str, np.ndarray]], Trajectory]
 """`(key, policy, coords [episodes] by name) -> Trajectory [episodes, time]`, in NumPy or JAX; any Python."""
+
+
+def one_by_one(
+    play: Callable[[int, Any, dict[str, float]], Mapping[str, Any]], *, steps: int | None = None
+) -> HostSimulate:
+    """Makes a `simulate` that plays its episodes one after the other.
+
+    Args:
+      play: plays one episode, `(seed, policy, coords by name) -> episode`, as `Trajectory.from_episodes` reads them.
+      steps: length of the episodes; that of the longest where None.
+    """
+
+    def simulate(key: jax.Array, policy: Any, coords: dict[str, np.ndarray]) -> Trajectory:
+        robots = [dict(zip(coords, map(float, values), strict=True)) for values in zip(*coords.values(), strict=True)]
+        seeds = np.asarray(jax.random.randint(key, (len(robots),), 0, 2**31 - 1))
+        played = [play(int(seed), policy, robot) for seed, robot in zip(seeds, robots, strict=True)]
+        return Trajectory.from_episodes(played, steps=steps)
+
+    return simulate
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,13 +58,26 @@ class HostTuner:
     Attributes:
       config: sizes.
       simulate: simulates episodes of robots with given coordinates (`HostSimulate`).
-      verify, update: as in `Tuner`.
+      train_policy, measure, verify, update: as in `Tuner`; the first two may be any Python as well.
     """
 
     config: TunerConfig
     simulate: HostSimulate
+    train_policy: TrainPolicy = keep
+    measure: Measure | None = None
     verify: Verify = calibrated_gate
     update: Update = posterior_update
+
+    # The tuner's own functions; `step` calls the `tune` of this class.
+    init, train, step = Tuner.init, Tuner.train, Tuner.step
+
+    def run(self, key: jax.Array, state: TunerState, num_tunings: int) -> tuple[TunerState, Info]:
+        """Does several tunings, as `Tuner.run` does, with their infos stacked."""
+        infos = []
+        for key_step in jax.random.split(key, num_tunings):
+            state, info = self.step(key_step, state)
+            infos.append(info)
+        return state, jax.tree.map(lambda *leaves: np.stack(leaves), *infos)
 
     def tune(self, key: jax.Array, state: TunerState, measured: Trajectory) -> tuple[TunerState, Info]:
         """Does what `Tuner.tune` does, with the same keys, so that the same simulator gives the same answer.
@@ -52,6 +85,7 @@ class HostTuner:
         Raises:
           ValueError: episodes, simulated or measured, do not have the shapes that they should.
         """
+        check_set(measured, self.config)
         key_gate, key_update = jax.random.split(key)
         carry = self._tuner.before(state.dist)
         while carry["verdict"] == Verdict.WIDEN:
@@ -70,7 +104,7 @@ class HostTuner:
         def simulate(key, policy, coords):
             return self.simulate(key, policy, {name: np.asarray(values) for name, values in coords.items()})
 
-        return Tuner(config=self.config, train_policy=keep, simulate=simulate)
+        return Tuner(config=self.config, train_policy=self.train_policy, simulate=simulate, measure=self.measure)
 
     @cached_property
     def _verify(self):

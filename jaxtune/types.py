@@ -52,20 +52,24 @@ class Trajectory:
 
         Args:
           episodes: mappings with `observation` [time, obs], `action` [time, act], `reward` [time] and `terminated`, for
-            the episode or [time]; others, such as `truncated`, are not read. Observations may have one entry more, the
-            one after the last step, which is left out.
+            the episode or [time]. `truncated` is not read: an episode that was not terminated did not fall.
+            Observations may have one entry more, the one after the last step, which is left out.
           steps: length of the set; longer episodes are cut, shorter ones masked. That of the longest where None.
 
         Returns:
           NumPy arrays. An episode fell where it was terminated within `steps`. From a step on that is not finite it is
-          masked, and counts as one that broke.
+          masked, and counts as one that fell and broke.
 
         Raises:
-          ValueError: there is no episode, one lacks a key, or its lists or widths do not agree.
+          ValueError: there is no episode, one lacks a key or a step, or its lists or widths do not agree.
         """
-        read = [_read_episode(number, episode) for number, episode in enumerate(episodes)]
-        if not read:
+        if isinstance(episodes, Mapping) or not isinstance(episodes, Sequence):
+            raise ValueError(f"episodes: got {type(episodes).__name__}, expected a list of episodes")
+        if not episodes:
             raise ValueError("episodes: got none, expected at least one")
+        if steps is not None and (not isinstance(steps, int) or steps < 1):
+            raise ValueError(f"steps: got {steps!r}, expected a whole number of at least 1")
+        read = [_read_episode(number, episode) for number, episode in enumerate(episodes)]
         obs, action, reward, terminated = zip(*read, strict=True)
         steps = max(map(len, reward)) if steps is None else steps
         for field, values in (("observation", obs), ("action", action)):
@@ -84,19 +88,23 @@ class Trajectory:
         inside = np.arange(steps) < lived[:, None]
         finite = np.isfinite(obs).all(-1) & np.isfinite(action).all(-1) & np.isfinite(score)
         alive = inside & np.logical_and.accumulate(finite, axis=1)
+        broke = (inside & ~finite).any(axis=1)
+        ended = np.array([end and len(value) <= steps for end, value in zip(terminated, reward, strict=True)])
         return cls(
             obs=obs,
             action=action,
             alive=alive,
             score=np.where(alive, score, 0.0),
-            fell=np.array([end and len(value) <= steps for end, value in zip(terminated, reward, strict=True)]),
-            not_finite=(inside & ~finite).any(axis=1),
+            fell=ended | broke,
+            not_finite=broke,
         )
 
 
 def _read_episode(number: int, episode: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray, np.ndarray, bool]:
     """Reads observations, actions, rewards and whether it was terminated, and checks that their lengths agree."""
     keys = ("observation", "action", "reward", "terminated")
+    if not isinstance(episode, Mapping):
+        raise ValueError(f"episode {number}: got {type(episode).__name__}, expected {', '.join(keys)} by name")
     missing = [key for key in keys if key not in episode]
     if missing:
         raise ValueError(f"episode {number}: got {', '.join(episode)}, expected {', '.join(missing)} as well")
@@ -109,6 +117,8 @@ def _read_episode(number: int, episode: Mapping[str, Any]) -> tuple[np.ndarray, 
             raise ValueError(
                 f"episode {number}, {key}: expected one list of numbers a step, all of one width"
             ) from None
+        if array.size == 0:
+            raise ValueError(f"episode {number}, {key}: got no step, expected at least one")
         found.append(array.reshape(len(array), -1) if key != "reward" else array)
     obs, action, reward = found
     if reward.ndim != 1 or len(action) != len(reward) or len(obs) not in (len(reward), len(reward) + 1):
@@ -116,7 +126,15 @@ def _read_episode(number: int, episode: Mapping[str, Any]) -> tuple[np.ndarray, 
             f"episode {number}: got {len(obs)} observations, {len(action)} actions, rewards of shape {reward.shape}; "
             "expected as many of each (one more observation is allowed)"
         )
-    return obs[: len(reward)], action, reward, bool(np.any(episode["terminated"]))
+    ended = np.asarray(episode["terminated"])
+    # An episode ends with the step that terminates it.
+    fits = ended.dtype == bool and ended.shape in ((), (len(reward),)) and not np.atleast_1d(ended)[:-1].any()
+    if not fits:
+        raise ValueError(
+            f"episode {number}, terminated: got {ended.dtype} of shape {ended.shape}, expected True or False, for the "
+            "episode or for each of its steps, and True in none but the last"
+        )
+    return obs[: len(reward)], action, reward, bool(ended.any())
 
 
 @chex.dataclass(frozen=True)

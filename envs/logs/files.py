@@ -213,6 +213,9 @@ def _signals(path: Path, columns: dict[str, np.ndarray], meta: Meta) -> dict[str
             check_values(path, signal, meta.columns.get(name, name), one)
         signals[signal] = np.stack(values, axis=1) if len(names) > 1 or "." in names[0] else values[0]
     numbered = [name for name in columns if is_observation(name)]
+    for name in columns:
+        if name.startswith(f"{OBSERVATION}.") and name not in numbered:
+            raise ValueError(f"{path}, column '{name}': expected {OBSERVATION}.0, {OBSERVATION}.1, ...")
     for number in range(len(numbered)):
         if f"{OBSERVATION}.{number}" not in columns:
             raise ValueError(

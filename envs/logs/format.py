@@ -181,4 +181,4 @@ def column_names(signal: str, joints: Sequence[str]) -> list[str]:
 def is_observation(column: Any) -> bool:
     """Tells whether a column is a component of the policy's observation, such as `obs.7`."""
     head, _, number = str(column).partition(".")
-    return head == OBSERVATION and number.isdecimal()
+    return head == OBSERVATION and number.isdecimal() and number == str(int(number))

@@ -1,7 +1,8 @@
 """Makes episodes from logs that hold the policy's own observations: of any robot, without its model.
 
-A row's observation and action belong together. Rows come at the policy's rate, or faster; then a tick is where the
-action changes. A run is cut where ticks are missing, and ends where the motors are switched off, which is a fall.
+A row's observation and action belong together. Rows come at the policy's rate, and then each is a tick; or they are
+faster, and then a tick is where observation or action changes. A run begins where the motors are switched on. It is cut
+where ticks are missing, and ends where the motors are switched off, which is a fall.
 """
 
 import jax
@@ -9,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs.logs import Log, Run
-from envs.targets.recorded import HOLE, Recorded, cut, find_ticks
+from envs.targets.recorded import HOLE, Recorded, at_policy_rate, cut, find_ticks
 from jaxtune.types import Trajectory
 
 
@@ -31,6 +32,9 @@ def episodes(log: Log, steps: int, *, control_s: float, obs: int, act: int) -> R
       ValueError: observation or action have another size, or ticks do not come at the policy's rate.
     """
     found = []
+    rate = (log.policy or {}).get("rate_hz", 1.0 / control_s)
+    if abs(rate * control_s - 1.0) > 1e-3:
+        raise ValueError(f"policy.rate_hz: got {rate:g}, expected {1.0 / control_s:g}, as simulated")
     for index, run in enumerate(log.runs):
         for name, size in (("obs", obs), ("action", act)):
             got = run.signals[name].shape[1]
@@ -58,9 +62,11 @@ def episodes(log: Log, steps: int, *, control_s: float, obs: int, act: int) -> R
 
 def _pieces(run: Run, control_s: float) -> list[tuple[dict, int]]:
     """Cuts a run into pieces of consecutive ticks, each with its first step in the run."""
-    rows, _ = find_ticks(run.name, run.time, run.signals["action"], control_s)
-    off = np.flatnonzero(run.signals.get("enabled", np.ones(len(run.time))) == 0)
+    on = run.signals.get("enabled", np.ones(len(run.time))) != 0
+    begin = int(on.argmax())
+    off = begin + np.flatnonzero(~on[begin:])
     end = off[0] if len(off) else len(run.time)
+    rows = _ticks(run, control_s, begin)
     rows = rows[rows < end]
     if not len(rows):
         raise ValueError(f"{run.name}: got no step with the motors on, expected a walk")
@@ -80,3 +86,14 @@ def _pieces(run: Run, control_s: float) -> list[tuple[dict, int]]:
         }
         pieces.append((piece, round((time[part[0]] - time[0]) / control_s)))
     return pieces
+
+
+def _ticks(run: Run, control_s: float, begin: int) -> np.ndarray:
+    """Finds the rows at which the policy acts, from the row `begin` on."""
+    # An action may stay at its limit for long, but an observation does not stay the same to the last bit.
+    sent = np.concatenate([run.signals["obs"], run.signals["action"]], axis=1)
+    rows, _ = find_ticks(run.name, run.time, sent, control_s)
+    if at_policy_rate(run.time, control_s):
+        rows = np.arange(len(run.time))
+    # The first row shows what the policy observed first, whenever that was.
+    return np.union1d(begin, rows[rows >= begin])

@@ -175,6 +175,11 @@ def _at_ticks(run: Run, order: list[int]) -> dict[str, np.ndarray]:
     return seen | {"up": ~down[rows]}
 
 
+def at_policy_rate(time: np.ndarray, period: float) -> bool:
+    """Tells whether rows at times [rows] s come at the rate of a policy with this period in s."""
+    return abs(float(np.median(np.diff(time))) / period - 1.0) < _SAME_RATE
+
+
 def find_ticks(name: str, time: np.ndarray, action: np.ndarray, period: float) -> tuple[np.ndarray, bool]:
     """Finds the rows in which the policy sent an action, and whether it observed the robot in these very rows.
 
@@ -191,7 +196,7 @@ def find_ticks(name: str, time: np.ndarray, action: np.ndarray, period: float) -
     """
     width = float(np.median(np.diff(time)))
     changes = 1 + np.flatnonzero((np.diff(action, axis=0) != 0).any(axis=1))
-    if abs(width / period - 1.0) < _SAME_RATE:
+    if at_policy_rate(time, period):
         # Every row is a tick, unless the action has stayed the same for so long that the policy must have stopped.
         starts = np.append(0, changes)
         long = np.diff(np.append(starts, len(time)))

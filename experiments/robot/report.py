@@ -17,7 +17,7 @@ VERDICTS = {
     "unexplained": "The simulator does not cover what was measured, and a wider distribution brings it no closer: "
     "physics is missing in the model.",
     "radius_exhausted": "The simulator does not cover what was measured, and its distribution cannot grow any wider.",
-    "not_finite": "Nothing could be compared: every walk was shorter than a window (0.5 s), or a value is not finite.",
+    "not_finite": "Nothing could be compared: walks were shorter than a window of 50 steps, or a value is not finite.",
     None: "This method does not check whether the simulator covers what was measured.",
 }
 """What each verdict of the gate means; None stands for a method without a gate."""

@@ -2,6 +2,9 @@
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
 
 from jaxtune.mjx import Entry, parameters
 
@@ -49,6 +52,22 @@ CASES = {
     "weaker_motor": Case(hidden={"torque_scale": 0.6}, target="bullet"),
 }
 """The paper's four cases, Figs. 3.1 to 3.4, and a weaker motor, since this walk loses little with the paper's."""
+
+
+def errors(
+    entries: Mapping[str, Entry], estimate: Mapping[str, Any], truth: Mapping[str, float]
+) -> dict[str, np.ndarray]:
+    """Computes errors of physical values by name.
+
+    They are relative for multipliers, |estimate / truth - 1|, and absolute for offsets, which may be zero.
+
+    Args:
+      entries: the parameter table.
+      estimate: of any shape.
+      truth: values by name; every name of the estimate.
+    """
+    off = {name: np.abs(np.asarray(value) - truth[name]) for name, value in estimate.items()}
+    return {name: error / truth[name] if entries[name].log else error for name, error in off.items()}
 
 
 def checked_case(

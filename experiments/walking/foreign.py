@@ -19,7 +19,7 @@ from experiments.common.config import Preset
 from experiments.walking.learner import Learner
 from experiments.walking.policies import starting_policy
 from experiments.walking.robots import kind
-from jaxtune.host import HostTuner
+from jaxtune.host import HostTuner, one_by_one
 from jaxtune.mjx import Entry, Simulator, action_delay, apply_mujoco, field, friction, mass, parameters, strength
 from jaxtune.tuner import Info, TunerState
 from jaxtune.types import Trajectory
@@ -130,7 +130,7 @@ class HalfCheetah:
         self._env = gymnasium.make("HalfCheetah-v5").unwrapped
         self._nominal = self._env.model
         self._sizes = sizes
-        self.tune = HostTuner(config=sizes.tuner, simulate=self._simulate).tune
+        self.tune = HostTuner(config=sizes.tuner, simulate=one_by_one(self._play_coords)).tune
 
     def policy(self, out: Path) -> np.ndarray:
         kept = out / "policy.npy"
@@ -140,20 +140,15 @@ class HalfCheetah:
         return np.load(kept)
 
     def measure(self, key: jax.Array, policy: np.ndarray, truth: Mapping[str, float]) -> Trajectory:
-        return self._episodes(key, policy, [dict(truth)] * self._sizes.tuner.set_episodes)
-
-    def _simulate(self, key: jax.Array, policy: np.ndarray, coords: Mapping[str, np.ndarray]) -> Trajectory:
-        values = parameters.from_coords(self.entries, coords)
-        return self._episodes(
-            key, policy, [dict(zip(values, row, strict=True)) for row in zip(*values.values(), strict=True)]
+        coords = {name: np.float32(value) for name, value in parameters.to_coords(self.entries, truth).items()}
+        count = self._sizes.tuner.set_episodes
+        return one_by_one(self._play_coords)(
+            key, policy, {name: np.full(count, value) for name, value in coords.items()}
         )
 
-    def _episodes(self, key, policy, robots) -> Trajectory:
-        seeds = jax.random.randint(key, (len(robots),), 0, 2**31 - 1)
+    def _play_coords(self, seed: int, policy: np.ndarray, coords: Mapping[str, float]) -> dict[str, list]:
         steps = min(150, self._sizes.episode_steps)
-        return Trajectory.from_episodes(
-            [self._play(int(seed), policy, robot, steps) for seed, robot in zip(seeds, robots, strict=True)]
-        )
+        return self._play(seed, policy, parameters.from_coords(self.entries, coords), steps)
 
     def _play(self, seed: int, policy: np.ndarray, robot: Mapping[str, float], steps: int) -> dict[str, list]:
         self._env.model = apply_mujoco(self._nominal, robot, self.entries)
@@ -183,12 +178,18 @@ class HalfCheetah:
         return policy
 
 
-def world(name: str, sizes: Preset) -> World:
-    """Makes one of the robots in `PACKAGES`.
+def check(name: str) -> None:
+    """Checks that a robot can be made.
 
     Raises:
-      ValueError: its package is not installed.
+      ValueError: it is not in `PACKAGES`, or its package is not installed.
     """
+    if name not in PACKAGES:
+        raise ValueError(f"robots: got '{name}', expected some of {', '.join(PACKAGES)}")
     if importlib.util.find_spec(PACKAGES[name]) is None:
         raise ValueError(f"robots: got '{name}', but its package {PACKAGES[name]} is not installed")
+
+
+def world(name: str, sizes: Preset) -> World:
+    """Makes one of the robots in `PACKAGES`."""
     return HalfCheetah(sizes) if name == "half_cheetah" else Traced(name, sizes)

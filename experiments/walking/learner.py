@@ -55,6 +55,9 @@ class Learner:
       hidden: parameters that are not tuned, but may differ from nominal in training. `oracle` uses them.
       correction: a corrected model that discovery wrote; None means the nominal model.
       kind: the robot.
+
+    Raises:
+      ValueError: the robot's episodes are shorter than a window of the tuner, or it cannot be made of the correction.
     """
 
     def __init__(
@@ -65,6 +68,11 @@ class Learner:
         correction: Correction | None = None,
         kind: Kind = BITENO,
     ):
+        window = max(preset.tuner.spm.window, preset.tuner.dvm.window)
+        if kind.episode_steps < window:
+            raise ValueError(
+                f"robot '{kind.name}': got episodes of {kind.episode_steps} steps, expected at least {window}, a window"
+            )
         self.preset = preset = replace(preset, episode_steps=min(preset.episode_steps, kind.episode_steps))
         self.kind = kind
         self.entries = entries

@@ -55,7 +55,8 @@ def walk(
         steps = (index + 1) * chunk * learner.preset.ppo.steps_per_update
         curve.append({"steps": steps, "seconds": time.monotonic() - start, **line})
         if progress:
-            progress.update(task, completed=steps, description=f"reward {100 * line['reward']:.2f} per second")
+            rate = line["reward"] / learner.kind.control_s
+            progress.update(task, completed=steps, description=f"reward {rate:.2f} per second")
     return policy, curve
 
 

@@ -6,10 +6,11 @@ for which a parameter table is then proposed (`jaxtune.mjx.parameters_of`).
 """
 
 import importlib.util
+import inspect
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -101,7 +102,7 @@ def kind(name: str) -> Kind:
     if colon and place == "playground":
         return _foreign(name, _playground(what))
     if colon and place.endswith(".py"):
-        return _foreign(name, _from_file(Path(place), what))
+        return _foreign(name, _from_file(Path(place).resolve(), what))
     raise ValueError(
         f"robot: got '{name}', expected {', '.join(_SHIPPED)}, playground:NAME or path/to/file.py:function"
     )
@@ -111,9 +112,10 @@ def _foreign(name: str, made: Any) -> Kind:
     """Makes a kind of a simulator, or of an environment without a table."""
     try:
         if not isinstance(made, Simulator):
-            model = model_of(made)
-            made = Simulator(made, _LONGEST, parameters_of(model, control_s=float(getattr(made, "dt", 0.0))))
-        made.observation_size  # noqa: B018  so that a missing `observe` is named before anything compiles
+            table = parameters_of(model_of(made), control_s=float(getattr(made, "dt", 0.0)))
+            made = Simulator(made, _LONGEST, table, observe=_state_key(made))
+        if not hasattr(made.env, "dt"):
+            raise ValueError("env: has no dt, the control period in seconds")
     except ValueError as error:
         raise ValueError(f"robot '{name}': {error}") from error
     return Kind(
@@ -140,6 +142,12 @@ def _foreign(name: str, made: Any) -> Kind:
     )
 
 
+def _state_key(env: Any) -> str | None:
+    """Returns the key of what a policy is given in Playground's dictionaries of observations."""
+    obs = jax.eval_shape(env.reset, jax.random.PRNGKey(0)).obs
+    return "state" if isinstance(obs, Mapping) and "state" in obs else None
+
+
 def _uncorrected(robot: Simulator, correction: Correction | None) -> Simulator:
     if correction is not None:
         raise ValueError("model: got a corrected model, which can be simulated with --robot biteno alone")
@@ -147,9 +155,9 @@ def _uncorrected(robot: Simulator, correction: Correction | None) -> Simulator:
 
 
 def _power(state: Any) -> jax.Array:
-    """Mechanical power of the joints in W, from the state of an environment of Playground or Brax."""
+    """Mechanical power of the joints in W, from the state of an environment of Playground or Brax; else nan."""
     data = getattr(state, "data", None) or getattr(state, "pipeline_state", None)
-    return jnp.zeros(()) if data is None else jnp.maximum(data.qfrc_actuator * data.qvel, 0.0).sum()
+    return jnp.full((), jnp.nan) if data is None else jnp.maximum(data.qfrc_actuator * data.qvel, 0.0).sum()
 
 
 def _playground(name: str) -> Any:
@@ -159,20 +167,28 @@ def _playground(name: str) -> Any:
         raise ValueError("robot: MuJoCo Playground is not installed; expected `pip install playground`") from error
     if name not in registry.ALL_ENVS:
         raise ValueError(f"robot: got 'playground:{name}', expected one of {', '.join(registry.ALL_ENVS)}")
-    return registry.load(name, config_overrides={"impl": "jax"})
+    # Some environments have no such setting, and one implementation.
+    has_choice = "impl" in registry.get_default_config(name)
+    return registry.load(name, config_overrides={"impl": "jax"} if has_choice else None)
 
 
+@cache
 def _from_file(path: Path, function: str) -> Any:
-    if not path.exists():
+    if not path.is_file():
         raise ValueError(f"robot: {path} does not exist")
-    # As for a script: its folder is searched for what it imports, and its classes find their module by name.
-    sys.path.append(str(path.parent.resolve()))
-    spec = importlib.util.spec_from_file_location(path.stem, path)
-    module = sys.modules[path.stem] = importlib.util.module_from_spec(spec)
+    # As for a script: its folder is searched for what it imports, and its classes find their module by name. The name
+    # is its own, or `brax.py` would stand in the place of Brax.
+    sys.path.append(str(path.parent))
+    name = f"_robot_{path.stem}"
+    spec = importlib.util.spec_from_file_location(name, path)
+    module = sys.modules[name] = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    if not callable(getattr(module, function, None)):
+    make = getattr(module, function, None)
+    if not callable(make):
         raise ValueError(f"robot: {path} has no function '{function}'")
-    return getattr(module, function)()
+    if any(parameter.default is parameter.empty for parameter in inspect.signature(make).parameters.values()):
+        raise ValueError(f"robot: {path}: got {function}{inspect.signature(make)}, expected a function of no arguments")
+    return make()
 
 
 BITENO = Kind(

@@ -69,6 +69,8 @@ def check_implementation(model: mjx.Model) -> None:
     Raises:
       ValueError: it is not.
     """
+    if not hasattr(model, "impl"):
+        raise ValueError(f"model: got {type(model).__name__}, expected mjx.Model; make it with mjx.put_model(model)")
     if model.impl != mjx.Impl.JAX:
         raise ValueError(
             f"model, impl: got '{model.impl.value}', expected 'jax'; make it with mjx.put_model(model, impl='jax') "

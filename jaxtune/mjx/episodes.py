@@ -69,6 +69,9 @@ def rollout(
 
     Returns:
       The episodes, and what was watched of them, [episodes, time, ...].
+
+    Raises:
+      ValueError: the policy's action is not one array of the robot's `action_size`.
     """
     # Without the barrier the compiler would fold constant parameters into every derived field of every model, and take
     # minutes.
@@ -80,7 +83,7 @@ def rollout(
         def step(carry, now):
             (state, alive), (key, number) = carry, now
             state = prepare(state, given, number)
-            action = act(state.obs, key)
+            action = _checked(act(state.obs, key), robot.action_size)
             following, motion = robot.move(params, state, action)
             broke = alive & (following.not_finite > 0)
             lives = alive & ~broke
@@ -96,6 +99,14 @@ def rollout(
 
     keys = jax.random.split(key, len(next(iter(params.values()))))
     return in_chunks(episode, (keys, params, given))
+
+
+def _checked(action: Any, size: int) -> jax.Array:
+    # One number would be broadcast to all motors, without a word.
+    if not hasattr(action, "shape") or action.shape != (size,):
+        got = f"shape {action.shape}" if hasattr(action, "shape") else f"a {type(action).__name__}"
+        raise ValueError(f"act: got {got}, expected an action of shape ({size},)")
+    return action
 
 
 def in_chunks(function: Callable[..., Any], inputs: Any) -> Any:

@@ -18,7 +18,7 @@ import numpy as np
 from mujoco import mjx
 
 from jaxtune import dist as dists
-from jaxtune.mjx.derived_fields import check_implementation, set_const
+from jaxtune.mjx.derived_fields import DERIVED, check_implementation, set_const
 from jaxtune.types import Coords, ParamDist
 
 Params = Mapping[str, jax.Array]
@@ -38,10 +38,12 @@ _PREFIXES = {
     "body": ("body_",),
     "geom": ("geom_", "pair_"),
     "joint": ("jnt_", "dof_"),
-    "actuator": ("actuator_",),
+    "actuator": ("actuator_", "jnt_actfrcrange"),
     "control": (),
 }
 """How the fields begin that have rows for objects of a kind."""
+_NOT_NEGATIVE = ("body_mass", "body_inertia", "dof_", "jnt_stiffness", "geom_friction", "pair_friction")
+"""How the fields begin that no offset may take below zero."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,37 +80,63 @@ class Entry:
         """Checks the row before anything is compiled.
 
         Raises:
-          ValueError: a target has no name or stands there twice, a field belongs to another kind of object, or the
-            bounds are not ascending (above zero for a multiplier).
+          ValueError: the kind is unknown; a target has no name or stands there twice; a field belongs to another kind
+            of object or is recomputed in any case; or the bounds are not two finite numbers that ascend (above zero for
+            a multiplier).
         """
-        targets = self.targets or ()
-        if "" in targets or len(set(targets)) < len(targets):
-            raise ValueError(
-                f"targets: got {targets}, expected distinct names; an object without one must get one in the model"
-            )
-        for name in self.field_names:
-            prefixes = _PREFIXES[self.kind]
-            if not name.startswith(prefixes):
-                expected = f"fields of a {self.kind}, which begin with {' or '.join(prefixes)}" if prefixes else "none"
-                raise ValueError(f"fields: got '{name}', expected {expected}")
-        low, high = self.bounds
-        if not low < high or (self.log and low <= 0):
+        if self.kind not in _PREFIXES:
+            raise ValueError(f"kind: got {self.kind!r}, expected one of {', '.join(_PREFIXES)}")
+        self._check_targets()
+        self._check_fields()
+        try:
+            low, high = map(float, self.bounds)
+        except (TypeError, ValueError):
+            raise ValueError(f"bounds: got {self.bounds!r}, expected two numbers") from None
+        if not -math.inf < low < high < math.inf or (self.log and low <= 0):
             expected = "ascending ones, above zero for a multiplier" if self.log else "ascending ones"
             raise ValueError(f"bounds: got {self.bounds}, expected {expected}")
+
+    def _check_targets(self) -> None:
+        if self.targets is None:
+            return
+        named = isinstance(self.targets, tuple) and all(isinstance(name, str) for name in self.targets)
+        if not named or (not self.targets and self.kind != "control"):
+            raise ValueError(f"targets: got {self.targets!r}, expected a tuple of names, or None for all")
+        if "" in self.targets or len(set(self.targets)) < len(self.targets):
+            raise ValueError(
+                f"targets: got {self.targets}, expected distinct names; an object without one must get one in the model"
+            )
+
+    def _check_fields(self) -> None:
+        for field in self.fields:
+            name, *column = (field,) if isinstance(field, str) else field
+            if not isinstance(name, str) or not all(isinstance(number, int) for number in column):
+                raise ValueError(f"fields: got {field!r}, expected a name, or a name and the number of a column")
+            if name in DERIVED:
+                raise ValueError(f"fields: got '{name}', which follows from masses and inertias; change those")
+            if not name.startswith(_PREFIXES[self.kind]):
+                prefixes = " or ".join(_PREFIXES[self.kind])
+                expected = f"fields of a {self.kind}, which begin with {prefixes}" if prefixes else "none"
+                raise ValueError(f"fields: got '{name}', expected {expected}")
 
     def check(self, model: mjx.Model) -> None:
         """Checks that the value can change this model.
 
         Raises:
-          ValueError: the model has no such target, field or column; a multiplier meets zeros alone; or friction is
-            added to a joint for which MJX does not solve it.
+          ValueError: there is no field; the model has no such target, field or column; a multiplier meets zeros alone;
+            an offset may take a mass, a friction or the like below zero; or friction is added to a joint for which MJX
+            does not solve it.
         """
+        if not self.fields and self.kind != "control":
+            raise ValueError("fields: got none, expected at least one")
         met = []
         for field in self.fields:
             name, *column = (field,) if isinstance(field, str) else field
             array = getattr(model, name, None)
             if not hasattr(array, "shape"):
                 raise ValueError(f"fields: got '{name}', which mjx.Model does not have")
+            if not np.issubdtype(array.dtype, np.floating):
+                raise ValueError(f"fields: got '{name}', which holds {array.dtype}; expected one of real numbers")
             if column and not (array.ndim == 2 and 0 <= column[0] < array.shape[1]):
                 raise ValueError(f"column: got {column[0]} of '{name}', which has {math.prod(array.shape[1:])}")
             rows, _ = self.rows(model, name)
@@ -117,6 +145,11 @@ class Entry:
                 raise ValueError(
                     "fields: MJX solves for dof_frictionloss only in joints that had some when the model was put on "
                     "the device; give all of these joints 1e-6 in the MuJoCo model, and put it there again"
+                )
+            smallest = met[-1].min(initial=np.inf)
+            if not self.log and name.startswith(_NOT_NEGATIVE) and smallest + self.bounds[0] < 0:
+                raise ValueError(
+                    f"bounds: got {self.bounds}, which makes {name} negative; expected at least {-smallest:g}"
                 )
         if self.log and met and not any(values.any() for values in met):
             raise ValueError(
@@ -147,25 +180,28 @@ class Entry:
         if self.targets is None:
             return np.arange(count), np.zeros(count, int)
         found = [self._find(model, target) for target in self.targets]
-        owner = [number for number, ids in enumerate(found) for _ in ids]
-        return np.concatenate([*found, []]).astype(int), np.array(owner, int)
+        ids = np.concatenate([*found, []]).astype(int)
+        if len(set(ids)) < len(ids):
+            raise ValueError(f"targets: got {', '.join(self.targets)}, two of which are the same {self.kind}")
+        return ids, np.array([number for number, ids in enumerate(found) for _ in ids], int)
 
     def _find(self, model, target: str) -> np.ndarray:
         index = mjx.name2id(model, _OBJECTS[self.kind], target)
         if index >= 0:
             return np.array([index])
+        driven = {}
         if self.kind == "actuator":
-            drives = np.isin(model.actuator_trntype, (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT))
-            joint = mjx.name2id(model, mujoco.mjtObj.mjOBJ_JOINT, target)
-            drives &= (np.asarray(model.actuator_trnid)[:, 0] == joint) & (joint >= 0)
-            if drives.any():
-                return np.flatnonzero(drives)
+            numbers, joints = _driven(model, np.arange(model.nu))
+            for number, joint in zip(numbers, joints, strict=True):
+                driven.setdefault(mjx.id2name(model, mujoco.mjtObj.mjOBJ_JOINT, joint), []).append(number)
+            if target in driven:
+                return np.array(driven[target])
         named = [
             mjx.id2name(model, _OBJECTS[self.kind], number) for number in range(getattr(model, _COUNTS[self.kind]))
         ]
         raise ValueError(
             f"targets: got {self.kind} '{target}', which the model does not have; expected some of "
-            f"{', '.join(filter(None, named))}"
+            f"{', '.join(dict.fromkeys(filter(None, [*named, *driven])))}"
         )
 
     def rows(self, model: mjx.Model | mujoco.MjModel, field: str) -> tuple[np.ndarray, np.ndarray]:
@@ -186,10 +222,20 @@ class Entry:
             holds = np.asarray(model.dof_jntid)[:, None] == ids
         elif field.startswith("pair_"):
             holds = (np.asarray(model.pair_geom1)[:, None] == ids) | (np.asarray(model.pair_geom2)[:, None] == ids)
+        elif self.kind == "actuator" and field.startswith("jnt_"):
+            numbers, joints = _driven(model, ids)
+            holds = (np.arange(model.njnt)[:, None] == joints) @ (numbers[:, None] == ids)
         else:
             return ids, owner
         rows = np.flatnonzero(holds.any(axis=1))
         return rows, owner[holds[rows].argmax(axis=1)]
+
+
+def _driven(model, actuators: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns those of the actuators that drive a joint, and the joints that they drive."""
+    kinds = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+    actuators = actuators[np.isin(np.asarray(model.actuator_trntype)[actuators], kinds)]
+    return actuators, np.asarray(model.actuator_trnid)[actuators, 0]
 
 
 def select(entries: Mapping[str, Entry], names: Sequence[str]) -> dict[str, Entry]:
@@ -210,10 +256,14 @@ def check(model: mjx.Model, entries: Mapping[str, Entry]) -> None:
     """Checks that every parameter of a table can change a model (`Entry.check`).
 
     Raises:
-      ValueError: one cannot, or the model is of another implementation than JAX's.
+      ValueError: one cannot, the table is none, or the model is not of MJX's JAX implementation.
     """
     check_implementation(model)
+    if not isinstance(entries, Mapping) or not all(isinstance(name, str) for name in entries):
+        raise ValueError(f"parameters: got {type(entries).__name__}, expected rows (jaxtune.mjx.Entry) by name")
     for name, entry in entries.items():
+        if not isinstance(entry, Entry):
+            raise ValueError(f"parameter '{name}': got {type(entry).__name__}, expected a row (jaxtune.mjx.Entry)")
         try:
             entry.check(model)
         except ValueError as error:
@@ -229,9 +279,10 @@ def distribution(entries: Mapping[str, Entry], radius: float, centre: Params) ->
       centre: physical values by name; those that are left out are nominal.
 
     Raises:
-      ValueError: a name is not in the table, a value is out of bounds, or the radius is not positive.
+      ValueError: a name is not in the table, a value is out of bounds (the nominal one too, where it is left out), or
+        the radius is not positive.
     """
-    check_values(entries, centre)
+    check_values(entries, nominal(entries) | dict(centre))
     ends = ({name: entry.bounds[end] for name, entry in entries.items()} for end in (0, 1))
     middle, lower, upper = (
         {name: float(value) for name, value in to_coords(entries, values).items()}
@@ -244,11 +295,12 @@ def check_values(entries: Mapping[str, Entry], params: Params) -> None:
     """Checks physical values by name against a table.
 
     Raises:
-      ValueError: a name is not in the table, or a value is out of bounds.
+      ValueError: a name is not in the table, or a value is no number or out of bounds.
     """
     for name, entry in select(entries, tuple(params)).items():
         low, high = entry.bounds
-        if not low <= params[name] <= high:
+        number = np.ndim(params[name]) == 0 and not isinstance(params[name], str)
+        if not number or not low <= params[name] <= high:
             raise ValueError(f"parameter '{name}': got {params[name]}, expected {low:g} to {high:g}")
 
 
@@ -273,10 +325,13 @@ def to_coords(entries: Mapping[str, Entry], params: Params) -> dict[str, jax.Arr
 
     Returns:
       Coordinates by name, of the same shapes.
+
+    Raises:
+      ValueError: a name is not in the table.
     """
     return {
-        name: jnp.log(value) if entries[name].log else jnp.asarray(value) / entries[name].unit
-        for name, value in params.items()
+        name: jnp.log(params[name]) if entry.log else jnp.asarray(params[name]) / entry.unit
+        for name, entry in select(entries, tuple(params)).items()
     }
 
 
@@ -291,10 +346,13 @@ def from_coords(entries: Mapping[str, Entry], coords: Coords) -> dict[str, jax.A
 
     Returns:
       Physical values by name, of the same shapes.
+
+    Raises:
+      ValueError: a name is not in the table.
     """
     return {
-        name: jnp.exp(value) if entries[name].log else jnp.asarray(value) * entries[name].unit
-        for name, value in coords.items()
+        name: jnp.exp(coords[name]) if entry.log else jnp.asarray(coords[name]) * entry.unit
+        for name, entry in select(entries, tuple(coords)).items()
     }
 
 

@@ -37,13 +37,14 @@ def mass(bodies: Names, *, bounds: Bounds) -> Entry:
 def strength(joints: Names, *, bounds: Bounds) -> Entry:
     """Multiplies the torque of motors, and of position and velocity servos, by one value.
 
-    Gains, biases and force limits are multiplied alike, so that every torque is this share of the nominal one.
+    Gains, biases and force limits are multiplied alike, and so are the limits of actuator force at the joints that they
+    drive, so that every torque is this share of the nominal one.
 
     Args:
       joints: names of actuators, or of the joints that they drive; None for all actuators.
       bounds: smallest and largest multiplier.
     """
-    fields = ("actuator_gainprm", "actuator_biasprm", "actuator_forcerange")
+    fields = ("actuator_gainprm", "actuator_biasprm", "actuator_forcerange", "jnt_actfrcrange")
     return Entry(kind="actuator", targets=_names(joints), fields=fields, bounds=bounds)
 
 
@@ -59,10 +60,10 @@ def friction(geoms: Names = None, *, bounds: Bounds) -> Entry:
 
 def action_delay(*, bounds_s: Bounds) -> Entry:
     """Delays the policy's actions by a time in seconds, the same for all of an episode (`jaxtune.mjx.Simulator`)."""
-    low, _ = bounds_s
-    if low < 0:
+    entry = Entry(kind="control", targets=(), fields=(), bounds=bounds_s, log=False)
+    if bounds_s[0] < 0:
         raise ValueError(f"bounds_s: got {bounds_s}, expected no negative delay")
-    return Entry(kind="control", targets=(), fields=(), bounds=bounds_s, log=False)
+    return entry
 
 
 def field(name: str, *, bounds: Bounds, column: int | None = None, offset: bool = False, **targets: Names) -> Entry:
@@ -128,4 +129,8 @@ def _without_side(name: str) -> str:
 
 
 def _names(names: Names) -> tuple[str, ...] | None:
-    return (names,) if isinstance(names, str) else None if names is None else tuple(names)
+    if names is None or isinstance(names, str):
+        return names if names is None else (names,)
+    if not isinstance(names, Sequence) or isinstance(names, bytes):
+        raise ValueError(f"targets: got {names!r}, expected a name, several, or None for all")
+    return tuple(names)

@@ -19,6 +19,7 @@ from typing import Any
 import chex
 import jax
 import jax.numpy as jnp
+import numpy as np
 from mujoco import mjx
 
 from jaxtune import dist as dists
@@ -41,11 +42,9 @@ def with_model(env: Any, model: mjx.Model) -> Any:
     made (joint limits, a standing height) stays nominal. Where that matters, or for an environment of another make,
     hand `Simulator` a function of your own.
     """
-    env = copy.copy(getattr(env, "unwrapped", env))
-    if hasattr(env, "_mjx_model"):
-        env._mjx_model = model
-    else:
-        env.sys = model
+    env = copy.copy(env)
+    # Playground's `mjx_model` is a property that reads `_mjx_model`.
+    setattr(env, next((name for name in ("_mjx_model", "mjx_model") if name in vars(env)), "sys"), model)
     return env
 
 
@@ -93,16 +92,64 @@ class Simulator:
     def __post_init__(self) -> None:
         if self.model is None:
             object.__setattr__(self, "model", model_of(self.env))
-        if self.steps < 1:
-            raise ValueError(f"steps: got {self.steps}, expected at least 1")
+        if not isinstance(self.steps, int) or self.steps < 1:
+            raise ValueError(f"steps: got {self.steps!r}, expected at least 1, a whole number")
+        parameters.check(self.model, self.parameters)
         if not self.parameters:
             raise ValueError("parameters: got none, expected a row for each that may be wrong")
-        parameters.check(self.model, self.parameters)
-        delays = [name for name, entry in self.parameters.items() if entry.kind == "control"]
+        self._check_delay()
+        self._check_reach()
+        self._check_reset()
+
+    def _check_delay(self) -> None:
+        delays = {name: entry for name, entry in self.parameters.items() if entry.kind == "control"}
         if len(delays) > 1:
             raise ValueError(f"parameters: got {' and '.join(delays)}, expected one action_delay at most")
-        if delays and not hasattr(self.env, "dt"):
-            raise ValueError(f"parameter '{delays[0]}': the environment has no dt, the control period in seconds")
+        for name, entry in delays.items():
+            if not hasattr(self.env, "dt"):
+                raise ValueError(f"parameter '{name}': the environment has no dt, the control period in seconds")
+            longest = self.steps * float(self.env.dt)
+            if entry.bounds[1] > longest:
+                raise ValueError(
+                    f"parameter '{name}', bounds: got {entry.bounds} s, expected less than an episode, {longest:g} s"
+                )
+
+    def _check_reach(self) -> None:
+        """Checks that the default `with_model` reaches the model that the environment simulates."""
+        if not callable(self.with_model):
+            raise ValueError(f"with_model: got {self.with_model!r}, expected a function (env, model) -> env")
+        if self.with_model is not with_model:
+            return
+        inner = getattr(self.env, "unwrapped", self.env)
+        if inner is not self.env:
+            raise ValueError(
+                f"env: got {type(self.env).__name__} around {type(inner).__name__}, expected an environment without "
+                "wrappers, or with_model= that gives another model to what it wraps"
+            )
+        model = self.model.replace(body_mass=2.0 * self.model.body_mass)
+        try:
+            reached = model_of(with_model(self.env, model)) is model
+        except (AttributeError, TypeError, ValueError):
+            reached = False
+        if not reached:
+            raise ValueError(
+                f"with_model: got none, and the default does not reach the model of {type(self.env).__name__}; "
+                "expected a function (env, model) -> env"
+            )
+
+    def _check_reset(self) -> None:
+        """Checks what an environment starts with, by shape: one robot, and the observation that `observe` names."""
+        named = (self.observe,) if isinstance(self.observe, str) or callable(self.observe) else self.observe or ()
+        if not isinstance(named, Sequence) or not all(isinstance(name, str) or callable(name) for name in named):
+            raise ValueError(f"observe: got {self.observe!r}, expected a key, keys, or a function")
+        shapes = [np.shape(leaf) for leaf in jax.tree.leaves(self._start.obs)]
+        others = [np.shape(getattr(self._start, name)) for name in ("reward", "done")]
+        if any(others) or any(len(shape) != 1 for shape in shapes):
+            raise ValueError(
+                f"env: got a reset with observations of shape {', '.join(map(str, shapes))}, reward and done of shape "
+                f"{' and '.join(map(str, others))}, expected those of one robot: [obs], () and ()"
+            )
+        self.layout  # noqa: B018  names what is wrong with `observe`
 
     @property
     def entries(self) -> Mapping[str, Entry]:
@@ -124,10 +171,16 @@ class Simulator:
         low, high = dists.box(dist)
         ends = {"low": low, "value": dist.centre, "high": high}
         found = {end: parameters.from_coords(self.parameters, coords) for end, coords in ends.items()}
-        return {name: {end: float(values[name]) for end, values in found.items()} for name in self.parameters}
+        names = [name for name in self.parameters if name in dist.centre]
+        return {name: {end: float(values[name]) for end, values in found.items()} for name in names}
 
     def simulate(self, act: Act) -> Callable[[jax.Array, Any, Coords], Trajectory]:
-        """Makes the `simulate` of a tuner: one episode for every draw of the coordinates."""
+        """Makes the `simulate` of a tuner: one episode for every draw of the coordinates.
+
+        Raises:
+          ValueError: the policy is no function.
+        """
+        _check_act(act)
 
         def simulate(key: jax.Array, policy: Any, coords: Coords) -> Trajectory:
             return self.rollout(key, act, policy, parameters.from_coords(self.parameters, coords))
@@ -141,8 +194,15 @@ class Simulator:
           act: the policy.
           params: true physical values by name; those that are left out are nominal.
           episodes: in a measured set, as in `TunerConfig.set_episodes`.
+
+        Raises:
+          ValueError: the policy is no function, a name is not in the table, a value is out of bounds, or there are no
+            episodes.
         """
+        _check_act(act)
         parameters.check_values(self.parameters, params)
+        if not isinstance(episodes, int) or episodes < 1:
+            raise ValueError(f"episodes: got {episodes!r}, expected a whole number of at least 1")
         truth = parameters.nominal(self.parameters) | dict(params)
 
         def measure(key: jax.Array, policy: Any) -> Trajectory:
@@ -208,9 +268,18 @@ class Simulator:
     @cached_property
     def layout(self) -> dict[str, int]:
         """Parts of what is observed and their sizes, in order: the keys of a dictionary observation, else `obs`."""
-        start = jax.eval_shape(lambda: self.env.reset(jax.random.PRNGKey(0)).obs)
+        start = self._start.obs
         whole = jax.eval_shape(self.observed, start).shape[0]
         return {name: start[name].shape[0] for name in self._keys} if self._keys else {"obs": whole}
+
+    @cached_property
+    def _start(self) -> Any:
+        """Shapes of the environment's own state at the start of an episode."""
+        start = jax.eval_shape(self.env.reset, jax.random.PRNGKey(0))
+        for name in ("obs", "reward", "done"):
+            if not hasattr(start, name):
+                raise ValueError(f"env: got a reset that returns {type(start).__name__} without '{name}'")
+        return start
 
     def observed(self, obs: Any) -> jax.Array:
         """Makes one array of an observation, by `observe`.
@@ -228,28 +297,40 @@ class Simulator:
             raise ValueError(f"observe: got {self.observe!r}, but the environment's observation is one array")
         return obs
 
-    def randomization_fn(self, dist: ParamDist) -> Callable[[mjx.Model, jax.Array], tuple[mjx.Model, mjx.Model]]:
+    def randomization_fn(
+        self, dist: ParamDist, *, leave_out: Sequence[str] = ()
+    ) -> Callable[[mjx.Model, jax.Array], tuple[mjx.Model, mjx.Model]]:
         """Makes the `randomization_fn` of Brax's and Playground's training: robots drawn from a distribution.
 
-        It takes a model and keys [environments], and returns the model with a batch of values in the fields that
+        It takes a model and keys `rng` [environments], and returns the model with a batch of values in the fields that
         differ, and the axes to vmap over. Their `train` functions bind the keys themselves.
 
-        Raises:
-          ValueError: the table has an action delay, which is not part of a model.
-        """
-        for name, entry in self.parameters.items():
-            if entry.kind == "control":
-                raise ValueError(f"parameter '{name}': it is not part of the model, so no randomization_fn can draw it")
-        changed = {*DERIVED, *(field for entry in self.parameters.values() for field in entry.field_names)}
+        Args:
+          dist: the distribution.
+          leave_out: names of parameters that stay nominal.
 
-        def randomize(model: mjx.Model, keys: jax.Array) -> tuple[mjx.Model, mjx.Model]:
+        Raises:
+          ValueError: the table has an action delay that is not left out: it is not part of a model. Or it lacks a
+            name.
+        """
+        parameters.select(self.parameters, leave_out)
+        table = {name: entry for name, entry in self.parameters.items() if name not in leave_out}
+        for name, entry in table.items():
+            if entry.kind == "control":
+                raise ValueError(
+                    f"parameter '{name}': it is not part of the model, so no randomization_fn can draw it; expected it "
+                    f"in leave_out=('{name}',), or a training that draws it itself"
+                )
+        changed = {*DERIVED, *(field for entry in table.values() for field in entry.field_names)}
+
+        def randomize(model: mjx.Model, rng: jax.Array) -> tuple[mjx.Model, mjx.Model]:
             def fields(key):
-                drawn = jax.tree.map(lambda draw: draw[0], dists.sample(key, dist, 1))
-                robot = parameters.apply(model, parameters.from_coords(self.parameters, drawn), self.parameters)
+                drawn = {name: draws[0] for name, draws in dists.sample(key, dist, 1).items() if name in table}
+                robot = parameters.apply(model, parameters.from_coords(table, drawn), table)
                 return {name: _get(robot, name) for name in changed}
 
             axes = jax.tree.map(lambda _: None, model).tree_replace(dict.fromkeys(changed, 0))
-            return model.tree_replace(jax.vmap(fields)(keys)), axes
+            return model.tree_replace(jax.vmap(fields)(rng)), axes
 
         return randomize
 
@@ -280,17 +361,24 @@ def model_of(env: Any) -> mjx.Model:
     """Finds the model of an environment of MuJoCo Playground or of Brax's MJX backend.
 
     Raises:
-      ValueError: it has none where theirs have it.
+      ValueError: it has none where theirs have it, or is of another engine of Brax.
     """
-    for place in (env, getattr(env, "unwrapped", env)):
-        for name in ("mjx_model", "sys"):
-            model = getattr(place, name, None)
-            if isinstance(model, mjx.Model):
-                return model
+    for name in ("mjx_model", "sys"):
+        model = getattr(env, name, None)
+        if isinstance(model, mjx.Model):
+            # Brax's other engines have a model of the same type, and never read it.
+            if name == "sys" and getattr(env, "backend", "mjx") != "mjx":
+                raise ValueError(f"env: got an environment of Brax's backend '{env.backend}', expected 'mjx'")
+            return model
     raise ValueError(
         f"env: got {type(env).__name__}, which has no MJX model in 'mjx_model' (MuJoCo Playground) or 'sys' (Brax with "
         "backend='mjx'); hand over model= and with_model="
     )
+
+
+def _check_act(act: Any) -> None:
+    if not callable(act):
+        raise ValueError(f"act: got {type(act).__name__}, expected a function (policy, observation, key) -> action")
 
 
 def _raw(key: jax.Array) -> jax.Array:

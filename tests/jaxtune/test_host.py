@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import toys
 
-from jaxtune.host import HostTuner
+from jaxtune.host import HostTuner, one_by_one
 from jaxtune.rules import calibrated_gate, posterior_update
 from jaxtune.tuner import Tuner, TunerState, explain, keep, knobs
 from jaxtune.types import Trajectory, Verdict
@@ -70,6 +70,53 @@ def test_a_measured_set_of_another_length_is_refused(tuners):
         host.tune(jax.random.key(1), state(), measured)
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda set_: None, "measured: got NoneType, expected a jaxtune.types.Trajectory"),
+        (lambda set_: jax.tree.map(lambda leaf: leaf[:1], set_), r"measured, alive: got shape \(1, 60\), expected 2"),
+        (lambda set_: set_.replace(alive=set_.alive.astype(int)), "measured, alive: got int32, expected .* bool"),
+        (lambda set_: set_.replace(fell=[False, False]), "measured, fell: got list, expected an array of bool"),
+    ],
+    ids=["nothing", "too few", "numbers", "list"],
+)
+def test_a_measured_set_is_looked_at_before_anything_is_simulated(tuners, change, message):
+    _, host, seen = tuners
+    measured = SLIDER.measure(TWO, 2)(jax.random.key(0), toys.policy())
+    seen.clear()
+    with pytest.raises(ValueError, match=message):
+        host.tune(jax.random.key(1), state(), change(measured))
+    assert not seen
+
+
+def test_a_run_in_python_is_one_in_a_program(tuners):
+    measure = SLIDER.measure({"friction": 0.05, "mass": 0.0}, 2)
+    parts = {"config": toys.TINY, "measure": measure, "simulate": SLIDER.simulate}
+    trained = lambda key, policy, dist: (policy, {"steps": jnp.ones(())})  # noqa: E731
+    first = state()
+    expected, infos = jax.jit(Tuner(train_policy=trained, **parts).run, static_argnums=2)(jax.random.key(5), first, 2)
+    host = HostTuner(train_policy=trained, **parts)
+    moved, host_infos = host.run(jax.random.key(5), host.init(first.policy, first.dist, first.knobs), 2)
+    assert host_infos.calls.shape == (2,)
+    for got, wanted in zip(jax.tree.leaves((moved, host_infos)), jax.tree.leaves((expected, infos)), strict=True):
+        np.testing.assert_allclose(got, wanted, rtol=2e-3, atol=2e-3)
+
+
+def test_episodes_are_played_one_by_one():
+    seen = []
+
+    def play(seed, policy, coords):
+        seen.append((seed, policy, coords))
+        return episode(4 if coords["mass"] < 0 else 6)
+
+    coords = {"mass": np.array([-0.5, 0.5]), "drag": np.array([1.0, 2.0])}
+    episodes = one_by_one(play)(jax.random.key(0), "walk", coords)
+    assert [one[1:] for one in seen] == [("walk", {"mass": -0.5, "drag": 1.0}), ("walk", {"mass": 0.5, "drag": 2.0})]
+    assert seen[0][0] != seen[1][0]
+    np.testing.assert_array_equal(episodes.alive.sum(axis=1), [4, 6])
+    assert one_by_one(play, steps=9)(jax.random.key(0), "walk", coords).obs.shape == (2, 9, 2)
+
+
 # Episodes of a Gymnasium loop
 
 
@@ -109,6 +156,8 @@ def test_an_episode_is_masked_from_its_first_number_that_is_not_finite():
     episodes = Trajectory.from_episodes([broken, episode(5)])
     np.testing.assert_array_equal(episodes.alive.sum(axis=1), [2, 5])
     np.testing.assert_array_equal(episodes.not_finite, [True, False])
+    # As in a simulation that breaks.
+    np.testing.assert_array_equal(episodes.fell, [True, False])
     np.testing.assert_array_equal(episodes.score[0], [1.0, 2.0, 0.0, 0.0, 0.0])
 
 
@@ -128,6 +177,14 @@ def test_an_episode_is_masked_from_its_first_number_that_is_not_finite():
         ([episode(3, observation=[[1.0], [1.0, 2.0], [1.0]])], "episode 0, observation: expected one list of numbers"),
         ([episode(3, observation=[{"camera": 1.0}] * 3)], "episode 0, observation: expected one list of numbers"),
         ([episode(3), episode(3, action=[[0.0, 1.0]] * 3)], "episodes, action: got 2 widths"),
+        (episode(3), "episodes: got dict, expected a list of episodes"),
+        (None, "episodes: got NoneType, expected a list"),
+        ([episode(3), None], "episode 1: got NoneType, expected observation, action, reward, terminated by name"),
+        ([episode(0)], "episode 0, observation: got no step"),
+        ([episode(3, terminated="False")], "episode 0, terminated: got <U5"),
+        ([episode(3, terminated=None)], "episode 0, terminated: got object"),
+        ([episode(3, terminated=[])], r"terminated: got float64 of shape \(0,\)"),
+        ([episode(3, terminated=[False, True, False])], "True in none but the last"),
     ],
 )
 def test_episodes_that_do_not_fit_together_are_refused(episodes, message):

@@ -63,9 +63,37 @@ def test_names_of_another_hand(tmp_path):
 
 
 def test_faster_rows_are_taken_where_the_action_changes(tmp_path):
-    found = episodes(folder(tmp_path / "log", rows(100, per_tick=5), rate_hz=250), steps=19).trajectory
-    # The first tick is not seen to change.
-    np.testing.assert_allclose(found.obs[0, :, 0], 0.1 * np.arange(1, 20), rtol=1e-5)
+    found = episodes(folder(tmp_path / "log", rows(100, per_tick=5), rate_hz=250)).trajectory
+    np.testing.assert_allclose(found.obs[0, :, 0], 0.1 * np.arange(20), rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("per_tick", [1, 5])
+def test_an_action_at_its_limit_leaves_no_hole(tmp_path, per_tick):
+    columns = rows(60 * per_tick, per_tick=per_tick)
+    for name in ("action.a", "action.b"):
+        columns[name][20 * per_tick : 45 * per_tick] = 1.0
+    found = episodes(folder(tmp_path / "log", columns, rate_hz=50 * per_tick), steps=60)
+    np.testing.assert_array_equal(found.begin, [0])
+    assert found.trajectory.alive.all()
+    np.testing.assert_allclose(found.trajectory.obs[0, :, 0], 0.1 * np.arange(60), rtol=1e-5, atol=1e-6)
+
+
+def test_a_robot_at_rest_is_recorded_too(tmp_path):
+    columns = {name: values if name == "t" else np.ones_like(values) for name, values in rows(30).items()}
+    assert episodes(folder(tmp_path / "log", columns), steps=30).trajectory.alive.all()
+
+
+def test_a_walk_begins_where_the_motors_are_switched_on(tmp_path):
+    columns = rows(40) | {"enabled": ((np.arange(40) >= 10) & (np.arange(40) < 35)).astype(float)}
+    found = episodes(folder(tmp_path / "log", columns), steps=30).trajectory
+    np.testing.assert_allclose(found.obs[0, :25, 0], 0.1 * np.arange(10, 35), rtol=1e-5)
+    assert found.alive.sum() == 25
+    assert found.fell.all()
+
+
+def test_a_policy_of_another_rate_is_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"policy.rate_hz: got 100, expected 50, as simulated"):
+        episodes(folder(tmp_path / "log", rows(20), policy={"rate_hz": 100}))
 
 
 def test_a_robot_that_is_switched_off_fell(tmp_path):
@@ -117,6 +145,8 @@ def test_a_known_robots_log_may_have_observations_too(tmp_path):
             lambda c: [c.pop(f"obs.{i}") for i in range(3)],
             "column 'obs.0': is missing, which a log of what a policy did",
         ),
+        (lambda c: c.update({"obs.x": c["obs.0"]}), "column 'obs.x': expected obs.0, obs.1"),
+        (lambda c: c.update({"obs.00": c["obs.0"]}), "column 'obs.00': expected obs.0, obs.1"),
         (lambda c: c.pop("action.b"), "column 'action.b': is missing, although 'action.a' is there"),
         (lambda c: c.update({"obs.3": c["obs.0"]}), "run_000: got 4 components of 'obs', expected 3"),
         (lambda c: c["obs.2"].__setitem__(4, np.nan), "row 5, column 'obs.2': got nan, expected a finite number"),
@@ -127,7 +157,7 @@ def test_a_known_robots_log_may_have_observations_too(tmp_path):
         (lambda c: c.update(t=2 * c["t"]), "got 25 rows a second, expected the policy's 50"),
         (lambda c: c.update(enabled=np.zeros(20)), "run_000: got no step with the motors on"),
     ],
-    ids=["gap", "no obs", "half an action", "size", "nan", "another joint", "rate", "off"],
+    ids=["gap", "no obs", "letter", "two digits", "half an action", "size", "nan", "another joint", "rate", "off"],
 )
 def test_what_cannot_be_used_is_named(tmp_path, change, message):
     columns = rows(20)

@@ -4,7 +4,7 @@ import pytest
 from mujoco import mjx
 
 from envs.biteno import constants
-from jaxtune.mjx import action_delay, apply_mujoco, check, field, friction, mass, parameters_of, strength
+from jaxtune.mjx import Entry, action_delay, apply, apply_mujoco, check, field, friction, mass, parameters_of, strength
 from jaxtune.mjx.parameters import distribution, from_coords
 
 ARM = """
@@ -65,6 +65,21 @@ def test_strength_scales_every_torque_of_motors_and_servos(arm):
     )
 
 
+def test_strength_scales_the_limit_of_actuator_force_at_a_joint():
+    xml = ARM.replace('name="elbow"', 'name="elbow" actuatorfrcrange="-5 5"').replace(
+        'name="shoulder"', 'name="shoulder" actuatorfrcrange="-9 8"'
+    )
+    model = mujoco.MjModel.from_xml_string(xml)
+    row = strength("elbow", bounds=(0.4, 2.0))
+    for weak in (changed(model, row, 0.7), apply(mjx.put_model(model), {"it": 0.7}, {"it": row})):
+        np.testing.assert_allclose(weak.jnt_actfrcrange, [[-9.0, 8.0], [-3.5, 3.5]], rtol=1e-6)
+    # A torque that the joint cuts: 3 * 4 Nm at the elbow, of 0.7 * 5 that it lets through.
+    data = mujoco.MjData(changed(model, row, 0.7))
+    data.ctrl[1] = 4.0
+    mujoco.mj_forward(changed(model, row, 0.7), data)
+    np.testing.assert_allclose(data.qfrc_actuator[1], 3.5)
+
+
 def test_friction_reaches_geoms_and_contact_pairs(arm):
     model = changed(arm, friction(bounds=(0.3, 3.0)), 0.5)
     np.testing.assert_allclose(model.geom_friction[:, 0], 0.5 * arm.geom_friction[:, 0])
@@ -98,6 +113,26 @@ def test_a_field_may_be_multiplied_or_added_to_and_have_a_column(arm):
             "got 'dof_damping', expected fields of a body",
         ),
         (lambda: mass("upper", bounds=(-1.0, 2.0)), r"bounds: got \(-1.0, 2.0\), expected ascending ones, above zero"),
+        (lambda: mass("upper", bounds=(0.5, float("inf"))), r"bounds: got \(0.5, inf\), expected ascending ones"),
+        (lambda: mass("upper", bounds=0.5), "bounds: got 0.5, expected two numbers"),
+        (lambda: mass("upper", bounds=("a", "b")), r"bounds: got \('a', 'b'\), expected two numbers"),
+        (lambda: action_delay(bounds_s=(0.0, 0.1, 0.2)), "expected two numbers"),
+        (lambda: mass({"upper", "lower"}, bounds=(0.5, 2.0)), "targets: got {.*}, expected a name, several, or None"),
+        (lambda: mass(b"upper", bounds=(0.5, 2.0)), "targets: got b'upper', expected a name"),
+        (lambda: mass((), bounds=(0.5, 2.0)), r"targets: got \(\), expected a tuple of names"),
+        (
+            lambda: Entry(kind="link", targets=None, fields=("body_mass",), bounds=(0.5, 2.0)),
+            "kind: got 'link', expected one of body, geom, joint, actuator, control",
+        ),
+        (
+            lambda: Entry(kind="body", targets="upper", fields=("body_mass",), bounds=(0.5, 2.0)),
+            "targets: got 'upper', expected a tuple of names",
+        ),
+        (
+            lambda: field("body_invweight0", bodies="upper", bounds=(0.5, 2.0)),
+            "fields: got 'body_invweight0', which follows from masses",
+        ),
+        (lambda: field("geom_friction", geoms="tip", column=0.0, bounds=(0.5, 2.0)), "expected a name, or a name and"),
         (lambda: action_delay(bounds_s=(-0.01, 0.02)), r"bounds_s: got \(-0.01, 0.02\), expected no negative delay"),
     ],
 )
@@ -113,7 +148,17 @@ def test_a_row_that_makes_no_sense_is_refused(make, message):
             mass("forearm", bounds=(0.5, 2.0)),
             "parameter 'it', targets: got body 'forearm', .* some of world, upper, lower$",
         ),
-        (strength("wrist", bounds=(0.5, 2.0)), "targets: got actuator 'wrist', .* some of elbow_motor$"),
+        (
+            strength("wrist", bounds=(0.5, 2.0)),
+            "targets: got actuator 'wrist', .* some of elbow_motor, shoulder, elbow$",
+        ),
+        (strength(("elbow", "elbow_motor"), bounds=(0.5, 2.0)), "got elbow, elbow_motor, two of which are the same"),
+        (field("geom_condim", geoms="tip", bounds=(0.5, 2.0)), "got 'geom_condim', which holds int"),
+        (
+            field("body_mass", bodies="lower", bounds=(-5.0, 5.0), offset=True),
+            r"bounds: got \(-5.0, 5.0\), which makes body_mass negative; expected at least -",
+        ),
+        (Entry(kind="body", targets=("lower",), fields=(), bounds=(0.5, 2.0)), "fields: got none, expected at least"),
         (
             field("dof_stiffness", joints=None, bounds=(0.5, 2.0)),
             "fields: got 'dof_stiffness', which mjx.Model does not",

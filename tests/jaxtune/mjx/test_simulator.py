@@ -1,3 +1,4 @@
+import functools
 import warnings
 
 import jax
@@ -12,7 +13,7 @@ from sled import SUBSTEPS, TABLE, Keyed, Sled
 
 from jaxtune import dist as dists
 from jaxtune import tuner
-from jaxtune.mjx import Simulator, apply_mujoco, field, from_coords, mass
+from jaxtune.mjx import Simulator, action_delay, apply_mujoco, field, from_coords, mass
 
 STEPS = 60
 
@@ -156,15 +157,13 @@ def test_dictionary_observations_are_compared_by_key(observe, size):
 
 @pytest.mark.parametrize("observe", [None, "states", ("state", "torque")], ids=["none", "misspelt", "one of two"])
 def test_a_key_that_is_missing_is_named(observe):
-    sim = Simulator(Keyed(), steps=3, parameters=TABLE, observe=observe)
     with pytest.raises(ValueError, match=r"observe: got .* expected some of state, told"):
-        sim.rollout(jax.random.key(0), lambda policy, obs, key: obs["state"][:1], None, {"mass": jnp.ones(2)})
+        Simulator(Keyed(), steps=3, parameters=TABLE, observe=observe)
 
 
 def test_a_key_for_an_observation_without_keys_is_refused():
-    sim = Simulator(Sled(), steps=3, parameters=TABLE, observe="state")
     with pytest.raises(ValueError, match="observe: got 'state', but the environment's observation is one array"):
-        sim.rollout(jax.random.key(0), act, 3.0, {"mass": jnp.ones(2)})
+        Simulator(Sled(), steps=3, parameters=TABLE, observe="state")
 
 
 # What is refused before anything compiles
@@ -174,11 +173,63 @@ class NoTime(Sled):
     dt = property()
 
 
+class Elsewhere(Sled):
+    """Simulates a model that nobody finds."""
+
+    def __init__(self):
+        super().__init__()
+        self._own = self.__dict__.pop("_mjx_model")
+
+    @property
+    def mjx_model(self):
+        return self._own
+
+    def step(self, state, action):
+        sled = Sled()
+        sled._mjx_model = self._own
+        return sled.step(state, action)
+
+
+class Wrapped(Sled):
+    """A wrapper, as Playground's and Brax's are."""
+
+    @property
+    def unwrapped(self):
+        return Sled()
+
+
+class Several(Sled):
+    def reset(self, key):
+        return jax.vmap(super().reset)(jax.random.split(key, 4))
+
+
+class Silent(Sled):
+    def reset(self, key):
+        return {"obs": jnp.zeros(2)}
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         ({"steps": 0}, "steps: got 0, expected at least 1"),
+        ({"steps": 60.5}, "steps: got 60.5, expected at least 1, a whole number"),
+        ({"steps": "60"}, "steps: got '60'"),
         ({"parameters": {}}, "parameters: got none"),
+        ({"parameters": [TABLE["mass"]]}, "parameters: got list, expected rows"),
+        ({"parameters": {"mass": (0.5, 2.0)}}, "parameter 'mass': got tuple, expected a row"),
+        ({"parameters": {1: TABLE["mass"]}}, "parameters: got dict, expected rows .* by name"),
+        (
+            {"parameters": {"late": action_delay(bounds_s=(0.0, 30.0))}},
+            r"parameter 'late', bounds: got \(0.0, 30.0\) s, expected less than an episode, 1.2 s",
+        ),
+        ({"observe": 3}, "observe: got 3, expected a key, keys, or a function"),
+        ({"observe": ["state", 3]}, "observe: got .'state', 3., expected a key, keys"),
+        ({"with_model": None}, "with_model: got None, expected a function"),
+        ({"model": Sled().mj_model}, "model: got MjModel, expected mjx.Model"),
+        ({"env": Elsewhere()}, "with_model: got none, and the default does not reach the model of Elsewhere"),
+        ({"env": Wrapped()}, "env: got Wrapped around Sled, expected an environment without wrappers"),
+        ({"env": Several()}, r"observations of shape \(4, 3\), .*, expected those of one robot"),
+        ({"env": Silent()}, "env: got a reset that returns dict without 'obs'"),
         ({"parameters": {"m": mass("sledge", bounds=(0.5, 2.0))}}, "parameter 'm', targets: got body 'sledge'"),
         ({"parameters": {**TABLE, "more": TABLE["delay"]}}, "got delay and more, expected one action_delay at most"),
         ({"env": object()}, "env: got object, which has no MJX model in 'mjx_model'"),
@@ -188,6 +239,63 @@ class NoTime(Sled):
 def test_a_simulator_that_cannot_be_is_refused(arguments, message):
     with pytest.raises(ValueError, match=message):
         Simulator(**{"env": Sled(), "steps": STEPS, "parameters": TABLE, **arguments})
+
+
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [
+        (lambda obs: obs[:2], r"act: got shape \(2,\), expected an action of shape \(1,\)"),
+        (lambda obs: obs[0], r"act: got shape \(\), expected an action of shape \(1,\)"),
+        (lambda obs: (obs[:1], {}), r"act: got a tuple, expected an action"),
+    ],
+    ids=["two", "scalar", "and extras"],
+)
+def test_an_action_of_another_size_is_refused(sim, action, message):
+    simulate = sim.simulate(lambda policy, obs, key: action(obs))
+    with pytest.raises(ValueError, match=message):
+        jax.eval_shape(simulate, jax.random.key(0), 3.0, {"mass": jnp.zeros(2)})
+
+
+def test_what_is_no_policy_or_no_episode_is_refused(sim):
+    with pytest.raises(ValueError, match="act: got float, expected a function"):
+        sim.simulate(3.0)
+    with pytest.raises(ValueError, match="act: got NoneType, expected a function"):
+        sim.measure(None, {}, 2)
+    for episodes in (0, 5.0):
+        with pytest.raises(ValueError, match=f"episodes: got {episodes}, expected a whole number"):
+            sim.measure(act, {}, episodes)
+    with pytest.raises(ValueError, match=r"parameter 'mass': got heavy, expected 0.5 to 2"):
+        sim.measure(act, {"mass": "heavy"}, 2)
+
+
+def test_a_distribution_that_cannot_be_is_refused(sim):
+    for radius in (0.0, -1.0, float("nan"), float("inf"), "0.2"):
+        with pytest.raises(ValueError, match=r"radius: got .*, expected a positive number"):
+            sim.dist(radius)
+    # A radius never exceeds the width of the bounds: log 4 = 1.386, and 2 for what is added.
+    assert sim.dist(10.0).radius["mass"] == pytest.approx(1.386, abs=1e-3)
+    assert sim.dist(10.0).radius["delay"] == 2.0
+    other = Simulator(Sled(), steps=STEPS, parameters={"load": mass("sled", bounds=(1.2, 2.0))})
+    with pytest.raises(ValueError, match=r"parameter 'load': got 1.0, expected 1.2 to 2"):
+        other.dist()
+    with pytest.raises(ValueError, match="parameters: got 'load', expected some of mass, damping, strength, delay"):
+        sim.physical(other.dist(centre={"load": 1.5}))
+
+
+def test_another_model_of_the_users_own(sim):
+    """An environment of another make is simulated by a function that gives it a model."""
+
+    def put(env, model):
+        env = Elsewhere()
+        env._own = model
+        return env
+
+    own = Simulator(Elsewhere(), steps=STEPS, parameters=TABLE, with_model=put)
+    params = {"mass": jnp.array([0.6, 1.5]), "damping": jnp.array([2.0, 0.5])}
+    episodes = own.rollout(jax.random.key(7), act, 3.0, params)
+    expected = sim.rollout(jax.random.key(7), act, 3.0, params)
+    np.testing.assert_allclose(episodes.obs, expected.obs, rtol=1e-5, atol=1e-6)
+    assert np.abs(episodes.obs[0] - episodes.obs[1]).max() > 0.1
 
 
 def test_a_hidden_parameter_out_of_bounds_is_refused(sim):
@@ -232,7 +340,8 @@ def test_brax_randomises_with_draws_of_the_distribution(pendulum):
     dist = pendulum.dist(radius=0.5)
     keys = jax.random.split(jax.random.PRNGKey(1), count)
     randomize = pendulum.randomization_fn(dist)
-    wrapped = DomainRandomizationVmapWrapper(env, lambda system: randomize(system, keys))
+    # As the training functions of Brax and Playground bind them.
+    wrapped = DomainRandomizationVmapWrapper(env, functools.partial(randomize, rng=keys))
     state = jax.jit(wrapped.reset)(keys)
     state = jax.jit(wrapped.step)(state, jnp.ones((count, 1)))
 
@@ -263,5 +372,21 @@ def _row(batch, axes, row):
 
 
 def test_a_delay_cannot_be_drawn_into_a_model(sim):
-    with pytest.raises(ValueError, match="parameter 'delay': it is not part of the model"):
+    with pytest.raises(ValueError, match=r"parameter 'delay': it is not part .*leave_out=\('delay',\)"):
         sim.randomization_fn(sim.dist())
+    with pytest.raises(ValueError, match="parameters: got 'late'"):
+        sim.randomization_fn(sim.dist(), leave_out=("late",))
+    model, axes = sim.randomization_fn(sim.dist(), leave_out=("delay", "damping"))(
+        sim.model, jax.random.split(jax.random.PRNGKey(0), 3)
+    )
+    assert np.ptp(model.body_mass[:, 1]) > 0.05
+    assert (axes.body_mass, axes.dof_damping) == (0, None)
+
+
+@pytest.mark.parametrize("backend", ["generalized", "positional", "spring"])
+def test_brax_engines_that_ignore_the_model_are_refused(backend):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        env = envs.get_environment("inverted_pendulum", backend=backend)
+    with pytest.raises(ValueError, match=f"env: got an environment of Brax's backend '{backend}', expected 'mjx'"):
+        Simulator(env, steps=5, parameters=PENDULUM)
