@@ -27,6 +27,7 @@ from envs.rig import Rig
 from experiments.common import checkpoint
 from experiments.common.cli import console, run
 from experiments.common.config import preset
+from experiments.walking import foreign
 from experiments.walking.learner import Learner
 from experiments.walking.policies import starting_policy
 from experiments.walking.robots import BITENO
@@ -48,11 +49,12 @@ _HEADINGS = {"rings": "rejects"}  # of the table; the key in JSON stays
 class Args:
     """Measures one thing, prints it as a table and writes it as JSON."""
 
-    what: tyro.conf.Positional[Literal["speed", "targets", "rig", "logs", "alarm"]]
+    what: tyro.conf.Positional[Literal["speed", "targets", "rig", "logs", "alarm", "tuner"]]
     """speed: training steps per second, with exact and fast physics. targets: simulation steps per second of every
     engine that is installed. rig: simulation steps per second of suspended robots, with the step of MJX and with that
     of discovery. logs: seconds to read ten minutes of 40 columns at 1 kHz. alarm: how often the gate
-    rejects in its first call, over many seeds."""
+    rejects in its first call, over many seeds. tuner: seconds to compile and to run a tuning, and four runs side by
+    side, of the CheetahRun of MuJoCo Playground."""
     out: Path = Path("runs/bench")
     """Folder of the results, a JSON file for each measurement."""
     preset: str = "cpu"
@@ -241,13 +243,56 @@ def alarm(args: Args) -> dict:
     }
 
 
+def tuner_programs(args: Args) -> dict:
+    """Measures compiling and running of `Tuner.tune`, and of `Tuner.run` vmapped over four seeds.
+
+    The robot is `CheetahRun` with four parameters and a delay, and a policy that stays as it is. A tuning has the
+    preset's sizes, and the runs have those of a sweep. Nothing comes from the cache of compiled programs.
+
+    Returns:
+      By program: seconds to trace, compile and run it, gate calls and tunings that ran.
+    """
+    foreign.check("cheetah")
+    jax.config.update("jax_enable_compilation_cache", False)
+    sizes, sim = preset(args.preset), foreign.cheetah()
+    weights = 0.5 * np.random.default_rng(0).normal(size=(sim.action_size, sim.observation_size))
+    act = lambda policy, obs, key: jnp.tanh(policy @ obs)  # noqa: E731
+    truth = {"torso": 1.4, "damping": 0.75, "gear": 0.9, "friction": 1.2, "delay": 0.01}
+
+    def machine(config):
+        measure = sim.measure(act, truth, config.set_episodes)
+        return tuner.Tuner(config=config, train_policy=tuner.keep, simulate=sim.simulate(act), measure=measure)
+
+    one, several = machine(sizes.tuner), machine(sizes.sweep)
+    state = one.init(jnp.asarray(weights, jnp.float32), sim.dist(0.4), tuner.knobs())
+    measured = jax.jit(one.measure)(jax.random.key(1), state.policy)
+    runs = jax.vmap(lambda key: several.run(key, state, sizes.sweep_tunings))
+    programs = {
+        "tune": (jax.jit(one.tune), (jax.random.key(0), state, measured)),
+        "run, four seeds": (jax.jit(runs), (jax.random.split(jax.random.key(0), 4),)),
+    }
+    rows = {}
+    for name, (program, inputs) in programs.items():
+        moments = [time.monotonic()]
+        lowered = program.lower(*inputs)
+        moments.append(time.monotonic())
+        compiled = lowered.compile()
+        moments.append(time.monotonic())
+        _, info = jax.block_until_ready(compiled(*inputs))
+        moments.append(time.monotonic())
+        seconds = dict(zip(("trace_s", "compile_s", "run_s"), np.diff(moments).tolist(), strict=True))
+        rows[name] = {**seconds, "gate_calls": int(info.calls.sum()), "tunings": info.calls.size}
+    return rows
+
+
 def main(args: Args) -> None:
     """Measures one thing, prints a table, and writes it as JSON with the time and the memory that it took."""
     checkpoint.set_up_compiler(
         checkpoint.for_simulation(most=1) if args.what == "rig" else preset(args.preset).xla_flags
     )
     begin = time.monotonic()
-    rows = {"speed": speed, "targets": targets, "rig": rig, "logs": logs, "alarm": alarm}[args.what](args)
+    measures = {"speed": speed, "targets": targets, "rig": rig, "logs": logs, "alarm": alarm, "tuner": tuner_programs}
+    rows = measures[args.what](args)
     table = Table(title=args.what)
     for column in ("", *next(iter(rows.values()))):
         table.add_column(_HEADINGS.get(column, column))

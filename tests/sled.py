@@ -92,9 +92,43 @@ def keyed():
     return Simulator(Keyed(), steps=60, parameters=TABLE, observe=("state", "told"))
 
 
-def without_keys():
-    """Dictionary observations, of which nobody says what is compared."""
+def with_a_state():
+    """Dictionary observations, of which `state` is what a policy is given, as in Playground."""
     return Keyed()
+
+
+class Unnamed(Sled):
+    """Dictionary observations, of which nobody knows which are compared."""
+
+    def _state(self, data, action):
+        plain = super()._state(data, action)
+        return State(data=data, obs={"seen": plain.obs[:2], "told": action}, reward=plain.reward, done=plain.done)
+
+
+def without_keys():
+    """The same without a word on what is compared."""
+    return Unnamed()
+
+
+def of_steps(steps):
+    """A function that needs to be told something."""
+    return Simulator(Sled(), steps=steps, parameters=TABLE)
+
+
+def short():
+    """Episodes shorter than a window of the tuner."""
+    return of_steps(30)
+
+
+class Timeless(Sled):
+    """An environment that does not say how long its steps take."""
+
+    dt = property()
+
+
+def timeless():
+    """The same without its control period."""
+    return Timeless()
 
 
 def nothing():

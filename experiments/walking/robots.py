@@ -102,6 +102,8 @@ def kind(name: str) -> Kind:
     if colon and place == "playground":
         return _foreign(name, _playground(what))
     if colon and place.endswith(".py"):
+        if not Path(place).is_file():
+            raise ValueError(f"robot: {place} does not exist")
         return _foreign(name, _from_file(Path(place).resolve(), what))
     raise ValueError(
         f"robot: got '{name}', expected {', '.join(_SHIPPED)}, playground:NAME or path/to/file.py:function"
@@ -174,8 +176,6 @@ def _playground(name: str) -> Any:
 
 @cache
 def _from_file(path: Path, function: str) -> Any:
-    if not path.is_file():
-        raise ValueError(f"robot: {path} does not exist")
     # As for a script: its folder is searched for what it imports, and its classes find their module by name. The name
     # is its own, or `brax.py` would stand in the place of Brax.
     sys.path.append(str(path.parent))

@@ -8,11 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from sled import TABLE
 
 from envs import logs
 from experiments import export, robot_stub, sim2real, sim2sim, sweep, train
 from experiments.common.config import PRESETS
 from experiments.robot.rounds import Terms
+from experiments.robot.surrogate import Body
 from experiments.walking.learner import Learner
 from experiments.walking.policies import default_policy, starting_policy
 from experiments.walking.robots import kind
@@ -29,7 +31,9 @@ ROBOT = f"{FILE}:simulator"
         ("no/file.py:make", "robot: no/file.py does not exist"),
         (f"{FILE}:sledge", "has no function 'sledge'"),
         (f"{FILE}:nothing", "robot '.*:nothing': env: got NoneType, which has no MJX model"),
-        (f"{FILE}:without_keys", r"robot '.*:without_keys': observe: got None, expected some of state, told"),
+        (f"{FILE}:without_keys", r"robot '.*:without_keys': observe: got None, expected some of seen, told"),
+        (f"{FILE}:timeless", "robot '.*:timeless': env: has no dt, the control period in seconds"),
+        (f"{FILE}:of_steps", r"got of_steps\(steps\), expected a function of no arguments"),
         ("biteno:fast", "robot: got 'biteno:fast'"),
     ],
 )
@@ -42,6 +46,37 @@ def test_a_playground_that_is_missing_is_named(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "mujoco_playground", None)
     with pytest.raises(ValueError, match="MuJoCo Playground is not installed; expected `pip install playground`"):
         kind("playground:CheetahRun")
+
+
+def test_environments_of_playground_are_taken_by_name():
+    pytest.importorskip("mujoco_playground", reason="needs the extra playground")
+    assert {"torso_mass", "strength", "damping", "delay"} < kind("playground:CheetahRun").entries.keys()
+    with pytest.raises(ValueError, match=r"robot: got 'playground:CheetahWalk', expected one of .*CheetahRun"):
+        kind("playground:CheetahWalk")
+
+
+def test_a_file_may_have_the_name_of_a_package(tmp_path):
+    file = tmp_path / "brax.py"
+    file.write_text("from brax import envs\nfrom sled import simulator\n")
+    assert list(kind(f"{file}:simulator").entries) == list(kind(ROBOT).entries)
+
+
+def test_of_a_dictionary_the_state_is_compared():
+    assert kind(f"{FILE}:with_a_state").make(PRESETS["smoke"], TABLE, None).layout == {"state": 2}
+
+
+def test_episodes_shorter_than_a_window_are_refused_before_a_policy_is_trained():
+    robot = kind(f"{FILE}:short")
+    with pytest.raises(ValueError, match=r"robot '.*:short': got episodes of 30 steps, expected at least 50"):
+        Learner(PRESETS["smoke"], robot.chosen(None), kind=robot)
+
+
+def test_a_stand_in_takes_the_options_of_its_robot():
+    options = {"folder": Path("anywhere")}
+    with pytest.raises(ValueError, match="truth: got mass=2, but biteno has a body"):
+        robot_stub.stand_in(robot_stub.Args(truth=("mass=2",), **options))
+    with pytest.raises(ValueError, match=r"body: got .*, but .*simulator is its own simulation"):
+        robot_stub.stand_in(robot_stub.Args(robot=ROBOT, body=Body(trunk_mass=2.0), **options))
 
 
 def test_a_simulator_brings_its_table_and_an_environment_is_proposed_one():
@@ -121,7 +156,7 @@ def test_what_is_exported_acts_as_what_was_trained(trained, tmp_path):
     learner = Learner(PRESETS["smoke"], robot.chosen(None), kind=robot)
     act = learner.act(starting_policy(str(trained), learner))
     for obs in np.random.default_rng(0).normal(size=(5, 3)).astype(np.float32):
-        np.testing.assert_allclose(network(obs), act(obs, jax.random.PRNGKey(0)), atol=1e-5)
+        np.testing.assert_allclose(network(obs), act(obs, jax.random.PRNGKey(0)), rtol=1e-6, atol=1e-5)
     with pytest.raises(ValueError, match="obs: got a number that is not finite"):
         network(np.array([0.0, np.nan, 0.0]))
 
@@ -185,6 +220,10 @@ def test_a_go2_goes_through_every_step(tmp_path):
     tuned = {"parameters": "base_mass,calf_mass,strength", "truth": ("base_mass=1.3",), "methods": ("ours",)}
     sim2sim.main(sim2sim.Args(**common, **tuned, out=tmp_path / "tuned"))
     assert json.loads((tmp_path / "tuned" / "summary.json").read_text())["off"] == ["base_mass"]
+    lanes = {"step_sizes": (0.5,), "widen_factors": (1.5,), "radii": (0.2,), "levels": (0.9,), "seeds": 1}
+    of_sweep = {name: value for name, value in tuned.items() if name != "methods"}
+    sweep.main(sweep.Args(**common, **of_sweep, **lanes, out=tmp_path / "swept"))
+    assert (tmp_path / "swept" / "heat_map.png").exists()
     export.main(export.Args(**common, out=tmp_path / "exported"))
     assert Network(tmp_path / "exported" / "policy.npz")(np.zeros(45)).shape == (12,)
     terms = Terms(walk_s=1.6, force=True, timeout_s=0.0)
