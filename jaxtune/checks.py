@@ -1,5 +1,6 @@
 """Checks of the episodes that a user's functions return: by shape, so they run before anything is compiled."""
 
+import jax
 import numpy as np
 
 from jaxtune.rules import TunerConfig
@@ -55,6 +56,20 @@ def check_measured(measured: Trajectory, simulated: Trajectory, config: TunerCon
         got, expected = np.shape(getattr(measured, field))[-1], np.shape(getattr(simulated, field))[-1]
         if got != expected:
             raise ValueError(f"measured, {field}: got {got} numbers a step, expected {expected}, as simulated")
+    _check_motion(simulated)
+
+
+def _check_motion(simulated: Trajectory) -> None:
+    """Checks that something is observed, where values are known: inside `jit` the gate finds it instead."""
+    obs = simulated.obs
+    if isinstance(obs, jax.core.Tracer | jax.ShapeDtypeStruct):
+        return
+    seen = np.asarray(obs)[np.asarray(simulated.alive)]
+    if len(seen) and (seen == seen[0]).all():
+        raise ValueError(
+            f"simulate, obs: got {seen.shape[-1]} numbers that are the same in every step of every episode, expected "
+            "some that show how the robot moves"
+        )
 
 
 def _check_shapes(source: str, trajectory: Trajectory, episodes: int, why: str) -> int:

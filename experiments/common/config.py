@@ -11,7 +11,7 @@ from pathlib import Path
 
 from envs.biteno import TaskConfig
 from jaxtune.dvm import DVMConfig
-from jaxtune.mjx import Entry, select
+from jaxtune.mjx import Entry
 from jaxtune.ppo import PPOConfig
 from jaxtune.spm import SPMConfig
 from jaxtune.tuner import TunerConfig
@@ -155,8 +155,9 @@ def named_values(option: str, items: Sequence[str], entries: Mapping[str, Entry]
             found[name] = float(value)
         except ValueError:
             raise ValueError(f"{option}: got '{item}', expected name=value") from None
-        (entry,) = select(entries, [name]).values()
-        low, high = entry.bounds
+        if name not in entries:
+            raise ValueError(f"{option}: got '{name}', expected some of {', '.join(entries)}")
+        low, high = entries[name].bounds
         if not low <= found[name] <= high:
             raise ValueError(f"{option}: got '{item}', expected {low:g} to {high:g}")
     return found

@@ -185,7 +185,8 @@ class Simulator:
         def simulate(key: jax.Array, policy: Any, coords: Coords) -> Trajectory:
             return self.rollout(key, act, policy, parameters.from_coords(self.parameters, coords))
 
-        return simulate
+        # A tuner traces it several times, and the trace of an environment takes seconds.
+        return jax.jit(simulate)
 
     def measure(self, act: Act, params: Params, episodes: int) -> Callable[[jax.Array, Any], Trajectory]:
         """Makes a `measure` that stands in for a robot: the same environment with parameters that are hidden.
@@ -208,7 +209,7 @@ class Simulator:
         def measure(key: jax.Array, policy: Any) -> Trajectory:
             return self.rollout(key, act, policy, {name: jnp.full(episodes, value) for name, value in truth.items()})
 
-        return measure
+        return jax.jit(measure)
 
     def rollout(self, key: jax.Array, act: Act, policy: Any, params: Params) -> Trajectory:
         """Simulates one episode for every draw of the parameters, [draws] physical values by name.

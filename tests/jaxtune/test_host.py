@@ -89,6 +89,16 @@ def test_a_measured_set_is_looked_at_before_anything_is_simulated(tuners, change
     assert not seen
 
 
+def test_observations_that_never_change_are_named():
+    def simulate(key, policy, coords):
+        episodes = SLIDER.simulate(key, policy, coords)
+        return episodes.replace(obs=jnp.ones_like(episodes.obs))
+
+    measured = SLIDER.measure(TWO, 2)(jax.random.key(0), toys.policy())
+    with pytest.raises(ValueError, match="simulate, obs: got 2 numbers that are the same in every step"):
+        HostTuner(config=toys.TINY, simulate=simulate).tune(jax.random.key(1), state(), measured)
+
+
 def test_a_run_in_python_is_one_in_a_program(tuners):
     measure = SLIDER.measure({"friction": 0.05, "mass": 0.0}, 2)
     parts = {"config": toys.TINY, "measure": measure, "simulate": SLIDER.simulate}

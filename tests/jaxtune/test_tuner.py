@@ -430,12 +430,13 @@ def test_a_living_step_that_is_not_finite_leaves_no_score(gate):
     assert np.isfinite(score.novelty[1:]).all()
 
 
-def test_observations_that_never_change_leave_no_score():
+@pytest.mark.parametrize("value", [0.3, 1e4])
+def test_observations_that_never_change_leave_no_score(value):
     dist = toys.uniform(TWO, 0.2)
     collected = toys.collect(jax.random.key(0), dist, toys.TINY)
 
     def blind(episodes):
-        return episodes.replace(obs=jnp.full_like(episodes.obs, 0.3))
+        return episodes.replace(obs=jnp.full_like(episodes.obs, value))
 
     collected = collected.replace(trajectory=blind(collected.trajectory), held_out=blind(collected.held_out))
     measured = blind(SLIDER.measure(TWO, 2)(jax.random.key(1), toys.policy()))
