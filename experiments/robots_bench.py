@@ -4,7 +4,6 @@ Each robot is tuned to itself with hidden parameters, a few tunings long, with a
 parameters are drawn per seed without regard to the first box, so that some lie outside it.
 """
 
-import json
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -15,7 +14,7 @@ import numpy as np
 from rich.table import Table
 
 from experiments.common import checkpoint, plots
-from experiments.common.checkpoint import write_json
+from experiments.common.checkpoint import read_json, write_json
 from experiments.common.cli import console, run
 from experiments.common.config import preset
 from experiments.walking import foreign
@@ -191,7 +190,7 @@ def main(args: Args) -> None:
                 policy = world.policy(place) if policy is None else policy
                 write_json(path, tuned(world, args, policy, seed))
                 console.print(f"{name}, seed {seed}: {path}", markup=False)
-            results.setdefault(name, []).append(json.loads(path.read_text()))
+            results.setdefault(name, []).append(read_json(path))
     summaries = {name: summary(each) for name, each in results.items()}
     write_json(args.out / "summary.json", {"args": args, "robots": summaries, "versions": checkpoint.versions()})
     plots.recovery(args.out / "errors.png", results)

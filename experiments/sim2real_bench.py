@@ -6,7 +6,6 @@ motor lag, noise, drift, another friction. Falls in the walks of the rounds are 
 policy is evaluated in further walks, from which nothing is learnt.
 """
 
-import json
 import subprocess
 import sys
 from contextlib import contextmanager
@@ -21,7 +20,7 @@ from envs import corrected, logs
 from envs.biteno import constants
 from envs.targets import recorded
 from experiments.common import checkpoint, plots
-from experiments.common.checkpoint import as_json, from_json, write_json
+from experiments.common.checkpoint import as_json, from_json, read_json, write_json
 from experiments.common.cli import console, run
 from experiments.common.config import preset
 from experiments.robot import policy_files
@@ -198,7 +197,7 @@ def evaluate(args: Args, programs: Programs, policy: Path) -> WalkMeans:
             wait(place, _ANSWER_S)
         steps = round(args.walk_s / constants.POLICY_DT_S)
         write_json(found, summarise_walks(*recorded.whole(recorded.episodes(logs.read(place / "log"), steps), steps)))
-    return from_json(WalkMeans, json.loads(found.read_text()))
+    return from_json(WalkMeans, read_json(found))
 
 
 def main(args: Args) -> None:

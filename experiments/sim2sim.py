@@ -14,11 +14,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import jax
-from rich.progress import Progress
+from rich.progress import Progress, TaskID
 
 from envs.targets.protocol import Target
 from experiments.common import checkpoint, plots, report
-from experiments.common.checkpoint import as_json, write_json
+from experiments.common.checkpoint import as_json, read_json, write_json, write_text
 from experiments.common.cli import bars, console, run
 from experiments.common.config import Preset, named_values, preset
 from experiments.walking import comparison
@@ -141,23 +141,30 @@ class Runner:
 
         Returns:
           `lines`, the metrics before the first tuning and after each, and `measured_episodes`, their total number.
+
+        Raises:
+          ValueError: another process runs this pair, or its result is damaged.
         """
         path = self._args.out / "results" / f"{name}_{seed}.json"
         tunings = self._learner.preset.tunings
         task = progress.add_task(f"{name} seed {seed}", total=tunings)
         if not path.exists():
-            path.parent.mkdir(exist_ok=True)
-            lines = []
-            for line in self._tunings(name, seed):
-                lines.append(line)
-                with (self._args.out / "metrics.jsonl").open("a") as log:
-                    log.write(json.dumps(line) + "\n")
-                note = f" return {line['return']:.1f} {' '.join(line.get('verdicts', ()))}"
-                progress.update(task, completed=line["tuning"], description=f"{name} seed {seed}{note}")
-            sets = self._contenders[name].sets * tunings
-            write_json(path, {"lines": lines, "measured_episodes": sets * self._learner.preset.tuner.set_episodes})
+            with checkpoint.lock(path):
+                lines = self._play_tunings(name, seed, progress, task)
+                sets = self._contenders[name].sets * tunings
+                write_json(path, {"lines": lines, "measured_episodes": sets * self._learner.preset.tuner.set_episodes})
         progress.update(task, completed=tunings)
-        return json.loads(path.read_text())
+        return read_json(path)
+
+    def _play_tunings(self, name: str, seed: int, progress: Progress, task: TaskID) -> list[dict]:
+        lines = []
+        for line in self._tunings(name, seed):
+            lines.append(line)
+            with (self._args.out / "metrics.jsonl").open("a") as log:
+                log.write(json.dumps(line) + "\n")
+            note = f" return {line['return']:.1f} {' '.join(line.get('verdicts', ()))}"
+            progress.update(task, completed=line["tuning"], description=f"{name} seed {seed}{note}")
+        return lines
 
     def _tunings(self, name: str, seed: int) -> Iterator[dict]:
         contender, step = self._contenders[name], self._steps[name]
@@ -221,7 +228,7 @@ def main(args: Args) -> None:
     write_json(args.out / "summary.json", summary | {"versions": checkpoint.versions()})
     # The file that grew line by line may also hold lines of a run that was interrupted and started again.
     lines = [line for runs in results.values() for result in runs for line in result["lines"]]
-    (args.out / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    write_text(args.out / "metrics.jsonl", "".join(json.dumps(line) + "\n" for line in lines))
     plots.sim2sim(args.out, results, off, sizes.epochs)
     comparison.show(console, summary, results)
 

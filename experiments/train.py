@@ -8,10 +8,10 @@ import jax
 from envs import corrected
 from experiments.common import checkpoint, plots
 from experiments.common.checkpoint import write_json
-from experiments.common.cli import bars, console, run
+from experiments.common.cli import console, run
 from experiments.common.config import preset
 from experiments.walking.learner import Learner
-from experiments.walking.policies import policy_config, walk
+from experiments.walking.policies import trained
 from experiments.walking.robots import kind
 
 
@@ -52,9 +52,7 @@ def main(args: Args) -> None:
     if updates < 1:
         raise ValueError(f"updates: got {updates}, expected 1 or more")
     learner = Learner(sizes, entries, correction=args.model and corrected.read(args.model), kind=robot)
-    with bars() as progress:
-        policy, curve = walk(jax.random.PRNGKey(args.seed), learner, updates, progress)
-    checkpoint.save(args.out, policy.learner, policy_config(learner))
+    _, curve = trained(jax.random.PRNGKey(args.seed), learner, updates, args.out)
     write_json(args.out / "curve.json", {"args": args, "curve": curve})
     plots.training(args.out / "curve.png", curve, robot.control_s, robot.shown)
     first, last = curve[0], curve[-1]

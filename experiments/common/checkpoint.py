@@ -1,26 +1,34 @@
 """Saving and loading: checkpoints, JSON, and the folder of a run with its config and versions.
 
 Every file is written whole or not at all: a run may be killed at any moment, and must be able to continue from its
-files.
+files. A draft is written, put on the disk (fsync), and renamed into place.
 """
 
+import contextlib
 import dataclasses
+import fcntl
+import hashlib
 import importlib.metadata
 import json
 import os
 import platform
+import secrets
+import shutil
 import subprocess
 import typing
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import orbax.checkpoint as ocp
 
 _PACKAGES = ("jaxtune", "jax", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "orbax-checkpoint", "numpy")
 
 _DRAFT = ".tmp"  # suffix of a file that is being written, or that a killed run left behind
+_LOCK = ".lock"  # suffix of a file whose lock says that a process works on a piece
 
 
 def set_up_compiler(xla_flags: str) -> None:
@@ -133,9 +141,65 @@ def write_json(path: Path, value: Any) -> None:
 
     A program that is killed in between leaves the old file, and a program that reads meanwhile never sees half of one.
     """
-    draft = path.with_suffix(f".{os.getpid()}{_DRAFT}")
-    draft.write_text(json.dumps(as_json(value), indent=1) + "\n")
-    draft.replace(path)
+    write_text(path, json.dumps(as_json(value), indent=1) + "\n")
+
+
+def write_text(path: Path, text: str) -> None:
+    """Writes a text file, whole or not at all, as `write_json` does."""
+    draft = path.with_suffix(f".{secrets.token_hex(4)}{_DRAFT}")
+    try:
+        with draft.open("w") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        draft.replace(path)
+    except OSError:
+        # A full disk: the draft is of no use, and takes the room that others need.
+        draft.unlink(missing_ok=True)
+        raise
+    _sync(path.parent)
+
+
+def read_json(path: Path) -> Any:
+    """Reads a JSON file of a run.
+
+    Raises:
+      ValueError: the file was emptied or damaged; names it.
+    """
+    try:
+        return json.loads(path.read_text())
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path}: is damaged ({error}); delete it, and the same command computes it again") from None
+
+
+def _sync(folder: Path) -> None:
+    """Puts the names in a folder on the disk: a renamed file may have its old name after a power cut otherwise."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+@contextlib.contextmanager
+def lock(path: Path) -> Iterator[None]:
+    """Keeps other processes from working on the same piece of a run while this one does.
+
+    The operating system drops the lock when its owner ends, however it ends. The empty lock file stays.
+
+    Args:
+      path: what is worked on: the lock file is beside it, with `.lock` behind its name.
+
+    Raises:
+      ValueError: another process works on it.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.with_name(f".{path.name}{_LOCK}").open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise ValueError(f"out: another process works on {path}; wait for it, or choose another folder") from None
+        yield
 
 
 def open_run(out: Path, config: Any) -> None:
@@ -149,31 +213,66 @@ def open_run(out: Path, config: Any) -> None:
         number of seeds.
 
     Raises:
-      ValueError: the folder holds a run of another config (names the first field that differs), or other files.
+      ValueError: the folder holds a run of another config (names the first field that differs), or other files, or
+        nothing can be written there.
     """
     wanted = as_json(config)
     path = out / "config.json"
-    if path.exists():
-        _same(f"out: {out} holds a run of another config", json.loads(path.read_text())["config"], wanted)
-    elif out.exists() and any(item.suffix != _DRAFT for item in out.iterdir()):
-        raise ValueError(f"out: {out} is not empty and holds no config.json; expected a new folder or an earlier run's")
-    out.mkdir(parents=True, exist_ok=True)
-    if not path.exists():
-        write_json(path, {"config": wanted, "versions": versions()})
+    check_writable(out)
+    with (out / _LOCK).open("w") as file:
+        # Of two runs that begin at once the second waits until the first has said what it is.
+        fcntl.flock(file, fcntl.LOCK_EX)
+        if path.exists():
+            _same(f"out: {out} holds a run of another config", read_json(path)["config"], wanted)
+        elif any(not item.name.endswith((_DRAFT, _LOCK)) for item in out.iterdir()):
+            raise ValueError(
+                f"out: {out} is not empty and holds no config.json; expected a new folder or an earlier run's"
+            )
+        else:
+            write_json(path, {"config": wanted, "versions": versions()})
 
 
-def save(path: Path, state: Any, config: Any) -> None:
+def check_writable(out: Path) -> None:
+    """Makes a folder, and checks that files can be written there, before hours are spent on what goes into them.
+
+    Raises:
+      ValueError: they cannot; says why.
+    """
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        draft = out / f".{secrets.token_hex(4)}{_DRAFT}"
+        draft.write_bytes(bytes(1024))
+        draft.unlink()
+    except OSError as error:
+        raise ValueError(f"out: got {out}, where nothing can be written: {error.strerror}") from None
+
+
+def save(path: Path, state: Any, config: Any, notes: Any = None) -> None:
     """Writes a pytree of arrays as an orbax checkpoint, together with the config that `load` will compare.
+
+    The state goes into a folder of its own, and `config.json` says which, with its checksum. So the checkpoint that was
+    there is whole until the new one is, and a process that is killed in between loses neither.
 
     Args:
       path: folder of the checkpoint.
       state: the pytree.
       config: settings without which the state means nothing, such as the network's sizes. `load` refuses the state if
         the program that loads it has other ones.
+      notes: what else belongs to the state, as JSON (`read_notes`).
     """
+    path.mkdir(parents=True, exist_ok=True)
+    numbers = [int(old.name.rpartition("_")[2]) for old in path.glob("state_*") if old.name[6:].isdecimal()]
+    new = path / f"state_{max(numbers, default=0) + 1}"
     with ocp.StandardCheckpointer() as checkpointer:
-        checkpointer.save(path.absolute() / "state", _with_numbers(state), force=True)
-    write_json(path / "config.json", {"config": as_json(config), "versions": versions()})
+        checkpointer.save(new.absolute(), _with_numbers(state))
+    for file in new.rglob("*"):
+        _sync(file)
+    _sync(path)
+    entry = {"config": as_json(config), "state": new.name, "sha256": _checksum(new), "versions": versions()}
+    write_json(path / "config.json", entry if notes is None else entry | {"notes": notes})
+    for old in path.glob("state*"):
+        if old != new:
+            shutil.rmtree(old)
 
 
 def load(path: Path, like: Any, config: Any) -> Any:
@@ -188,18 +287,49 @@ def load(path: Path, like: Any, config: Any) -> Any:
       The pytree, with arrays on JAX's default device.
 
     Raises:
-      ValueError: there is no checkpoint, or one of another config; names the first field that differs.
+      ValueError: there is no checkpoint, a damaged one, or one of another config; names the first field that differs.
     """
     stored = path / "config.json"
     if not stored.exists():
         raise ValueError(f"policy: {path} holds no config.json; expected a folder that experiments.train has written")
-    _same(f"policy: {path} was made with another config", json.loads(stored.read_text())["config"], as_json(config))
+    entry = read_json(stored)
+    _same(f"policy: {path} was made with another config", entry["config"], as_json(config))
+    place = path / str(entry.get("state"))
+    if not place.is_dir() or _checksum(place) != entry.get("sha256"):
+        raise ValueError(
+            f"policy: {path} is damaged, or of an older version: its checksum is not the one in its config.json"
+        )
     with ocp.StandardCheckpointer() as checkpointer:
         wanted = jax.tree.map(ocp.utils.to_shape_dtype_struct, _with_numbers(like))
-        state = checkpointer.restore(path.absolute() / "state", wanted)
+        state = checkpointer.restore(place.absolute(), wanted)
     # Orbax commits arrays to a device, and a step with committed input and uncommitted output would compile twice.
     found = iter(jax.tree.map(jnp.asarray, jax.device_get(jax.tree.leaves(state))))
     return jax.tree.map(lambda leaf: next(found) if jnp.size(leaf) else leaf, like)
+
+
+def read_notes(path: Path) -> Any:
+    """Returns the notes that a checkpoint was saved with."""
+    return read_json(path / "config.json")["notes"]
+
+
+def _checksum(folder: Path) -> str:
+    """Returns the SHA-256 of all files of a folder, with their names."""
+    found = hashlib.sha256()
+    for file in sorted(path for path in folder.rglob("*") if path.is_file()):
+        found.update(f"{file.relative_to(folder).as_posix()} {file.stat().st_size}\n".encode())
+        found.update(file.read_bytes())
+    return found.hexdigest()
+
+
+def check_finite(what: str, state: Any) -> None:
+    """Checks the numbers of a pytree, before it is saved or handed to a robot.
+
+    Raises:
+      ValueError: one is not finite; names its place in the pytree.
+    """
+    for where, leaf in jax.tree_util.tree_leaves_with_path(state):
+        if jnp.issubdtype(jnp.result_type(leaf), jnp.floating) and not np.isfinite(np.asarray(leaf)).all():
+            raise ValueError(f"{what}: got a number that is not finite in {jax.tree_util.keystr(where)}")
 
 
 def _with_numbers(state: Any) -> Any:

@@ -1,9 +1,11 @@
 """What every command shares: it reads arguments, prints, shows progress, and turns a user's error into one line."""
 
+import shlex
+import sys
 import threading
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NoReturn
 
 import tyro
 from rich.console import Console
@@ -14,6 +16,7 @@ console = Console()
 """Where commands print their results."""
 
 _errors = Console(stderr=True)
+_INTERRUPTED = 130  # exit code of a command that Ctrl-C ended, by the shell's convention
 _LINE_S = 60.0  # between two lines of progress where there is no terminal to draw bars on
 
 
@@ -21,18 +24,38 @@ def run(main: Callable[[Any], None], args_type: type) -> None:
     """Runs a command: parses the command line into its `Args` and calls its `main` with them.
 
     A `ValueError` means bad input, which the user can correct. It ends the process with exit code 2 and one line on
-    stderr that names the field, what was found and what was expected. Any other exception is a defect of the program
-    and keeps its traceback.
+    stderr that names the field, what was found and what was expected. So does an error of the system, such as a full
+    disk. Ctrl-C ends with the command that goes on. Any other exception is a defect of the program and keeps its
+    traceback.
 
     Raises:
-      SystemExit: with code 2, where `main` raised a `ValueError` or the command line cannot be parsed.
+      SystemExit: with code 2, where `main` raised a `ValueError` or an `OSError`, or the command line cannot be parsed;
+        with code 130 after Ctrl-C.
     """
     args = tyro.cli(args_type, description=args_type.__doc__)
     try:
         main(args)
     except ValueError as error:
-        _errors.print(f"[red]error:[/red] {escape(str(error))}", highlight=False, soft_wrap=True)
-        raise SystemExit(2) from error
+        _refuse(str(error), error)
+    except OSError as error:
+        # A full disk, a file that may not be read: the system's words, with the name of the file.
+        place = f"{error.filename}: " if error.filename else ""
+        _refuse(f"{place}{error.strerror or error}", error)
+    except KeyboardInterrupt as error:
+        command = shlex.join(["python", "-m", _module(), *sys.argv[1:]])
+        _errors.print(f"stopped; to go on: {command}", highlight=False, markup=False, soft_wrap=True)
+        raise SystemExit(_INTERRUPTED) from error
+
+
+def _refuse(message: str, error: Exception) -> NoReturn:
+    _errors.print(f"[red]error:[/red] {escape(message)}", highlight=False, soft_wrap=True)
+    raise SystemExit(2) from error
+
+
+def _module() -> str:
+    """Name of the module that `python -m` runs."""
+    spec = sys.modules["__main__"].__spec__
+    return spec.name if spec else sys.argv[0]
 
 
 def bars() -> Progress:

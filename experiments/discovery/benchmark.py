@@ -1,6 +1,5 @@
 """What all benchmarks of discovery have in common: answers by the procedure that users have, and their scores."""
 
-import json
 import time
 import traceback
 from collections.abc import Mapping, Sequence
@@ -8,7 +7,7 @@ from pathlib import Path
 from typing import Protocol
 
 from experiments.common import checkpoint, plots
-from experiments.common.checkpoint import write_json
+from experiments.common.checkpoint import read_json, write_json
 from experiments.discovery import gate
 from experiments.discovery.investigate import investigate
 from experiments.discovery.scores import page, score, tally
@@ -73,7 +72,7 @@ class Benchmark:
     def _answered(self, case: Case) -> dict | None:
         folder = self.out / "answers" / name_of(case)
         there = [path for name in ("summary.json", "failed.json") if (path := folder / name).exists()]
-        return json.loads(there[0].read_text()) if there else None
+        return read_json(there[0]) if there else None
 
     def scored(self) -> list[dict]:
         """Scores every case that is answered. No other function opens the truth.
@@ -85,7 +84,7 @@ class Benchmark:
         for case in self.cases:
             answer = self._answered(case)
             if answer is not None:
-                truth = json.loads(self.truth_path(case).read_text())
+                truth = read_json(self.truth_path(case))
                 rows.append(score(truth, answer) | {"case": name_of(case)})
         return rows
 

@@ -1,6 +1,5 @@
 """One discovery from a folder of logs to its files: the same for a user's log and for the cases of a benchmark."""
 
-import json
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,7 +8,7 @@ from pathlib import Path
 from envs import corrected
 from envs.logs import Log
 from experiments.common import checkpoint
-from experiments.common.checkpoint import write_json
+from experiments.common.checkpoint import read_json, write_json
 from experiments.discovery.setup import Question, build_question, read_logs
 from experiments.discovery.summary import details, free_runs, summarise
 from jaxtune.discovery import workflow
@@ -67,7 +66,7 @@ def investigate(
     out.mkdir(parents=True, exist_ok=True)
     result = workflow.discover(
         question.problem,
-        saved=json.loads(saved.read_text()) if saved.exists() else None,
+        saved=read_json(saved) if saved.exists() else None,
         save=lambda state: write_json(saved, state),
         say=say,
     )

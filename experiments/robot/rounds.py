@@ -16,7 +16,6 @@ Every step of a round writes a file, and a step whose file exists is skipped. No
 them are expected to end in a fall (`experiments.robot.fall_risk`).
 """
 
-import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -27,7 +26,7 @@ import jax.numpy as jnp
 
 from envs.targets import recorded
 from experiments.common import checkpoint, report
-from experiments.common.checkpoint import from_json, write_json
+from experiments.common.checkpoint import from_json, read_json, write_json
 from experiments.common.cli import console
 from experiments.robot import policy_files
 from experiments.robot.checks import check_meaning, check_runs
@@ -252,4 +251,4 @@ class Rounds:
 
 def _read(kind: type, path: Path):
     """Reads a record that `write_json` wrote."""
-    return from_json(kind, json.loads(path.read_text()))
+    return from_json(kind, read_json(path))

@@ -4,6 +4,7 @@ A policy on disk is a folder: PPO's state as an orbax checkpoint, and a `config.
 (`policy_config`). The one that ships is `experiments/policies/walk`.
 """
 
+import shutil
 import time
 from pathlib import Path
 
@@ -28,19 +29,28 @@ def policy_config(learner: Learner) -> dict:
     return {**learner.kind.config(learner.preset), "hidden": list(learner.preset.ppo.hidden)}
 
 
+_KEEP_S = 60.0  # between two checkpoints of a training
+
+
 def walk(
-    key: jax.Array, learner: Learner, updates: int, progress: Progress | None = None
+    key: jax.Array, learner: Learner, updates: int, progress: Progress | None = None, kept: Path | None = None
 ) -> tuple[Policy, list[dict[str, float]]]:
     """Trains a walking policy from scratch, on robots around the nominal parameters.
+
+    A training that was interrupted goes on from its last checkpoint, to the result that it would have had.
 
     Args:
       key: random key of everything.
       learner: robot and sizes; `preset.policy_radius` is how far its robots are from nominal.
       updates: PPO updates, rounded up to whole chunks of `preset.chunk`.
       progress: display of steps and reward; None shows nothing.
+      kept: folder of the checkpoints, one a minute; None keeps none.
 
     Returns:
       The policy, and a line of metrics (means over the chunk) for every chunk of updates.
+
+    Raises:
+      ValueError: the folder's checkpoint is damaged, or of a training with another config.
     """
     key_init, key_train = jax.random.split(key)
     policy = learner.init(key_init)
@@ -48,8 +58,19 @@ def walk(
     chunk = min(learner.preset.chunk, updates)
     train = jax.jit(lambda key, policy: learner.train(key, policy, dist, chunk))
     task = progress.add_task("training", total=updates * learner.preset.ppo.steps_per_update) if progress else None
-    curve, start = [], time.monotonic()
-    for index in range(-(-updates // chunk)):
+    curve = []
+    identity = {
+        **policy_config(learner),
+        "key": jax.random.key_data(key),
+        "parameters": list(learner.entries),
+        "chunk": chunk,
+        "preset": learner.preset,
+    }
+    if kept and (kept / "config.json").exists():
+        policy, curve = checkpoint.load(kept, policy, identity), checkpoint.read_notes(kept)
+    last = time.monotonic()
+    start = last - (curve[-1]["seconds"] if curve else 0.0)
+    for index in range(len(curve), -(-updates // chunk)):
         policy, metrics = train(jax.random.fold_in(key_train, index), policy)
         line = {name: float(jnp.mean(value)) for name, value in metrics.items()}
         steps = (index + 1) * chunk * learner.preset.ppo.steps_per_update
@@ -57,6 +78,35 @@ def walk(
         if progress:
             rate = line["reward"] / learner.kind.control_s
             progress.update(task, completed=steps, description=f"reward {rate:.2f} per second")
+        if kept and time.monotonic() - last >= _KEEP_S:
+            checkpoint.save(kept, policy, identity, curve)
+            last = time.monotonic()
+    return policy, curve
+
+
+def trained(key: jax.Array, learner: Learner, updates: int, out: Path) -> tuple[Policy, list[dict[str, float]]]:
+    """Trains a policy with `walk`, showing progress, and saves it with its curve; goes on where it was interrupted.
+
+    Args:
+      key: random key of everything.
+      learner: robot and sizes.
+      updates: PPO updates.
+      out: folder of the policy.
+
+    Returns:
+      As `walk`.
+
+    Raises:
+      ValueError: nothing can be written there, another process trains there, or the policy is not finite.
+    """
+    checkpoint.check_writable(out)
+    kept = out / "training"
+    with checkpoint.lock(kept), bars() as progress:
+        policy, curve = walk(key, learner, updates, progress, kept)
+        checkpoint.check_finite("policy", policy.learner)
+        checkpoint.save(out, policy.learner, policy_config(learner))
+        write_json(out / "curve.json", {"curve": curve})
+        shutil.rmtree(kept, ignore_errors=True)
     return policy, curve
 
 
@@ -90,10 +140,7 @@ def starting_policy(name: str, learner: Learner, out: Path | None = None) -> Pol
     if name == "scratch":
         place = out / "policy"
         if not (place / "config.json").exists():
-            with bars() as progress:
-                policy, curve = walk(jax.random.PRNGKey(0), learner, learner.preset.scratch_updates, progress)
-            checkpoint.save(place, policy.learner, policy_config(learner))
-            write_json(place / "curve.json", {"curve": curve})
+            trained(jax.random.PRNGKey(0), learner, learner.preset.scratch_updates, place)
     ppo = checkpoint.load(place, fresh.learner, policy_config(learner))
     # Disk holds networks, optimiser and statistics alone. Robots are reset, so they may have another model by now.
     return learner.init(jax.random.PRNGKey(0), ppo)
