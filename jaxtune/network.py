@@ -18,12 +18,18 @@ class Network:
 
     Args:
       path: of the `.npz` that was exported.
+
+    Raises:
+      ValueError: the file holds a number that is not finite.
     """
 
     def __init__(self, path: str | Path):
         with open(path, "rb") as file, np.load(file, allow_pickle=False) as stored:
             self.meta = json.loads(str(stored["meta"]))
             arrays = {name: stored[name] for name in stored.files if name != "meta"}
+        for name, values in arrays.items():
+            if not np.isfinite(values).all():
+                raise ValueError(f"{path}: {name}: got a number that is not finite")
         self._mean, self._std = arrays["mean"], arrays["std"]
         self._layers = [(arrays[f"kernel_{i}"], arrays[f"bias_{i}"]) for i in range(self.meta["layers"])]
 
@@ -31,7 +37,8 @@ class Network:
         """Returns the action [act] for an observation [obs], in the order of `meta["observation"]`.
 
         Raises:
-          ValueError: a component is not finite; names the part of the observation.
+          ValueError: a component is not finite, and names the part of the observation; or the action is not, for an
+            observation that is far too large.
         """
         if not np.isfinite(obs).all():
             names = [row["name"] for row in self.meta["observation"] for _ in range(row["size"])]
@@ -43,4 +50,8 @@ class Network:
             if number + 1 < len(self._layers):
                 # ELU. Without the minimum, the exponential would overflow in the branch that `where` discards.
                 value = np.where(value > 0, value, np.expm1(np.minimum(value, 0.0)))
+        if not np.isfinite(value).all():
+            raise ValueError(
+                f"action: got a number that is not finite, for observations of up to {np.abs(obs).max():g}"
+            )
         return value

@@ -13,6 +13,7 @@ from types import ModuleType
 import jax
 import numpy as np
 
+from experiments.common.checkpoint import check_finite
 from experiments.walking.learner import Learner
 from jaxtune import network
 from jaxtune.ppo import PPO, PPOState
@@ -42,10 +43,11 @@ def export(out: Path, ppo: PPOState, learner: Learner) -> None:
       learner: of the robot and the preset that it was trained with.
 
     Raises:
-      ValueError: the package `onnx` is not installed.
+      ValueError: the package `onnx` is not installed, or the policy holds a number that is not finite.
     """
     onnx = require_onnx()
     (mean, std), layers = jax.device_get(PPO.layers(ppo))
+    check_finite("policy", {"mean": mean, "std": std, "layers": layers})
     kind = learner.kind
     text = json.dumps(kind.meta(learner.preset, learner.robot) | {"layers": len(layers)})
     out.mkdir(parents=True, exist_ok=True)

@@ -22,6 +22,7 @@ from experiments.robot import policy_files
 from experiments.robot.surrogate import Body, Robot
 from experiments.walking.learner import Learner
 from experiments.walking.policies import starting_policy
+from jaxtune.network import Network
 
 
 @pytest.fixture(scope="module")
@@ -52,6 +53,27 @@ def played(walk):
     start = jax.vmap(lambda key: learner.robot.reset({}, key))(jax.random.split(jax.random.PRNGKey(0), 8))
     run = jax.jit(jax.vmap(lambda state: jax.lax.scan(step, state, jax.random.split(jax.random.PRNGKey(1), 10))[1]))
     return jax.device_get(run(start))
+
+
+def test_a_policy_that_is_not_finite_is_neither_exported_nor_played(walk, folder, tmp_path):
+    learner, policy = walk
+    broken = jax.tree.map(lambda leaf: leaf.at[..., 0].set(jnp.nan) if leaf.ndim == 2 else leaf, policy.learner)
+    with pytest.raises(ValueError, match=r"policy: got a number that is not finite in \['layers'\]\[0\]"):
+        policy_files.export(tmp_path / "policy", broken, learner)
+    assert not (tmp_path / "policy").exists()
+    with np.load(folder / "policy.npz", allow_pickle=False) as stored:
+        arrays = dict(stored)
+    arrays["bias_1"] = np.full_like(arrays["bias_1"], np.inf)
+    np.savez(tmp_path / "policy.npz", **arrays)
+    with pytest.raises(ValueError, match=r"policy.npz: bias_1: got a number that is not finite"):
+        Network(tmp_path / "policy.npz")
+
+
+@pytest.mark.filterwarnings("ignore:overflow:RuntimeWarning", "ignore:invalid:RuntimeWarning")
+def test_a_player_never_answers_what_is_not_finite(folder):
+    network = Network(folder / "policy.npz")
+    with pytest.raises(ValueError, match=r"action: got a number that is not finite, for observations of up to 1e\+308"):
+        network(np.full(40, 1e308))
 
 
 def test_onnxruntime_does_what_flax_does(walk, folder, played):

@@ -360,6 +360,35 @@ def test_errors_are_printed_as_they_are(monkeypatch, capsys):
     assert not printed.out
 
 
+@pytest.mark.parametrize(
+    ("error", "code", "line"),
+    [
+        (OSError(28, "No space left on device", "runs/summary.json"), 2, "error: runs/summary.json: No space left on"),
+        (PermissionError(13, "Permission denied", "runs"), 2, "error: runs: Permission denied"),
+        (KeyboardInterrupt(), 130, "stopped; to go on: python -m "),
+    ],
+)
+def test_errors_of_the_system_and_ctrl_c_are_one_line(monkeypatch, capsys, error, code, line):
+    @dataclass
+    class Seed:
+        """A command with an option."""
+
+        seed: int = 0
+
+    def main(args):
+        raise error
+
+    monkeypatch.setattr(sys, "argv", ["program", "--seed", "3"])
+    monkeypatch.setattr(cli, "_errors", Console(width=200, stderr=True))
+    with pytest.raises(SystemExit) as ended:
+        cli.run(main, Seed)
+    assert ended.value.code == code
+    printed = capsys.readouterr().err
+    assert printed.startswith(line)
+    assert printed.count("\n") == 1
+    assert code == 2 or printed.endswith(" --seed 3\n")
+
+
 def test_progress_is_a_line_a_minute_where_there_is_no_terminal(monkeypatch):
     output = io.StringIO()
     monkeypatch.setattr(cli, "console", Console(file=output, width=100))
