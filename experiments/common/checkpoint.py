@@ -294,11 +294,10 @@ def load(path: Path, like: Any, config: Any) -> Any:
         raise ValueError(f"policy: {path} holds no config.json; expected a folder that experiments.train has written")
     entry = read_json(stored)
     _same(f"policy: {path} was made with another config", entry["config"], as_json(config))
-    place = path / str(entry.get("state"))
-    if not place.is_dir() or _checksum(place) != entry.get("sha256"):
-        raise ValueError(
-            f"policy: {path} is damaged, or of an older version: its checksum is not the one in its config.json"
-        )
+    # Checkpoints of the first version have neither the name of their state nor its checksum.
+    place = path / entry.get("state", "state")
+    if not place.is_dir() or _checksum(place) != entry.get("sha256", _checksum(place)):
+        raise ValueError(f"policy: {path} is damaged: its checksum is not the one in its config.json")
     with ocp.StandardCheckpointer() as checkpointer:
         wanted = jax.tree.map(ocp.utils.to_shape_dtype_struct, _with_numbers(like))
         state = checkpointer.restore(place.absolute(), wanted)

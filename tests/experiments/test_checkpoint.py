@@ -107,7 +107,7 @@ def test_a_flipped_bit_anywhere_in_a_checkpoint_is_noticed(tmp_path):
     for path in files:
         content = path.read_bytes()
         path.write_bytes(bytes([content[0] ^ 4]) + content[1:])
-        with pytest.raises(ValueError, match="is damaged, or of an older version"):
+        with pytest.raises(ValueError, match="is damaged: its checksum"):
             checkpoint.load(tmp_path, state(0.0), CONFIG)
         path.write_bytes(content)
     assert checkpoint.load(tmp_path, state(0.0), CONFIG)["kernel"][0, 0] == 1.0
@@ -129,6 +129,13 @@ def test_a_number_that_is_not_finite_is_named():
     broken = {"layers": [state(1.0), state(1.0) | {"kernel": jnp.array([1.0, jnp.nan])}]}
     with pytest.raises(ValueError, match=r"policy: got a number that is not finite in \['layers'\]\[1\]\['kernel'\]"):
         checkpoint.check_finite("policy", broken)
+
+
+def test_a_checkpoint_of_the_first_version_is_read(tmp_path):
+    checkpoint.save(tmp_path, state(3.0), CONFIG)
+    (tmp_path / "state_1").rename(tmp_path / "state")
+    (tmp_path / "config.json").write_text(json.dumps({"config": CONFIG, "versions": {}}))
+    assert checkpoint.load(tmp_path, state(0.0), CONFIG)["kernel"][0, 0] == 3.0
 
 
 # Two processes, and folders
