@@ -4,6 +4,7 @@ A suspended robot has no free base and no contacts. Discovery works on it, becau
 measured and contact is chaotic.
 """
 
+import re
 from pathlib import Path
 
 import mujoco
@@ -11,6 +12,8 @@ import numpy as np
 
 from envs import go2, pendulum
 from envs.biteno import constants
+
+_OTHER_FILES = re.compile(r"<include\b|\bfile\s*=")
 
 BUILT_IN = {
     "biteno": (constants.MODEL_PATH, constants.JOINTS),
@@ -39,6 +42,25 @@ def spec(robot: str) -> mujoco.MjSpec:
         return without_files(mujoco.MjSpec.from_file(str(path)))
     except ValueError as error:
         raise ValueError(f"robot: {path}: {error}") from error
+
+
+def one_file(robot: str) -> str:
+    """Returns a robot as the text of one MJCF; as it was written, where it refers to no other file.
+
+    Args:
+      robot: path of the MJCF.
+
+    Raises:
+      ValueError: it cannot be read, or not without its meshes.
+    """
+    text = Path(robot).read_text(encoding="utf-8")
+    # A comment may speak of files.
+    if not _OTHER_FILES.search(re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL)):
+        return text
+    try:
+        return spec(robot).to_xml()
+    except ValueError as error:
+        raise ValueError(f"robot: {robot} without its meshes: {error}") from error
 
 
 def without_files(spec: mujoco.MjSpec) -> mujoco.MjSpec:

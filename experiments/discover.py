@@ -22,6 +22,9 @@ class Args:
     logs: tuple[Path, ...]
     """Folders of logs of one robot. A folder with the JSON files of the XL330 pendulum (github.com/Rhoban/bam) is read
     too."""
+    robot: Path | None = None
+    """MJCF of the robot, in the place of the logs' own models. It may be anywhere; a log's own must be in its
+    folder."""
     out: Path = Path("runs/discover")
     """Folder of the results. The same command with the same folder continues after the last accepted effect."""
     horizons: tuple[float, ...] | None = None
@@ -50,7 +53,7 @@ def main(args: Args) -> None:
     checkpoint.set_up_compiler(checkpoint.for_simulation())
     _check(args)
     # Says what is wrong with the logs before the folder is made and anything is compiled.
-    log, spec = read_logs(args.logs, args.clear_flags, args.swap_halves)
+    log, spec = read_logs(args.logs, args.clear_flags, args.swap_halves, args.robot)
     for note in gate.check(log, spec, args.horizons, trust=args.trust_log):
         console.print(f"note: {note}", highlight=False, markup=False, soft_wrap=True)
     identity = {name: value for name, value in vars(args).items() if name not in ("out", "trust_log")}
@@ -65,6 +68,7 @@ def main(args: Args) -> None:
             seed=args.seed,
             clear_flags=args.clear_flags,
             swap_halves=args.swap_halves,
+            robot=args.robot,
             say=lambda text: progress.update(task, description=text[:100]),
         )
     report.show(console, answer.question, answer.summary, answer.free)

@@ -11,7 +11,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from envs.diagnosis import diagnose_log, shared_findings
-from envs.logs import read, read_xl330
+from envs.logs import read_any
 from experiments.common import checkpoint, plots
 from experiments.common.cli import console, run
 
@@ -23,6 +23,8 @@ class Args:
 
     log: Path
     """Folder of the log, with its meta.yaml; or of the JSON files of the XL330 pendulum."""
+    robot: Path | None = None
+    """MJCF of the robot, in the place of the log's own model. It may be anywhere; a log's own must be in its folder."""
     out: Path | None = None
     """Folder of doctor.json and doctor.png; runs/doctor/NAME_OF_THE_LOG if not given."""
 
@@ -33,8 +35,7 @@ def main(args: Args) -> None:
     Raises:
       ValueError: the log is damaged and cannot be read.
     """
-    foreign = not (args.log / "meta.yaml").exists() and any(args.log.glob("*.json"))
-    log = read_xl330(args.log) if foreign else read(args.log)
+    log = read_any(args.log, args.robot)
     out = args.out or Path("runs/doctor") / args.log.resolve().name
     found = diagnose_log(log)
     said = shared_findings(found)

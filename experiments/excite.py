@@ -4,7 +4,6 @@ The result is a log without measurements. Play its targets on the robot, suspend
 columns; `experiments.discover` then reads the log. The motion is described in `experiments.discovery.excitation`.
 """
 
-import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,7 +15,8 @@ from envs.logs import Controller, Log, Run, read_any, write
 from experiments.common.cli import console, run
 from experiments.discovery.excitation import MOTIONS, excitation, scaled
 
-_OTHER_FILES = re.compile(r"<include\b|\bfile\s*=")
+_MOST = {"seconds": 3600.0, "rate_hz": 1e5, "kp": 1e6, "torque_limit_nm": 1e5, "control_hz": 1e5}
+"""Largest values of options: what a robot can be, and what fits into memory."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,9 +61,6 @@ def main(args: Args) -> None:
     _check(args)
     robot, joints, controller = _described(args) if args.like is None else _alike(args.like)
     spec = models.spec(robot)
-    built_in = robot in models.BUILT_IN
-    # Before anything is written, because it may fail.
-    model = None if built_in else _one_file(Path(robot), spec)
     runs = tuple(
         Run(
             name=one.name,
@@ -75,11 +72,7 @@ def main(args: Args) -> None:
         )
         for one in excitation(spec, joints, args.runs, args.seconds, args.rate_hz, args.seed, args.motion)
     )
-    name = robot if built_in else Path(robot).name
-    write(Log(robot=name, base="fixed", rate_hz=args.rate_hz, joints=joints, policy=None, runs=runs), args.out)
-    # The log names its model by a path relative to itself, so that the folder can be moved as a whole.
-    if model is not None:
-        (args.out / name).write_text(model, encoding="utf-8")
+    write(Log(robot=robot, base="fixed", rate_hz=args.rate_hz, joints=joints, policy=None, runs=runs), args.out)
     console.print(
         f"wrote {len(runs)} runs of {args.seconds:g} s for {', '.join(joints)} to {args.out}. Play each run's targets "
         "on the robot, and add the measured columns to its file or a copy of it: q.*, and dq.* if there is a sensor."
@@ -106,11 +99,11 @@ def _alike(folder: Path) -> tuple[str, tuple[str, ...], Controller]:
 
 def _check(args: Args) -> None:
     """Checks every number, before the model is read."""
-    for name in ("seconds", "rate_hz", "kp", "torque_limit_nm", "control_hz"):
-        if not 0 < getattr(args, name) < np.inf:
-            raise ValueError(f"{name}: got {getattr(args, name)}, expected a positive, finite number")
-    if not 0 <= args.kd < np.inf:
-        raise ValueError(f"kd: got {args.kd}, expected a finite number that is not negative")
+    for name, most in _MOST.items():
+        if not 0 < getattr(args, name) <= most:
+            raise ValueError(f"{name}: got {getattr(args, name)}, expected more than 0 and at most {most:g}")
+    if not 0 <= args.kd <= _MOST["kp"]:
+        raise ValueError(f"kd: got {args.kd}, expected 0 to {_MOST['kp']:g}")
     if args.seed < 0:
         raise ValueError(f"seed: got {args.seed}, expected a number that is not negative")
     if args.runs < 4:
@@ -119,19 +112,6 @@ def _check(args: Args) -> None:
         raise ValueError(f"motion: got '{args.motion}', expected one of {', '.join(MOTIONS)}")
     if args.out.exists() and any(args.out.iterdir()):
         raise ValueError(f"out: got {args.out}, expected a new or empty folder")
-
-
-def _one_file(path: Path, spec: mujoco.MjSpec) -> str:
-    """Returns a model as the text of one MJCF; as it was written, where it refers to no other file."""
-    text = path.read_text(encoding="utf-8")
-    # A comment may speak of files.
-    if not _OTHER_FILES.search(re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL)):
-        return text
-    try:
-        # Writing compiles, so a copy is written.
-        return spec.copy().to_xml()
-    except ValueError as error:
-        raise ValueError(f"robot: {path} without its meshes: {error}") from error
 
 
 if __name__ == "__main__":

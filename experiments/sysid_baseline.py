@@ -33,6 +33,8 @@ class Args:
 
     logs: tuple[Path, ...]
     """Folders of logs of one robot, as `discover` takes them."""
+    robot: Path | None = None
+    """MJCF of the robot, in the place of the logs' own models."""
     out: Path = Path("runs/sysid_baseline.json")
     """File of the results."""
     subsets: tuple[str, ...] = ("joints", "actuators", "sensing", "masses")
@@ -58,7 +60,7 @@ def main(args: Args) -> None:
     """
     sysid_parameters.package()
     _check(args)
-    log, spec = read_logs(args.logs)
+    log, spec = read_logs(args.logs, robot=args.robot)
     begin = time.perf_counter()
     bench = Bench(log, sysid_parameters.robot_of(spec, log))
     tried = _fit_all(args, bench)

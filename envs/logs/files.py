@@ -9,6 +9,7 @@ import numpy as np
 import yaml
 
 from envs.logs.bags import SUFFIXES, is_bag, read_bag
+from envs.logs.containment import check_inside
 from envs.logs.format import (
     FACTS,
     JOINT_SIGNALS,
@@ -24,18 +25,20 @@ from envs.logs.format import (
 )
 from envs.logs.meta import Meta
 from envs.logs.tables import READERS, WRITERS, check_time, check_values, refuse_first
-from envs.models import BUILT_IN
+from envs.models import BUILT_IN, one_file
 
 _UNIT_NORM = 0.05  # tolerance of the length of unit vectors
 _RATE_RATIO = 2.0  # largest ratio of nominal to recorded rate, or the reverse
 
 
-def read(folder: Path, measured: bool = True) -> Log:
+def read(folder: Path, measured: bool = True, model: Path | None = None) -> Log:
     """Reads a log and checks everything about it before anything is computed.
 
     Args:
       folder: with `meta.yaml` and the runs.
       measured: True for a measured log, which needs positions. False for targets that a robot is still to play.
+      model: path of an MJCF in the place of the log's own `robot`. A log's own model, and all that it refers to, must
+        be in its folder; this one may be anywhere.
 
     Returns:
       The log in the model's names, units and signs.
@@ -44,7 +47,7 @@ def read(folder: Path, measured: bool = True) -> Log:
       ValueError: names the file, the row (of data, from 1) or the key, what was found and what was expected.
     """
     folder = Path(folder)
-    meta = Meta(folder, {name: joints for name, (_, joints) in BUILT_IN.items()})
+    meta = Meta(folder, {name: joints for name, (_, joints) in BUILT_IN.items()}, model)
     return _read(folder, meta, "q" if measured else "target")
 
 
@@ -63,6 +66,7 @@ def read_observed(folder: Path) -> Log:
 def _read(folder: Path, meta: Meta, needed: str) -> Log:
     paths = sorted(folder.glob("run_*"))
     for path in paths:
+        check_inside(folder, path, "runs")
         if not (path.suffix in READERS and path.is_file()) and not is_bag(path):
             raise ValueError(
                 f"{path}: expected a file that ends in one of {', '.join((*READERS, *SUFFIXES))}, or a bag's folder"
@@ -89,7 +93,8 @@ def _read(folder: Path, meta: Meta, needed: str) -> Log:
 def write(log: Log, folder: Path, suffix: str = ".csv") -> None:
     """Writes a log in the model's names, units and signs, from which `read` returns the same log.
 
-    `meta.yaml` is written last, and in one step, so that another program which waits for it finds all runs complete.
+    `meta.yaml` is written last, and in one step, so that another program which waits for it finds all runs complete. A
+    robot that is the path of an MJCF is written too, as one file, so that the folder can be moved as a whole.
 
     Args:
       log: to write.
@@ -107,9 +112,12 @@ def write(log: Log, folder: Path, suffix: str = ".csv") -> None:
             raise ValueError(f"runs: got '{run.name}', expected a name that begins with 'run_'")
     if folder.exists() and any(folder.iterdir()):
         raise ValueError(f"{folder}: expected an empty folder")
+    model = None if log.robot in BUILT_IN or not Path(log.robot).is_file() else one_file(log.robot)
     folder.mkdir(parents=True, exist_ok=True)
+    if model is not None:
+        (folder / Path(log.robot).name).write_text(model, encoding="utf-8")
     meta = {
-        "robot": log.robot,
+        "robot": log.robot if model is None else Path(log.robot).name,
         "base": log.base,
         "rate_hz": log.rate_hz,
         "joints": list(log.joints),

@@ -13,6 +13,7 @@ import mujoco
 import numpy as np
 import yaml
 
+from envs.logs.containment import check_inside, check_model
 from envs.logs.controller import BETWEEN_ROWS, GAINS, OPTIONAL_GAINS, Controller
 from envs.logs.format import (
     FACTS,
@@ -26,6 +27,7 @@ from envs.logs.format import (
 )
 
 _ANGLE = {"rad": 1.0, "deg": np.pi / 180.0}  # factors to rad
+_FASTEST_HZ = 1e5  # of rows and controllers; what follows from a rate must fit into memory
 _LARGEST = 1e300  # YAML's integers may be too large for a float
 _TORQUE = {"Nm": 1.0, "mNm": 1e-3}  # factors to Nm
 _META = {
@@ -73,25 +75,29 @@ class Meta:
       folder: of the log.
       robots: joints that may be logged, by the name of the built-in robot; None for a log of observations and actions,
         whose robot may have any name, any joints and an unknown controller.
+      model: path of an MJCF that the user names in the place of the log's `robot`; it may be anywhere.
 
     Raises:
       ValueError: names the file and the key, what was found and what was expected.
     """
 
-    def __init__(self, folder: Path, robots: Mapping[str, Sequence[str]] | None):
+    def __init__(self, folder: Path, robots: Mapping[str, Sequence[str]] | None, model: Path | None = None):
         self.path = folder / "meta.yaml"
         if not self.path.is_file():
             raise ValueError(f"{self.path}: there is no such file")
+        check_inside(folder, self.path, "meta.yaml")
         try:
             meta = yaml.load(self.path.read_text(encoding="utf-8"), _Loader)
         except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
             raise ValueError(f"{self.path}: {error}") from error
         meta = self._mapping("", meta, _META if robots is not None else _META | {"base": False, "controller": False})
         self.robot, movable = self._text("robot", meta["robot"]), None
-        if robots is not None:
+        if model is not None:
+            self.robot, movable = self._read_model(model)
+        elif robots is not None:
             self.robot, movable = self._robot(folder, self.robot, robots)
         self.base = self._one_of("base", meta.get("base", "free"), ("fixed", "free"))
-        self.rate_hz = self._number("rate_hz", meta["rate_hz"])
+        self.rate_hz = self._rate("rate_hz", meta["rate_hz"])
         self.joints = self._names("joints", meta["joints"])
         for joint in self.joints:
             if movable is not None and joint not in movable:
@@ -119,10 +125,8 @@ class Meta:
         if meta.get("policy") is not None:
             self.policy = self._mapping("policy", meta["policy"], policy)
             for name, value in self.policy.items():
-                if name == "base":
-                    self._text("policy.base", value)
-                else:
-                    self._number(f"policy.{name}", value)
+                check = {"base": self._text, "rate_hz": self._rate}.get(name, self._number)
+                check(f"policy.{name}", value)
         # Kept as written, because a run may override single numbers of it.
         self._controller = meta.get("controller")
         self.controller = self._controller and self._read_controller("controller", self._controller)
@@ -176,7 +180,7 @@ class Meta:
         between = entry.get("target_between_rows", "unknown")
         return Controller(
             kind=kind,
-            rate_hz=self._number(f"{where}.rate_hz", entry["rate_hz"]),
+            rate_hz=self._rate(f"{where}.rate_hz", entry["rate_hz"]),
             gains={name: self._gain(f"{where}.{name}", entry.get(name, np.inf), name) for name in there},
             between_rows=self._one_of(f"{where}.target_between_rows", between, BETWEEN_ROWS),
         )
@@ -196,6 +200,12 @@ class Meta:
         path = folder / name
         if not path.is_file():
             self._refuse("robot", name, f"{', '.join(robots)}, or the path of an MJCF file, relative to {folder}")
+        check_model(folder, path, f"{self.path}: robot")
+        return self._read_model(path)
+
+    def _read_model(self, path: Path) -> tuple[str, Sequence[str]]:
+        if not path.is_file():
+            raise ValueError(f"robot: got {path}, expected an MJCF file")
         try:
             model = mujoco.MjModel.from_xml_path(str(path))
         except ValueError as error:
@@ -246,6 +256,12 @@ class Meta:
             wanted = "a number" if negative else "a number that is not negative" if zero else "a positive number"
             self._refuse(where, value, wanted)
         return float(value)
+
+    def _rate(self, where: str, value: Any) -> float:
+        rate = self._number(where, value)
+        if rate > _FASTEST_HZ:
+            self._refuse(where, value, f"at most {_FASTEST_HZ:g}")
+        return rate
 
     def _one_of(self, where: str, value: Any, allowed) -> Any:
         if isinstance(value, bool) or not isinstance(value, str | int) or value not in allowed:

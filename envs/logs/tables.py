@@ -12,6 +12,8 @@ import pyarrow
 import pyarrow.csv
 import pyarrow.parquet
 
+from envs.logs.containment import check_archive
+
 
 def check_time(path: Path, name: str, time: np.ndarray) -> None:
     """Refuses time stamps that do not strictly increase.
@@ -123,6 +125,7 @@ def _cell(path: Path, row: int, name: str, text: str) -> float:
 
 
 def _read_npz(path: Path) -> dict[str, np.ndarray]:
+    check_archive(path)
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
             columns = {name: arrays[name] for name in arrays.files}

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from envs.logs.containment import check_inside
 from envs.logs.controller import Controller
 from envs.logs.files import read
 from envs.logs.format import JOINT_SIGNALS, Log, Run
@@ -33,13 +34,18 @@ _SIGNALS = {
 _OTHER = ("load", "temp")
 
 
-def read_any(folder: Path) -> Log:
+def read_any(folder: Path, model: Path | None = None) -> Log:
     """Reads the log in a folder, in the project's format or as JSON files of the XL330 pendulum.
+
+    Args:
+      folder: of the log.
+      model: as in `read`; the pendulum has its own.
 
     Raises:
       ValueError: it is neither, or has errors.
     """
-    return read(folder) if (folder / "meta.yaml").exists() or not any(folder.glob("*.json")) else read_xl330(folder)
+    foreign = not (folder / "meta.yaml").exists() and any(folder.glob("*.json"))
+    return read_xl330(folder) if foreign else read(folder, model=model)
 
 
 def read_xl330(folder: Path) -> Log:
@@ -57,6 +63,8 @@ def read_xl330(folder: Path) -> Log:
     paths = sorted(Path(folder).glob("*.json"))
     if not paths:
         raise ValueError(f"{folder}: no *.json files")
+    for path in paths:
+        check_inside(Path(folder), path, "runs")
     runs = tuple(map(_run, paths))
     names = [run.name for run in runs]
     for path, name in zip(paths, names, strict=True):

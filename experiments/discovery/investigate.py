@@ -38,6 +38,7 @@ def investigate(
     seed: int = 0,
     clear_flags: bool = False,
     swap_halves: bool = False,
+    robot: Path | None = None,
     say: Say = lambda text: None,
 ) -> Answer:
     """Reads logs, discovers what their model lacks, and writes summary, details and the corrected model.
@@ -61,7 +62,7 @@ def investigate(
       ValueError: a log cannot be used.
     """
     began, saved = time.monotonic(), out / "state.json"
-    log, spec = read_logs(logs, clear_flags, swap_halves)
+    log, spec = read_logs(logs, clear_flags, swap_halves, robot)
     question = build_question(log, spec, horizons, null_logs, seed)
     out.mkdir(parents=True, exist_ok=True)
     result = workflow.discover(

@@ -72,7 +72,7 @@ class _Simulator:
 
 
 def read_logs(
-    folders: Sequence[Path], clear_flags: bool = False, swap_halves: bool = False
+    folders: Sequence[Path], clear_flags: bool = False, swap_halves: bool = False, robot: Path | None = None
 ) -> tuple[Log, mujoco.MjSpec]:
     """Reads the logs of one robot as a single log that can be split, and the robot's nominal model.
 
@@ -80,6 +80,7 @@ def read_logs(
       folders: of logs, or of the XL330 pendulum's JSON files.
       clear_flags: whether flags of the model that switch physics off are cleared; else they are refused.
       swap_halves: whether train changes places with select and sealed.
+      robot: path of an MJCF in the place of the logs' own models.
 
     Returns:
       A log with the runs of all folders (of several, a run's name ends in the number of its folder), cut in time where
@@ -89,7 +90,7 @@ def read_logs(
       ValueError: a log cannot be read, the logs are not of one robot, its base is free, or its model has flags that
         switch physics off.
     """
-    logs = [read_any(folder) for folder in folders]
+    logs = [read_any(folder, robot) for folder in folders]
     if not logs:
         raise ValueError("logs: got none, expected one or more")
     first = logs[0]

@@ -8,6 +8,7 @@ import pytest
 import yaml
 
 from envs import logs
+from envs.logs import containment
 
 JOINTS = ["left_hip", "left_knee"]
 META = {
@@ -86,11 +87,83 @@ def test_a_robot_may_be_any_mjcf_with_hinges_or_slides(tmp_path):
     arm = """<mujoco><worldbody><body><freejoint name="free"/><geom size=".1"/>
       <body><joint name="left_hip"/><geom size=".1"/><body><joint name="left_knee" type="slide"/><geom size=".1"/>
       </body></body></body></worldbody></mujoco>"""
-    (tmp_path / "arm.xml").write_text(arm)
-    log = logs.read(put(tmp_path / "log", meta={"robot": "../arm.xml"}))
-    assert log.robot == str(tmp_path / "arm.xml")
+    folder = put(tmp_path / "log", meta={"robot": "arm.xml"})
+    (folder / "arm.xml").write_text(arm)
+    assert logs.read(folder).robot == str(folder / "arm.xml")
     with pytest.raises(ValueError, match="has no 'free'; expected left_hip, left_knee"):
-        logs.read(put(tmp_path / "log", meta={"robot": "../arm.xml", "joints": ["left_hip", "free"]}))
+        logs.read(put(folder, meta={"robot": "arm.xml", "joints": ["left_hip", "free"]}))
+    # A model that the user names may be anywhere.
+    (folder / "arm.xml").rename(tmp_path / "elsewhere.xml")
+    assert logs.read(put(folder), model=tmp_path / "elsewhere.xml").robot == str(tmp_path / "elsewhere.xml")
+
+
+OUT = "leads out of the log's folder"
+
+
+@pytest.mark.parametrize(
+    "robot",
+    ["../arm.xml", "sub/../../arm.xml", "{absolute}", "link.xml"],
+    ids=["up", "down and up", "absolute", "link"],
+)
+def test_a_model_outside_the_logs_folder_is_refused(tmp_path, robot):
+    (tmp_path / "arm.xml").write_text("<mujoco/>")
+    robot = robot.format(absolute=tmp_path / "arm.xml")
+    folder = put(tmp_path / "log", meta={"robot": robot})
+    (folder / "sub").mkdir()
+    (folder / "link.xml").symlink_to(tmp_path / "arm.xml")
+    with pytest.raises(ValueError, match=rf"meta.yaml: robot: got .*{OUT}.*, or a model that is named on the command"):
+        logs.read(folder)
+
+
+@pytest.mark.parametrize(
+    "reference",
+    [
+        '<include file="../secret.xml"/>',
+        '<include file="{absolute}"/>',
+        '<include file="link.xml"/>',
+        '<asset><mesh file="../secret.stl"/></asset>',
+        '<compiler meshdir=".."/><asset><mesh file="secret.stl"/></asset>',
+        '<compiler assetdir="/etc"/><asset><texture type="skybox" fileup="passwd"/></asset>',
+        '<include file="inner.xml"/>',
+    ],
+    ids=["include up", "include absolute", "include of a link", "mesh", "meshdir", "assetdir", "nested"],
+)
+def test_files_that_a_logs_model_refers_to_are_in_the_logs_folder(tmp_path, reference):
+    (tmp_path / "secret.xml").write_text("<mujoco/>")
+    folder = put(tmp_path / "log", meta={"robot": "robot.xml"})
+    (folder / "link.xml").symlink_to(tmp_path / "secret.xml")
+    (folder / "inner.xml").write_text('<mujoco><asset><hfield file="../secret.png"/></asset></mujoco>')
+    model = f"<mujoco>{reference.format(absolute=tmp_path / 'secret.xml')}</mujoco>"
+    (folder / "robot.xml").write_text(model)
+    with pytest.raises(ValueError, match=rf"robot: got .*{OUT}"):
+        logs.read(folder)
+
+
+def test_a_model_may_have_files_in_other_folders_of_the_log(tmp_path):
+    arm = """<mujoco><compiler meshdir="../meshes"/><include file="../parts/option.xml"/><worldbody>
+      <body><joint name="left_hip"/><geom size=".1"/><body><joint name="left_knee"/><geom size=".1"/></body></body>
+      </worldbody></mujoco>"""
+    folder = put(tmp_path / "log", meta={"robot": "model/arm.xml"})
+    for name, text in {"model/arm.xml": arm, "parts/option.xml": "<mujoco><option timestep='0.002'/></mujoco>"}.items():
+        (folder / name).parent.mkdir()
+        (folder / name).write_text(text)
+    assert logs.read(folder).robot == str(folder / "model" / "arm.xml")
+
+
+def test_a_run_that_is_a_link_out_of_the_folder_is_refused_unread(tmp_path):
+    folder = put(tmp_path / "log")
+    (tmp_path / "secret.csv").write_text("password\nhunter2\n")
+    (folder / "run_001.csv").symlink_to(tmp_path / "secret.csv")
+    with pytest.raises(ValueError, match=rf"runs: got .*run_001.csv, which {OUT}") as refused:
+        logs.read(folder)
+    assert "hunter2" not in str(refused.value)
+
+
+def test_a_small_archive_that_fills_the_memory_is_refused(tmp_path, monkeypatch):
+    folder = put(tmp_path / "log", name="run_001.npz")
+    monkeypatch.setattr(containment, "LARGEST_BYTES", 100)
+    with pytest.raises(ValueError, match=r"run_001.npz: got .* GiB unpacked, expected at most"):
+        logs.read(folder)
 
 
 def test_a_run_may_have_its_own_condition_split_and_gains(tmp_path):
@@ -209,6 +282,23 @@ def test_meta_that_is_no_meta_is_named(tmp_path, text, named):
     (tmp_path / "log" / "meta.yaml").write_text(text)
     with pytest.raises(ValueError, match=named):
         logs.read(tmp_path / "log")
+
+
+@pytest.mark.parametrize(
+    ("meta", "message"),
+    [
+        ({"rate_hz": 1e12}, "meta.yaml: rate_hz: got 1000000000000.0, expected at most 100000"),
+        ({"policy": {"rate_hz": 1e9}}, "policy.rate_hz: got 1000000000.0, expected at most 100000"),
+        (
+            {"controller": META["controller"] | {"rate_hz": 10**9}},
+            "controller.rate_hz: got 1000000000, expected at most",
+        ),
+    ],
+    ids=["rows", "policy", "controller"],
+)
+def test_a_rate_that_no_machine_has_is_refused(tmp_path, meta, message):
+    with pytest.raises(ValueError, match=message):
+        logs.read(put(tmp_path / "log", meta=meta))
 
 
 def cell(name, row, value):
