@@ -128,6 +128,19 @@ def test_returns_of_the_stand_in_robot_are_those_of_the_runs():
         assert _range([run["end"]["return"] for run in runs], 1) in README
 
 
+def test_errors_of_other_robots_are_those_of_the_runs():
+    robots = json.loads((_RESULTS / "robots" / "summary.json").read_text())["robots"]
+    page = (_RESULTS / "README.md").read_text()
+    for group in ("in_box", "outside"):
+        assert ", ".join(f"{found[group]['after']:.3f}" for found in robots.values()) in README
+    for name, found in robots.items():
+        inside, outside = (
+            f"{found[group]['parameters']}: {found[group]['before']:.3f} -> {found[group]['after']:.3f}"
+            for group in ("in_box", "outside")
+        )
+        assert re.search(rf"`{name}` .* {inside} \| {outside} \| {found['truth_in_last_box']:.2f} \|", page)
+
+
 def test_rates_of_discovery_are_those_of_the_benchmark():
     table = {row["measure"]: row for row in json.loads((_RESULTS / "discovery" / "scores.json").read_text())["table"]}
     for measure in ("top-1 name, 5 floor units and more", "names something where nothing is hidden"):
