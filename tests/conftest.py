@@ -30,6 +30,8 @@ def pytest_configure(config):
     with warnings.catch_warnings(action="ignore"):
         from experiments.common.config import QUICK_COMPILATION
     os.environ.setdefault("XLA_FLAGS", QUICK_COMPILATION)
+    # As `experiments.common.checkpoint.set_up_compiler` does.
+    os.environ.setdefault("NPROC", "8")
 
 
 # The fixtures import for themselves, since the line above rules only after this file has been read.

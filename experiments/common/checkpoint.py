@@ -28,6 +28,7 @@ import orbax.checkpoint as ocp
 _PACKAGES = ("jaxtune", "jax", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "orbax-checkpoint", "numpy")
 
 _DRAFT = ".tmp"  # suffix of a file that is being written, or that a killed run left behind
+_LEAST_THREADS = 8  # of XLA's pool on a CPU
 _LOCK = ".lock"  # suffix of a file whose lock says that a process works on a piece
 
 
@@ -35,18 +36,26 @@ def set_up_compiler(xla_flags: str) -> None:
     """Sets the flags of XLA, JAX's compiler, and keeps compiled programs on disk so that a second run starts sooner.
 
     Call it before JAX makes its first array, because JAX reads the flags then and never again. Programs are kept in the
-    user's cache folder, or where `JAX_COMPILATION_CACHE_DIR` says.
+    user's cache folder, or where `JAX_COMPILATION_CACHE_DIR` says. XLA also gets more threads than a small machine has
+    cores (environment variable `NPROC`, unless it is set): with one thread a core, programs on two cores were seen to
+    wait for themselves for ever.
 
     Args:
       xla_flags: added to `XLA_FLAGS`.
     """
     if xla_flags:
         os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {xla_flags}".strip()
+    os.environ.setdefault("NPROC", str(max(_LEAST_THREADS, cores())))
     if os.environ.get("JAX_COMPILATION_CACHE_DIR"):
         return
     base = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
     jax.config.update("jax_compilation_cache_dir", str(base / "jaxtune" / "xla"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
+
+
+def cores() -> int:
+    """Number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def for_simulation(most: int = 8) -> str:
@@ -61,8 +70,7 @@ def for_simulation(most: int = 8) -> str:
     Args:
       most: largest number of devices.
     """
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    devices = f"--xla_force_host_platform_device_count={min(cores, most)}"
+    devices = f"--xla_force_host_platform_device_count={min(cores(), most)}"
     # XLA ends the process at a flag that it does not know.
     return devices if jax.__version_info__ >= (0, 11) else f"{devices} --xla_cpu_use_fusion_emitters=false"
 
