@@ -13,7 +13,7 @@ import numpy as np
 from envs import go2, pendulum
 from envs.biteno import constants
 
-_OTHER_FILES = re.compile(r"<include\b|\bfile\s*=")
+_OTHER_FILES = re.compile(r"<include\b|\bfile\w*\s*=")
 
 BUILT_IN = {
     "biteno": (constants.MODEL_PATH, constants.JOINTS),

@@ -46,7 +46,8 @@ def check_measured(measured: Trajectory, simulated: Trajectory, config: TunerCon
       config: sizes of the tuning.
 
     Raises:
-      ValueError: as `check_set`, or episodes, observations or actions are of another size than the simulated ones.
+      ValueError: as `check_set`; episodes, observations or actions are of another size than the simulated ones; or,
+        where values are known, no simulated observation ever changes.
     """
     steps = check_set(measured, config)
     expected = np.shape(simulated.alive)[1]

@@ -39,7 +39,7 @@ def one_by_one(
 
     Args:
       play: plays one episode, `(seed, policy, coords by name) -> episode`, as `Trajectory.from_episodes` reads them.
-      steps: length of the episodes; that of the longest where None.
+      steps: length of the episodes. That of the longest where None, which must then be the measured one too.
     """
 
     def simulate(key: jax.Array, policy: Any, coords: dict[str, np.ndarray]) -> Trajectory:

@@ -3,15 +3,19 @@
 A link, an absolute path or one with `..` would have another file quoted in a message, or used as the robot's model.
 """
 
+import re
 import zipfile
 from pathlib import Path
-from xml.etree import ElementTree
+
+import mujoco
 
 LARGEST_BYTES = 2**31
 """Largest size of what an archive holds: an hour of 60 columns at 1 kHz is 1.7 GB."""
-_NAMES = ("file", "filename", "fileright", "fileleft", "fileup", "filedown", "filefront", "fileback")
-_FOLDERS = ("meshdir", "texturedir", "assetdir")
 _OR_NAMED = ", or a model that is named on the command line (--robot)"
+# What readers of XML and file systems understand differently: MuJoCo takes a backslash for a slash, and reads what
+# others take for a definition.
+_AMBIGUOUS = re.compile(rb"\\|<!(?!--|\[CDATA\[)")
+_URDF_FILE = re.compile(rb"""filename\s*=\s*["']([^"']*)["']""")  # MuJoCo does not list those
 
 
 def check_inside(folder: Path, path: Path, what: str, otherwise: str = "") -> None:
@@ -27,15 +31,25 @@ def check_inside(folder: Path, path: Path, what: str, otherwise: str = "") -> No
       ValueError: it does, itself or by a link in it.
     """
     within = folder.resolve()
-    for one in (path, *(path.rglob("*") if path.is_dir() and not path.is_symlink() else ())):
-        if not one.resolve().is_relative_to(within):
+
+    def check(one: Path) -> Path:
+        try:
+            found = one.resolve()
+        except (OSError, RuntimeError) as error:
+            raise ValueError(f"{what}: {one}: {error}") from None
+        if not found.is_relative_to(within):
             raise ValueError(
                 f"{what}: got {one}, which leads out of the log's folder {folder}; expected a file in it{otherwise}"
             )
+        return found
+
+    found = check(path)
+    for one in found.rglob("*") if found.is_dir() else ():
+        check(one)
 
 
 def check_model(folder: Path, path: Path, what: str) -> None:
-    """Checks an MJCF of a log, and all files that it refers to: included files, meshes, height fields, textures.
+    """Checks an MJCF of a log, and all files that it refers to: included files, models, meshes, textures.
 
     Args:
       folder: of the log.
@@ -43,27 +57,28 @@ def check_model(folder: Path, path: Path, what: str) -> None:
       what: begins the message.
 
     Raises:
-      ValueError: one of them leads out of the folder, or is no XML.
+      ValueError: one of them leads out of the folder, or the model cannot be read.
     """
-    texts, waiting = {}, [path]
-    while waiting:
-        one = waiting.pop()
+    check_inside(folder, path, what, _OR_NAMED)
+    _check_text(path, what)
+    try:
+        needed = [Path(one) for one in mujoco.mju_getXMLDependencies(str(path))]
+    except mujoco.FatalError as error:
+        raise ValueError(f"{what}: {error}") from None
+    for one in needed:
         check_inside(folder, one, what, _OR_NAMED)
-        if one.resolve() in texts or not one.is_file():
-            continue  # MuJoCo names a file that is missing
-        try:
-            root = texts[one.resolve()] = ElementTree.parse(one).getroot()
-        except ElementTree.ParseError as error:
-            raise ValueError(f"{what}: {one}: {error}") from None
-        waiting += [path.parent / item.get("file", "") for item in root.iter("include")]
-        # MuJoCo looks there first, and then beside the file that includes.
-        waiting += [one.parent / item.get("file", "") for item in root.iter("include")]
-    elements = [item for root in texts.values() for item in root.iter()]
-    folders = {"", *(item.get(name, "") for item in elements for name in _FOLDERS)}
-    named = {item.get(name) for item in elements for name in _NAMES} - {None}
-    for place in folders:
-        for name in named:
-            check_inside(folder, path.parent / place / name.removeprefix("package://"), what, _OR_NAMED)
+    for one in needed:
+        if one.suffix.lower() in (".xml", ".mjcf", ".urdf") and one.is_file():
+            _check_text(one, what)
+            for name in _URDF_FILE.findall(one.read_bytes()):
+                place = one.parent / name.decode(errors="replace").removeprefix("package://")
+                check_inside(folder, place, what, _OR_NAMED)
+
+
+def _check_text(path: Path, what: str) -> None:
+    found = _AMBIGUOUS.search(path.read_bytes())
+    if found:
+        raise ValueError(f"{what}: {path}: got '{found[0].decode()}', expected neither backslashes nor definitions")
 
 
 def check_archive(path: Path) -> None:

@@ -27,6 +27,7 @@ from envs.logs.meta import Meta
 from envs.logs.tables import READERS, WRITERS, check_time, check_values, refuse_first
 from envs.models import BUILT_IN, one_file
 
+_MODELS = (".xml", ".mjcf", ".urdf")  # suffixes
 _UNIT_NORM = 0.05  # tolerance of the length of unit vectors
 _RATE_RATIO = 2.0  # largest ratio of nominal to recorded rate, or the reverse
 
@@ -102,7 +103,8 @@ def write(log: Log, folder: Path, suffix: str = ".csv") -> None:
       suffix: of the runs' files: .csv, .npz or .parquet.
 
     Raises:
-      ValueError: the folder is not empty, the suffix is unknown, or a run's name does not begin with `run_`.
+      ValueError: the folder is not empty, the suffix is unknown, a run's name does not begin with `run_`, or the
+        robot's model cannot be read.
     """
     folder = Path(folder)
     if suffix not in WRITERS:
@@ -112,7 +114,8 @@ def write(log: Log, folder: Path, suffix: str = ".csv") -> None:
             raise ValueError(f"runs: got '{run.name}', expected a name that begins with 'run_'")
     if folder.exists() and any(folder.iterdir()):
         raise ValueError(f"{folder}: expected an empty folder")
-    model = None if log.robot in BUILT_IN or not Path(log.robot).is_file() else one_file(log.robot)
+    by_path = log.robot not in BUILT_IN and Path(log.robot).suffix in _MODELS and Path(log.robot).is_file()
+    model = one_file(log.robot) if by_path else None
     folder.mkdir(parents=True, exist_ok=True)
     if model is not None:
         (folder / Path(log.robot).name).write_text(model, encoding="utf-8")

@@ -39,12 +39,16 @@ def read_any(folder: Path, model: Path | None = None) -> Log:
 
     Args:
       folder: of the log.
-      model: as in `read`; the pendulum has its own.
+      model: as in `read`; the pendulum takes none, because it has its own.
 
     Raises:
       ValueError: it is neither, or has errors.
     """
     foreign = not (folder / "meta.yaml").exists() and any(folder.glob("*.json"))
+    if foreign and model is not None:
+        raise ValueError(
+            f"robot: got {model}, but the logs of the XL330 pendulum in {folder} have a model of their own"
+        )
     return read_xl330(folder) if foreign else read(folder, model=model)
 
 

@@ -175,12 +175,9 @@ def _at_ticks(run: Run, order: list[int]) -> dict[str, np.ndarray]:
     return seen | {"up": ~down[rows]}
 
 
-def at_policy_rate(time: np.ndarray, period: float) -> bool:
-    """Tells whether rows at times [rows] s come at the rate of a policy with this period in s."""
-    return abs(float(np.median(np.diff(time))) / period - 1.0) < _SAME_RATE
-
-
-def find_ticks(name: str, time: np.ndarray, action: np.ndarray, period: float) -> tuple[np.ndarray, bool]:
+def find_ticks(
+    name: str, time: np.ndarray, sent: np.ndarray, period: float, what: str = "'action'"
+) -> tuple[np.ndarray, bool]:
     """Finds the rows in which the policy sent an action, and whether it observed the robot in these very rows.
 
     If rows come at the policy's rate, every row is a tick. Among faster rows a tick is where the action changes.
@@ -188,15 +185,16 @@ def find_ticks(name: str, time: np.ndarray, action: np.ndarray, period: float) -
     Args:
       name: of the run, for messages.
       time: [rows] s.
-      action: [rows, act].
+      sent: [rows, columns] what the policy sends, or what else changes with its ticks alone.
       period: of the policy, in s.
+      what: names the columns in messages.
 
     Raises:
       ValueError: rows are too slow for the policy, or actions change at another rate.
     """
     width = float(np.median(np.diff(time)))
-    changes = 1 + np.flatnonzero((np.diff(action, axis=0) != 0).any(axis=1))
-    if at_policy_rate(time, period):
+    changes = 1 + np.flatnonzero((np.diff(sent, axis=0) != 0).any(axis=1))
+    if abs(width / period - 1.0) < _SAME_RATE:
         # Every row is a tick, unless the action has stayed the same for so long that the policy must have stopped.
         starts = np.append(0, changes)
         long = np.diff(np.append(starts, len(time)))
@@ -209,7 +207,7 @@ def find_ticks(name: str, time: np.ndarray, action: np.ndarray, period: float) -
     rows, apart = changes, np.diff(time[changes])
     if len(rows) < 2 or abs(np.median(apart) / period - 1.0) > 0.25:
         every = f"every {np.median(apart):.3g} s" if len(rows) > 1 else f"{len(rows)} time(s)"
-        raise ValueError(f"{name}: 'action' changes {every}, expected every {period:g} s")
+        raise ValueError(f"{name}: {what} changes {every}, expected every {period:g} s")
     # Two equal actions in a row show no change, so the tick of the second one is filled in. After a long silence
     # nothing is filled in, because the policy has stopped.
     unchanged = [

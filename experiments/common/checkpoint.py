@@ -12,6 +12,7 @@ import importlib.metadata
 import json
 import os
 import platform
+import re
 import secrets
 import shutil
 import subprocess
@@ -38,7 +39,7 @@ def set_up_compiler(xla_flags: str) -> None:
     Call it before JAX makes its first array, because JAX reads the flags then and never again. Programs are kept in the
     user's cache folder, or where `JAX_COMPILATION_CACHE_DIR` says. XLA also gets more threads than a small machine has
     cores (environment variable `NPROC`, unless it is set): with one thread a core, programs on two cores were seen to
-    wait for themselves for ever.
+    hang.
 
     Args:
       xla_flags: added to `XLA_FLAGS`.
@@ -172,17 +173,20 @@ def read_json(path: Path) -> Any:
     """Reads a JSON file of a run.
 
     Raises:
-      ValueError: the file was emptied or damaged; names it.
+      ValueError: the file was emptied or damaged, or holds no object; names it.
     """
     try:
-        return json.loads(path.read_text())
+        found = json.loads(path.read_text())
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: is damaged ({error}); delete it, and the same command computes it again") from None
+        raise ValueError(f"{path}: is damaged: {error}") from None
+    if not isinstance(found, dict):
+        raise ValueError(f"{path}: is damaged: got {type(found).__name__}, expected an object")
+    return found
 
 
-def _sync(folder: Path) -> None:
-    """Puts the names in a folder on the disk: a renamed file may have its old name after a power cut otherwise."""
-    handle = os.open(folder, os.O_RDONLY)
+def _sync(item: Path) -> None:
+    """Puts a file, or the names in a folder, on the disk: a renamed file may have its old name after a power cut."""
+    handle = os.open(item, os.O_RDONLY)
     try:
         os.fsync(handle)
     finally:
@@ -196,7 +200,7 @@ def lock(path: Path) -> Iterator[None]:
     The operating system drops the lock when its owner ends, however it ends. The empty lock file stays.
 
     Args:
-      path: what is worked on: the lock file is beside it, with `.lock` behind its name.
+      path: what is worked on: the lock file is beside it, hidden, with `.lock` behind its name.
 
     Raises:
       ValueError: another process works on it.
@@ -273,13 +277,14 @@ def save(path: Path, state: Any, config: Any, notes: Any = None) -> None:
     new = path / f"state_{max(numbers, default=0) + 1}"
     with ocp.StandardCheckpointer() as checkpointer:
         checkpointer.save(new.absolute(), _with_numbers(state))
-    for file in new.rglob("*"):
-        _sync(file)
+    for item in (new, *new.rglob("*")):
+        _sync(item)
     _sync(path)
     entry = {"config": as_json(config), "state": new.name, "sha256": _checksum(new), "versions": versions()}
     write_json(path / "config.json", entry if notes is None else entry | {"notes": notes})
-    for old in path.glob("state*"):
-        if old != new:
+    # Not all that begins like this is a checkpoint's: discovery keeps a `state.json`.
+    for old in path.iterdir():
+        if old != new and old.is_dir() and re.fullmatch(r"state(_\d+)?(\.orbax-checkpoint-tmp.*)?", old.name):
             shutil.rmtree(old)
 
 
@@ -304,7 +309,7 @@ def load(path: Path, like: Any, config: Any) -> Any:
     _same(f"policy: {path} was made with another config", entry["config"], as_json(config))
     # Checkpoints of the first version have neither the name of their state nor its checksum.
     place = path / entry.get("state", "state")
-    if not place.is_dir() or _checksum(place) != entry.get("sha256", _checksum(place)):
+    if not place.is_dir() or ("sha256" in entry and _checksum(place) != entry["sha256"]):
         raise ValueError(f"policy: {path} is damaged: its checksum is not the one in its config.json")
     with ocp.StandardCheckpointer() as checkpointer:
         wanted = jax.tree.map(ocp.utils.to_shape_dtype_struct, _with_numbers(like))

@@ -43,7 +43,7 @@ def run(main: Callable[[Any], None], args_type: type) -> None:
         _refuse(f"{place}{error.strerror or error}", error)
     except KeyboardInterrupt as error:
         command = shlex.join(["python", "-m", _module(), *sys.argv[1:]])
-        _errors.print(f"stopped; to go on: {command}", highlight=False, markup=False, soft_wrap=True)
+        _errors.print(f"stopped; to go on or begin anew: {command}", highlight=False, markup=False, soft_wrap=True)
         raise SystemExit(_INTERRUPTED) from error
 
 

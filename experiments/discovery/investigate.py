@@ -53,6 +53,7 @@ def investigate(
       seed: of the null logs.
       clear_flags: whether flags of the model that switch physics off are cleared; else they are refused.
       swap_halves: whether train changes places with select and sealed.
+      robot: path of an MJCF in the place of the logs' own models.
       say: receives a line of text about progress.
 
     Returns:

@@ -75,6 +75,7 @@ class Learner:
             )
         self.preset = preset = replace(preset, episode_steps=min(preset.episode_steps, kind.episode_steps))
         self.kind = kind
+        self.correction = correction
         self.entries = entries
         self._hidden = hidden
         self.robot = kind.make(preset, {**entries, **hidden}, correction)

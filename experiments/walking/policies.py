@@ -19,6 +19,8 @@ from experiments.walking.learner import Learner, Policy
 from experiments.walking.robots import Kind
 from jaxtune.mjx import parameters
 
+_KEEP_S = 60.0  # between two checkpoints of a training
+
 
 def policy_config(learner: Learner) -> dict:
     """Lists the settings that a saved policy shares with the run that loads it.
@@ -27,9 +29,6 @@ def policy_config(learner: Learner) -> dict:
     refuses a folder whose config differs.
     """
     return {**learner.kind.config(learner.preset), "hidden": list(learner.preset.ppo.hidden)}
-
-
-_KEEP_S = 60.0  # between two checkpoints of a training
 
 
 def walk(
@@ -50,7 +49,8 @@ def walk(
       The policy, and a line of metrics (means over the chunk) for every chunk of updates.
 
     Raises:
-      ValueError: the folder's checkpoint is damaged, or of a training with another config.
+      ValueError: the folder's checkpoint is damaged, or of a training with another config or more updates; or the
+        policy is not finite when it is kept.
     """
     key_init, key_train = jax.random.split(key)
     policy = learner.init(key_init)
@@ -62,12 +62,15 @@ def walk(
     identity = {
         **policy_config(learner),
         "key": jax.random.key_data(key),
-        "parameters": list(learner.entries),
+        "parameters": learner.entries,
+        "correction": learner.correction and learner.correction.digest,
         "chunk": chunk,
         "preset": learner.preset,
     }
     if kept and (kept / "config.json").exists():
         policy, curve = checkpoint.load(kept, policy, identity), checkpoint.read_notes(kept)
+        if len(curve) * chunk > updates + chunk - 1:
+            raise ValueError(f"updates: got {updates}, but {kept} holds a training of {len(curve) * chunk}")
     last = time.monotonic()
     start = last - (curve[-1]["seconds"] if curve else 0.0)
     for index in range(len(curve), -(-updates // chunk)):
@@ -79,6 +82,7 @@ def walk(
             rate = line["reward"] / learner.kind.control_s
             progress.update(task, completed=steps, description=f"reward {rate:.2f} per second")
         if kept and time.monotonic() - last >= _KEEP_S:
+            checkpoint.check_finite("policy", policy.learner)
             checkpoint.save(kept, policy, identity, curve)
             last = time.monotonic()
     return policy, curve

@@ -146,7 +146,7 @@ def _foreign(name: str, made: Any) -> Kind:
 
 def _state_key(env: Any) -> str | None:
     """Returns the key of what a policy is given in Playground's dictionaries of observations."""
-    obs = jax.eval_shape(env.reset, jax.random.PRNGKey(0)).obs
+    obs = getattr(jax.eval_shape(env.reset, jax.random.PRNGKey(0)), "obs", None)
     return "state" if isinstance(obs, Mapping) and "state" in obs else None
 
 

@@ -42,8 +42,8 @@ _PREFIXES = {
     "control": (),
 }
 """How the fields begin that have rows for objects of a kind."""
-_NOT_NEGATIVE = ("body_mass", "body_inertia", "dof_", "jnt_stiffness", "geom_friction", "pair_friction")
-"""How the fields begin that no offset may take below zero."""
+_NOT_NEGATIVE = {"body_mass", "body_inertia", "dof_armature", "dof_damping", "dof_frictionloss", "jnt_stiffness"}
+_NOT_NEGATIVE |= {"geom_friction", "pair_friction"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,10 +88,9 @@ class Entry:
             raise ValueError(f"kind: got {self.kind!r}, expected one of {', '.join(_PREFIXES)}")
         self._check_targets()
         self._check_fields()
-        try:
-            low, high = map(float, self.bounds)
-        except (TypeError, ValueError):
-            raise ValueError(f"bounds: got {self.bounds!r}, expected two numbers") from None
+        if len(np.shape(self.bounds)) != 1 or not all(map(_is_number, self.bounds)) or len(self.bounds) != 2:
+            raise ValueError(f"bounds: got {self.bounds!r}, expected two numbers")
+        low, high = self.bounds
         if not -math.inf < low < high < math.inf or (self.log and low <= 0):
             expected = "ascending ones, above zero for a multiplier" if self.log else "ascending ones"
             raise ValueError(f"bounds: got {self.bounds}, expected {expected}")
@@ -108,10 +107,14 @@ class Entry:
             )
 
     def _check_fields(self) -> None:
+        if not isinstance(self.fields, tuple):
+            raise ValueError(f"fields: got {self.fields!r}, expected a tuple")
         for field in self.fields:
-            name, *column = (field,) if isinstance(field, str) else field
-            if not isinstance(name, str) or not all(isinstance(number, int) for number in column):
+            kinds = (str,) if isinstance(field, str) else (str, int)
+            parts = (field,) if isinstance(field, str) or not isinstance(field, tuple) else field
+            if len(parts) != len(kinds) or not all(map(isinstance, parts, kinds)):
                 raise ValueError(f"fields: got {field!r}, expected a name, or a name and the number of a column")
+            name = parts[0]
             if name in DERIVED:
                 raise ValueError(f"fields: got '{name}', which follows from masses and inertias; change those")
             if not name.startswith(_PREFIXES[self.kind]):
@@ -147,7 +150,7 @@ class Entry:
                     "the device; give all of these joints 1e-6 in the MuJoCo model, and put it there again"
                 )
             smallest = met[-1].min(initial=np.inf)
-            if not self.log and name.startswith(_NOT_NEGATIVE) and smallest + self.bounds[0] < 0:
+            if not self.log and name in _NOT_NEGATIVE and smallest + self.bounds[0] < 0:
                 raise ValueError(
                     f"bounds: got {self.bounds}, which makes {name} negative; expected at least {-smallest:g}"
                 )
@@ -231,6 +234,11 @@ class Entry:
         return rows, owner[holds[rows].argmax(axis=1)]
 
 
+def _is_number(value) -> bool:
+    """Tells whether a value is one real number, of Python, NumPy or JAX."""
+    return np.ndim(value) == 0 and np.issubdtype(getattr(value, "dtype", type(value)), np.number)
+
+
 def _driven(model, actuators: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Returns those of the actuators that drive a joint, and the joints that they drive."""
     kinds = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
@@ -299,8 +307,7 @@ def check_values(entries: Mapping[str, Entry], params: Params) -> None:
     """
     for name, entry in select(entries, tuple(params)).items():
         low, high = entry.bounds
-        number = np.ndim(params[name]) == 0 and not isinstance(params[name], str)
-        if not number or not low <= params[name] <= high:
+        if not _is_number(params[name]) or not low <= params[name] <= high:
             raise ValueError(f"parameter '{name}': got {params[name]}, expected {low:g} to {high:g}")
 
 

@@ -30,7 +30,7 @@ from jaxtune.mjx.parameters import Entry, Params
 from jaxtune.types import Coords, ParamDist, Trajectory
 
 Act = Callable[[Any, Any, jax.Array], jax.Array]
-"""A policy: `(policy, observation of one environment, key) -> action [act]`."""
+"""A policy: `(policy, observation of one environment, key) -> action [act]`. The policy is a pytree of arrays."""
 WithModel = Callable[[Any, mjx.Model], Any]
 """`(env, model) -> env`: a copy of an environment that simulates this model."""
 
@@ -111,7 +111,7 @@ class Simulator:
             longest = self.steps * float(self.env.dt)
             if entry.bounds[1] > longest:
                 raise ValueError(
-                    f"parameter '{name}', bounds: got {entry.bounds} s, expected less than an episode, {longest:g} s"
+                    f"parameter '{name}', bounds: got {entry.bounds} s, expected at most an episode, {longest:g} s"
                 )
 
     def _check_reach(self) -> None:
@@ -142,11 +142,11 @@ class Simulator:
         named = (self.observe,) if isinstance(self.observe, str) or callable(self.observe) else self.observe or ()
         if not isinstance(named, Sequence) or not all(isinstance(name, str) or callable(name) for name in named):
             raise ValueError(f"observe: got {self.observe!r}, expected a key, keys, or a function")
-        shapes = [np.shape(leaf) for leaf in jax.tree.leaves(self._start.obs)]
+        whole = np.shape(jax.eval_shape(self.observed, self._start.obs))
         others = [np.shape(getattr(self._start, name)) for name in ("reward", "done")]
-        if any(others) or any(len(shape) != 1 for shape in shapes):
+        if any(others) or len(whole) != 1:
             raise ValueError(
-                f"env: got a reset with observations of shape {', '.join(map(str, shapes))}, reward and done of shape "
+                f"env: got a reset with an observation of shape {whole}, reward and done of shape "
                 f"{' and '.join(map(str, others))}, expected those of one robot: [obs], () and ()"
             )
         self.layout  # noqa: B018  names what is wrong with `observe`
@@ -171,11 +171,11 @@ class Simulator:
         low, high = dists.box(dist)
         ends = {"low": low, "value": dist.centre, "high": high}
         found = {end: parameters.from_coords(self.parameters, coords) for end, coords in ends.items()}
-        names = [name for name in self.parameters if name in dist.centre]
+        names = parameters.select(self.parameters, tuple(dist.centre))
         return {name: {end: float(values[name]) for end, values in found.items()} for name in names}
 
     def simulate(self, act: Act) -> Callable[[jax.Array, Any, Coords], Trajectory]:
-        """Makes the `simulate` of a tuner: one episode for every draw of the coordinates.
+        """Makes the `simulate` of a tuner: one episode for every draw of the coordinates, compiled.
 
         Raises:
           ValueError: the policy is no function.

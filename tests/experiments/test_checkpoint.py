@@ -116,12 +116,20 @@ def test_a_flipped_bit_anywhere_in_a_checkpoint_is_noticed(tmp_path):
         checkpoint.load(tmp_path, state(0.0), CONFIG)
 
 
-@pytest.mark.parametrize("content", ["", "{", '{"config": nothing}'])
+@pytest.mark.parametrize("content", ["", "{", '{"config": nothing}', "[]"])
 def test_an_emptied_or_damaged_file_is_named(tmp_path, content):
     path = tmp_path / "config.json"
     path.write_text(content)
-    with pytest.raises(ValueError, match=r"config.json: is damaged .*delete it"):
+    with pytest.raises(ValueError, match=r"config.json: is damaged: "):
         checkpoint.open_run(tmp_path, CONFIG)
+
+
+def test_what_others_keep_in_the_folder_stays(tmp_path):
+    (tmp_path / "statements").mkdir()
+    (tmp_path / "state.json").write_text("{}")
+    checkpoint.save(tmp_path, state(1.0), CONFIG)
+    checkpoint.save(tmp_path, state(2.0), CONFIG)
+    assert {path.name for path in tmp_path.iterdir()} == {"statements", "state.json", "state_2", "config.json"}
 
 
 def test_a_number_that_is_not_finite_is_named():
@@ -223,6 +231,8 @@ def test_a_training_that_was_killed_ends_as_if_it_had_not_been(learner, monkeypa
     assert not (out / "config.json").exists()
     with pytest.raises(ValueError, match=r"config.key"):
         policies.trained(jax.random.PRNGKey(4), learner, updates, out)
+    with pytest.raises(ValueError, match=r"updates: got 1, but .*training holds a training of 2"):
+        policies.trained(key, learner, 1, out)
     played = []
     train = learner.train
     monkeypatch.setattr(learner, "train", lambda *args: played.append(1) or train(*args))

@@ -365,7 +365,7 @@ def test_errors_are_printed_as_they_are(monkeypatch, capsys):
     [
         (OSError(28, "No space left on device", "runs/summary.json"), 2, "error: runs/summary.json: No space left on"),
         (PermissionError(13, "Permission denied", "runs"), 2, "error: runs: Permission denied"),
-        (KeyboardInterrupt(), 130, "stopped; to go on: python -m "),
+        (KeyboardInterrupt(), 130, "stopped; to go on or begin anew: python -m "),
     ],
 )
 def test_errors_of_the_system_and_ctrl_c_are_one_line(monkeypatch, capsys, error, code, line):

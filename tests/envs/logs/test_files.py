@@ -125,17 +125,67 @@ def test_a_model_outside_the_logs_folder_is_refused(tmp_path, robot):
         '<compiler meshdir=".."/><asset><mesh file="secret.stl"/></asset>',
         '<compiler assetdir="/etc"/><asset><texture type="skybox" fileup="passwd"/></asset>',
         '<include file="inner.xml"/>',
+        '<include xmlns="x" file="inner.xml"/>',
+        '<asset><model name="it" file="inner.xml"/></asset>',
+        '<include file="sub/inner.xml"/>',
+        '<asset><mesh filename="../secret.stl"/></asset>',
     ],
-    ids=["include up", "include absolute", "include of a link", "mesh", "meshdir", "assetdir", "nested"],
+    ids=[
+        "include up",
+        "include absolute",
+        "include of a link",
+        "mesh",
+        "meshdir",
+        "assetdir",
+        "nested",
+        "namespace",
+        "attached model",
+        "nested, in a folder",
+        "as in URDF",
+    ],
 )
 def test_files_that_a_logs_model_refers_to_are_in_the_logs_folder(tmp_path, reference):
     (tmp_path / "secret.xml").write_text("<mujoco/>")
     folder = put(tmp_path / "log", meta={"robot": "robot.xml"})
     (folder / "link.xml").symlink_to(tmp_path / "secret.xml")
-    (folder / "inner.xml").write_text('<mujoco><asset><hfield file="../secret.png"/></asset></mujoco>')
+    inner = '<mujoco><asset><hfield file="{up}secret.png"/></asset></mujoco>'
+    (folder / "inner.xml").write_text(inner.format(up="../"))
+    (folder / "sub").mkdir()
+    (folder / "sub" / "inner.xml").write_text(inner.format(up="../../"))
     model = f"<mujoco>{reference.format(absolute=tmp_path / 'secret.xml')}</mujoco>"
     (folder / "robot.xml").write_text(model)
     with pytest.raises(ValueError, match=rf"robot: got .*{OUT}"):
+        logs.read(folder)
+
+
+@pytest.mark.parametrize(
+    "model",
+    [
+        r'<mujoco><include file="..\secret.xml"/></mujoco>',
+        "<!DOCTYPE mujoco [<!ENTITY a \"<mujoco><include file='../secret.xml'/></mujoco>\">]><mujoco/>",
+    ],
+    ids=["backslash", "definition"],
+)
+def test_what_readers_of_xml_understand_differently_is_refused(tmp_path, model):
+    (tmp_path / "secret.xml").write_text("<mujoco/>")
+    folder = put(tmp_path / "log", meta={"robot": "robot.xml"})
+    (folder / "robot.xml").write_text(model)
+    with pytest.raises(ValueError, match=r"robot.xml: got '.*', expected neither backslashes nor definitions"):
+        logs.read(folder)
+
+
+def test_a_link_that_leads_in_a_circle_or_out_of_a_bag_is_refused(tmp_path):
+    folder = put(tmp_path / "log")
+    (folder / "hidden").mkdir()
+    (tmp_path / "secret.db3").write_text("")
+    (folder / "hidden" / "x.db3").symlink_to(tmp_path / "secret.db3")
+    (folder / "hidden" / "metadata.yaml").write_text("")
+    (folder / "run_001").symlink_to(folder / "hidden")
+    with pytest.raises(ValueError, match=rf"runs: got .*x.db3, which {OUT}"):
+        logs.read(folder)
+    (folder / "run_001").unlink()
+    (folder / "run_001.csv").symlink_to(folder / "run_001.csv")
+    with pytest.raises(ValueError, match=r"run_001.csv"):
         logs.read(folder)
 
 

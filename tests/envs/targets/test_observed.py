@@ -78,9 +78,16 @@ def test_an_action_at_its_limit_leaves_no_hole(tmp_path, per_tick):
     np.testing.assert_allclose(found.trajectory.obs[0, :, 0], 0.1 * np.arange(60), rtol=1e-5, atol=1e-6)
 
 
-def test_a_robot_at_rest_is_recorded_too(tmp_path):
-    columns = {name: values if name == "t" else np.ones_like(values) for name, values in rows(30).items()}
-    assert episodes(folder(tmp_path / "log", columns), steps=30).trajectory.alive.all()
+@pytest.mark.parametrize("per_tick", [1, 5])
+def test_rows_before_and_after_the_policy_are_no_walk(tmp_path, per_tick):
+    columns = rows(90 * per_tick, per_tick=per_tick)
+    for name in columns.keys() - {"t"}:
+        columns[name][: 30 * per_tick] = columns[name][30 * per_tick]
+        columns[name][60 * per_tick :] = columns[name][60 * per_tick - 1]
+    found = episodes(folder(tmp_path / "log", columns, rate_hz=50 * per_tick), steps=90)
+    # The first tick of the walk looks like the rows before it.
+    assert 28 <= found.trajectory.alive.sum() <= 30
+    assert len(found.run) == 1
 
 
 def test_a_walk_begins_where_the_motors_are_switched_on(tmp_path):

@@ -117,6 +117,19 @@ def test_a_field_may_be_multiplied_or_added_to_and_have_a_column(arm):
         (lambda: mass("upper", bounds=0.5), "bounds: got 0.5, expected two numbers"),
         (lambda: mass("upper", bounds=("a", "b")), r"bounds: got \('a', 'b'\), expected two numbers"),
         (lambda: action_delay(bounds_s=(0.0, 0.1, 0.2)), "expected two numbers"),
+        (lambda: action_delay(bounds_s=("0", "2")), r"bounds: got \('0', '2'\), expected two numbers"),
+        (
+            lambda: Entry(kind="body", targets=None, fields=None, bounds=(0.5, 2.0)),
+            "fields: got None, expected a tuple",
+        ),
+        (
+            lambda: Entry(kind="body", targets=None, fields=(5,), bounds=(0.5, 2.0)),
+            "fields: got 5, expected a name",
+        ),
+        (
+            lambda: Entry(kind="geom", targets=None, fields=(("geom_friction", 0, 1),), bounds=(0.5, 2.0)),
+            r"fields: got \('geom_friction', 0, 1\), expected a name",
+        ),
         (lambda: mass({"upper", "lower"}, bounds=(0.5, 2.0)), "targets: got {.*}, expected a name, several, or None"),
         (lambda: mass(b"upper", bounds=(0.5, 2.0)), "targets: got b'upper', expected a name"),
         (lambda: mass((), bounds=(0.5, 2.0)), r"targets: got \(\), expected a tuple of names"),

@@ -220,7 +220,7 @@ class Silent(Sled):
         ({"parameters": {1: TABLE["mass"]}}, "parameters: got dict, expected rows .* by name"),
         (
             {"parameters": {"late": action_delay(bounds_s=(0.0, 30.0))}},
-            r"parameter 'late', bounds: got \(0.0, 30.0\) s, expected less than an episode, 1.2 s",
+            r"parameter 'late', bounds: got \(0.0, 30.0\) s, expected at most an episode, 1.2 s",
         ),
         ({"observe": 3}, "observe: got 3, expected a key, keys, or a function"),
         ({"observe": ["state", 3]}, "observe: got .'state', 3., expected a key, keys"),
@@ -228,7 +228,7 @@ class Silent(Sled):
         ({"model": Sled().mj_model}, "model: got MjModel, expected mjx.Model"),
         ({"env": Elsewhere()}, "with_model: got none, and the default does not reach the model of Elsewhere"),
         ({"env": Wrapped()}, "env: got Wrapped around Sled, expected an environment without wrappers"),
-        ({"env": Several()}, r"observations of shape \(4, 3\), .*, expected those of one robot"),
+        ({"env": Several()}, r"an observation of shape \(4, 3\), .*, expected those of one robot"),
         ({"env": Silent()}, "env: got a reset that returns dict without 'obs'"),
         ({"parameters": {"m": mass("sledge", bounds=(0.5, 2.0))}}, "parameter 'm', targets: got body 'sledge'"),
         ({"parameters": {**TABLE, "more": TABLE["delay"]}}, "got delay and more, expected one action_delay at most"),
