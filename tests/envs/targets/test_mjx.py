@@ -35,6 +35,7 @@ class Script:
     """
 
     entries: Mapping[str, Entry] = field(default_factory=dict)
+    action_size = 3
     observed = staticmethod(lambda obs: obs)
 
     def reset(self, params, key):
@@ -120,7 +121,7 @@ def test_chunks_change_nothing(monkeypatch, count):
 
 
 def test_simulate_takes_search_coordinates():
-    table = {"kind": "body", "targets": (), "fields": (), "bounds": (0.1, 100.0)}
+    table = {"kind": "control", "targets": (), "fields": (), "bounds": (0.1, 100.0)}
     robot = Script(
         entries={
             "pay": Entry(**table),
