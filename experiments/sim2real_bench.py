@@ -17,7 +17,7 @@ import numpy as np
 from rich.table import Table
 
 from envs import corrected, logs
-from envs.biteno import constants
+from envs.biteno import constants, walks
 from envs.targets import recorded
 from experiments.common import checkpoint, plots
 from experiments.common.checkpoint import as_json, from_json, read_json, write_json
@@ -196,7 +196,7 @@ def evaluate(args: Args, programs: Programs, policy: Path) -> WalkMeans:
         with stand_in(policy.parent):
             wait(place, _ANSWER_S)
         steps = round(args.walk_s / constants.POLICY_DT_S)
-        write_json(found, summarise_walks(*recorded.whole(recorded.episodes(logs.read(place / "log"), steps), steps)))
+        write_json(found, summarise_walks(*recorded.whole(walks.episodes(logs.read(place / "log"), steps), steps)))
     return from_json(WalkMeans, read_json(found))
 
 

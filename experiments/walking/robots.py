@@ -18,11 +18,11 @@ import jax
 import jax.numpy as jnp
 
 from envs import corrected, go2
-from envs.biteno import constants, gait, onboard
+from envs.biteno import constants, gait, onboard, walks
 from envs.corrected import Correction
 from envs.diagnosis import Finding, diagnose_log, shared_findings
 from envs.logs import Log, read, read_observed
-from envs.targets import observed, recorded
+from envs.targets import observed
 from envs.targets.mjx import MjxTarget
 from envs.targets.protocol import Target
 from envs.targets.recorded import Recorded
@@ -211,7 +211,7 @@ BITENO = Kind(
         },
     },
     read=read,
-    episodes=recorded.episodes,
+    episodes=walks.episodes,
     findings=lambda log: shared_findings(diagnose_log(log)),
     player=Path(onboard.__file__).with_name("player.py"),
     policy=WALK,

@@ -13,9 +13,8 @@ import onnxruntime
 import pytest
 
 from envs import logs, sensing
-from envs.biteno import constants, env, gait
+from envs.biteno import constants, env, gait, walks
 from envs.biteno.player import Player
-from envs.targets import recorded
 from experiments import robot_stub
 from experiments.common.config import preset
 from experiments.robot import policy_files
@@ -180,7 +179,7 @@ def test_the_ideal_robot_walks_as_well_as_the_simulator(folder, tmp_path):
     falls, log = answered(folder, tmp_path / "round_000", IDEAL)
     assert falls == [False, False]
     assert [len(run.time) for run in log.runs] == [2000, 2000]
-    found = recorded.episodes(log, 400)
+    found = walks.episodes(log, 400)
     # Of 4 s; the walk earns 59 in 20 s, and at most 70 can be had.
     assert 2000 * float(found.trajectory.score.sum() / found.trajectory.alive.sum()) > 50
     # The row of a tick is what the policy saw: it does the same again.
@@ -196,7 +195,7 @@ def test_a_robot_that_falls_says_so(folder, tmp_path):
     (run,) = log.runs
     assert run.time[-1] < 3.9
     assert run.signals["enabled"][-1] == 0.0
-    np.testing.assert_array_equal(recorded.episodes(log, 400).trajectory.fell, [True])
+    np.testing.assert_array_equal(walks.episodes(log, 400).trajectory.fell, [True])
 
 
 def test_what_the_robot_lacks_is_in_its_log(folder, tmp_path):

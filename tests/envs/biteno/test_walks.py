@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from envs import logs, sensing
-from envs.biteno import constants
+from envs.biteno import constants, walks
 from envs.logs import Controller, Log, Run
 from envs.logs.sampling import HELD
 from envs.targets import mujoco_c, recorded
@@ -87,7 +87,7 @@ def same(found, trajectory, tolerance=1e-6):
 def test_windows_are_those_of_the_simulator(simulated, tmp_path, suffix):
     trajectory, log = simulated
     logs.write(log, tmp_path / "log", suffix)
-    found = recorded.episodes(logs.read(tmp_path / "log"), STEPS - 2).trajectory
+    found = walks.episodes(logs.read(tmp_path / "log"), STEPS - 2).trajectory
     same(found, trajectory)
     # Accelerations are differences over 10 ms of velocities that were rounded.
     known = found.alive & jnp.isfinite(found.score)
@@ -102,7 +102,7 @@ def test_joints_may_come_in_another_order(simulated):
         replace(run, signals={n: v[:, order] if n in joints else v for n, v in run.signals.items()}) for run in log.runs
     )
     turned = replace(log, joints=tuple(constants.JOINTS[i] for i in order), runs=runs)
-    same(recorded.episodes(turned, STEPS - 2).trajectory, trajectory)
+    same(walks.episodes(turned, STEPS - 2).trajectory, trajectory)
 
 
 def faster(run, rows_per_tick, shift=0.0):
@@ -121,7 +121,7 @@ def test_rows_that_keep_step_with_the_policy_are_taken_as_they_are(simulated):
     trajectory, log = simulated
     fast = replace(log, rate_hz=500.0, runs=tuple(faster(run, 5) for run in log.runs))
     # The first tick is not heard: nothing changes there.
-    found = recorded.episodes(fast, STEPS - 2).trajectory
+    found = walks.episodes(fast, STEPS - 2).trajectory
     np.testing.assert_array_equal(found.fell, trajectory.fell)
     ours, alive = windows.grid(found, LENGTH, 1)
     theirs, valid = windows.grid(jax.tree.map(lambda x: x[:, 3:] if x.ndim > 1 else x, trajectory), LENGTH, 1)
@@ -135,8 +135,8 @@ def test_rows_between_the_ticks_are_filtered(simulated):
     _, log = simulated
     run = log.runs[0]
     late = replace(log, rate_hz=330.0, runs=(faster(run, 3.3, 0.0005),))
-    on_time = recorded.episodes(replace(log, runs=(run,)), STEPS).trajectory
-    found = recorded.episodes(late, STEPS).trajectory
+    on_time = walks.episodes(replace(log, runs=(run,)), STEPS).trajectory
+    found = walks.episodes(late, STEPS).trajectory
     alive = np.asarray(found.alive[0, 1:-1] & on_time.alive[0, 2:])
     ours, theirs = np.asarray(found.obs[0, 1:-1])[alive], np.asarray(on_time.obs[0, 2:])[alive]
     held_channels = [*range(3, 6), *range(24, 30), *range(36, 40)]
@@ -152,7 +152,7 @@ def test_a_hole_ends_an_episode_without_a_fall(simulated):
     stays = log.runs[0]
     keep = np.r_[0:100, 105 : len(stays.time)]
     broken = replace(stays, time=stays.time[keep], signals={n: v[keep] for n, v in stays.signals.items()})
-    found = recorded.episodes(replace(log, runs=(broken,)), STEPS).trajectory
+    found = walks.episodes(replace(log, runs=(broken,)), STEPS).trajectory
     # The first tick of each piece and, because neither falls, the last one are not known.
     np.testing.assert_array_equal(found.alive.sum(axis=1), [98, len(keep) - 100 - 2])
     assert not found.fell.any()
@@ -163,7 +163,7 @@ def test_a_robot_that_gets_up_starts_another_episode(simulated):
     stays = log.runs[0]
     gravity = stays.signals["gravity"].copy()
     gravity[60:80] = gravity[90:100] = [1.0, 0.0, 0.0]  # it tumbles between two falls, and does not stand
-    found = recorded.episodes(replace(log, runs=(replace(stays, signals=stays.signals | {"gravity": gravity}),)), STEPS)
+    found = walks.episodes(replace(log, runs=(replace(stays, signals=stays.signals | {"gravity": gravity}),)), STEPS)
     np.testing.assert_array_equal(found.trajectory.fell, [True, False])
     np.testing.assert_array_equal(found.trajectory.alive.sum(axis=1), [59, len(stays.time) - 100 - 2])
 
@@ -172,7 +172,7 @@ def test_motors_off_are_a_fall(simulated):
     _, log = simulated
     stays = log.runs[0]
     enabled = np.where(np.arange(len(stays.time)) < 100, 1.0, 0.0)
-    found = recorded.episodes(replace(log, runs=(replace(stays, signals=stays.signals | {"enabled": enabled}),)), STEPS)
+    found = walks.episodes(replace(log, runs=(replace(stays, signals=stays.signals | {"enabled": enabled}),)), STEPS)
     np.testing.assert_array_equal(found.trajectory.fell, [True])
     np.testing.assert_array_equal(found.trajectory.alive.sum(axis=1), [99])
 
@@ -184,7 +184,7 @@ def test_a_fall_is_seen_after_the_policy_has_stopped(simulated):
     action = run.signals["action"].copy()
     action[onset - 2 :] = action[onset - 2]
     stopped = replace(run, signals=run.signals | {"action": action})
-    found = recorded.episodes(replace(log, rate_hz=500.0, runs=(stopped,)), STEPS).trajectory
+    found = walks.episodes(replace(log, rate_hz=500.0, runs=(stopped,)), STEPS).trajectory
     np.testing.assert_array_equal(found.fell, [True])
 
 
@@ -195,7 +195,7 @@ def test_a_policy_that_stops_is_not_made_up(simulated, rows_per_tick):
     action = run.signals["action"].copy()
     action[60 * rows_per_tick : 140 * rows_per_tick] = action[60 * rows_per_tick]
     paused = replace(run, signals=run.signals | {"action": action})
-    found = recorded.episodes(replace(log, rate_hz=100.0 * rows_per_tick, runs=(paused,)), STEPS).trajectory
+    found = walks.episodes(replace(log, rate_hz=100.0 * rows_per_tick, runs=(paused,)), STEPS).trajectory
     # 60 ticks before and the rest of 199 after 140, the first, the last and what borders on the pause left out.
     assert found.alive.shape[0] == 2
     np.testing.assert_allclose(found.alive.sum(axis=1), [58, 57], atol=2)
@@ -205,8 +205,8 @@ def test_a_policy_that_stops_is_not_made_up(simulated, rows_per_tick):
 def test_a_long_run_is_several_episodes(simulated):
     _, log = simulated
     stays = log.runs[0]
-    whole = recorded.episodes(replace(log, runs=(stays,)), STEPS)
-    parts = recorded.episodes(replace(log, runs=(stays,)), 80)
+    whole = walks.episodes(replace(log, runs=(stays,)), STEPS)
+    parts = walks.episodes(replace(log, runs=(stays,)), 80)
     assert parts.trajectory.obs.shape == (3, 80, 40)
     np.testing.assert_array_equal(parts.trajectory.alive.sum(axis=1), [80, 80, STEPS - 3 - 160])
     for one, other in (
@@ -218,10 +218,10 @@ def test_a_long_run_is_several_episodes(simulated):
 
 def test_beginnings_are_of_every_run_the_first_steps_of_its_first_episode(simulated):
     _, log = simulated
-    whole = recorded.episodes(log, STEPS)
+    whole = walks.episodes(log, STEPS)
     steps = int(whole.trajectory.alive[3].sum())
     for length in (steps - 1, steps, steps + 1):
-        pieces = recorded.episodes(log, length)
+        pieces = walks.episodes(log, length)
         first = np.unique(np.asarray(pieces.run), return_index=True)[1]
         jax.tree.map(
             partial(np.testing.assert_allclose, rtol=1e-6, atol=1e-6),
@@ -230,33 +230,33 @@ def test_beginnings_are_of_every_run_the_first_steps_of_its_first_episode(simula
         )
         assert recorded.beginning(whole, length).trajectory.fell[3] == (length >= steps)
     # Longer than what was cut, which is shorter than the walks.
-    assert recorded.beginning(recorded.episodes(log, 50), 60).power.shape == (4, 50)
+    assert recorded.beginning(walks.episodes(log, 50), 60).power.shape == (4, 50)
 
 
 def test_a_walk_is_the_same_in_one_piece_and_in_several(simulated):
     _, log = simulated
-    one, power = recorded.whole(recorded.episodes(log, STEPS), 150)
-    other, same_power = recorded.whole(recorded.episodes(log, 40), 150)
+    one, power = recorded.whole(walks.episodes(log, STEPS), 150)
+    other, same_power = recorded.whole(walks.episodes(log, 40), 150)
     jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-6, atol=1e-6), (one, power), (other, same_power))
-    ends = recorded.episodes(log, STEPS).trajectory.alive.sum(axis=1)
+    ends = walks.episodes(log, STEPS).trajectory.alive.sum(axis=1)
     np.testing.assert_array_equal(one.fell, [False, False, *(ends[2:] <= 150)])
     np.testing.assert_array_equal(one.alive.sum(axis=1), np.minimum(ends, 150))
     assert one.fell.any()
     # A fall in the last step is one, in the step after it is none.
     last = int(ends[3])
-    assert [bool(recorded.whole(recorded.episodes(log, STEPS), last + more)[0].fell[3]) for more in (-1, 0)] == [0, 1]
+    assert [bool(recorded.whole(walks.episodes(log, STEPS), last + more)[0].fell[3]) for more in (-1, 0)] == [0, 1]
 
 
 def test_a_lost_row_is_no_end_of_a_walk(simulated):
     """Of one walk a row is lost, of one that falls as well: what comes after the gap counts."""
     _, log = simulated
-    entire, _ = recorded.whole(recorded.episodes(log, STEPS), STEPS)
+    entire, _ = recorded.whole(walks.episodes(log, STEPS), STEPS)
     fall = int(entire.alive[2].sum())
     runs = []
     for run, row in ((log.runs[0], 100), (log.runs[2], fall - 10)):
         keep = np.delete(np.arange(len(run.time)), row)
         runs.append(replace(run, time=run.time[keep], signals={n: v[keep] for n, v in run.signals.items()}))
-    walked, _ = recorded.whole(recorded.episodes(replace(log, runs=tuple(runs)), STEPS), STEPS - 3)
+    walked, _ = recorded.whole(walks.episodes(replace(log, runs=tuple(runs)), STEPS), STEPS - 3)
     np.testing.assert_array_equal(walked.fell, [False, True])
     for found, expected, row in zip(walked.alive, entire.alive[np.array([0, 2]), :-3], (100, fall - 10), strict=True):
         # A step is a row with the ones before and after it; the first step is that of the second row.
@@ -269,7 +269,7 @@ def test_a_walk_ends_with_its_first_fall(simulated):
     gravity = log.runs[0].signals["gravity"].copy()
     gravity[60:62] = [1.0, 0.0, 0.0]
     tripped = replace(log, runs=(replace(log.runs[0], signals=log.runs[0].signals | {"gravity": gravity}), log.runs[1]))
-    pieces = recorded.episodes(tripped, STEPS)
+    pieces = walks.episodes(tripped, STEPS)
     np.testing.assert_array_equal(pieces.run, [0, 0, 1])
     np.testing.assert_array_equal(pieces.begin, [0, 62, 0])
     walked, power = recorded.whole(pieces, STEPS)
@@ -286,7 +286,7 @@ def test_a_fall_in_a_hole_of_the_rows_is_a_fall(simulated):
     gravity[100:110] = [1.0, 0.0, 0.0]
     keep = np.r_[0:80, 105 : len(run.time)]
     signals = {name: values[keep] for name, values in (run.signals | {"gravity": gravity}).items()}
-    pieces = recorded.episodes(replace(log, runs=(replace(run, time=run.time[keep], signals=signals),)), STEPS)
+    pieces = walks.episodes(replace(log, runs=(replace(run, time=run.time[keep], signals=signals),)), STEPS)
     np.testing.assert_array_equal(pieces.trajectory.fell, [True, False])
     walked, _ = recorded.whole(pieces, STEPS)
     np.testing.assert_array_equal(walked.fell, [True])
@@ -301,18 +301,18 @@ def test_a_trunk_that_sinks_has_fallen_whether_its_height_was_measured_or_not(si
     folded[120:] = [0.0, 1.2, -2.4, 0.0, 1.2, -2.4]  # feet under the hips, 0.22 m below them
     signals = run.signals | {"q": folded}
     del signals["pos"]
-    found = recorded.episodes(replace(log, runs=(replace(run, signals=signals),)), STEPS).trajectory
+    found = walks.episodes(replace(log, runs=(replace(run, signals=signals),)), STEPS).trajectory
     np.testing.assert_array_equal(found.fell, [True])
     np.testing.assert_array_equal(found.alive.sum(axis=1), [119])
     # Of a walk the legs say what was measured, and as long as it is up on its feet they never say that it sinks.
     upright = without(log, "pos")
-    same_fell = recorded.episodes(upright, STEPS).trajectory
-    np.testing.assert_array_equal(same_fell.alive, recorded.episodes(without(log), STEPS).trajectory.alive)
+    same_fell = walks.episodes(upright, STEPS).trajectory
+    np.testing.assert_array_equal(same_fell.alive, walks.episodes(without(log), STEPS).trajectory.alive)
 
 
 def test_commands_to_repeat_an_episode_hold_until_its_end_and_beyond(simulated):
     _, log = simulated
-    found = recorded.episodes(log, STEPS)
+    found = walks.episodes(log, STEPS)
     for episode in (0, 2):
         obs, alive = found.trajectory.obs[episode], int(found.trajectory.alive[episode].sum())
         # The first row is the tick before the first step.
@@ -328,7 +328,7 @@ def test_commands_to_repeat_an_episode_hold_until_its_end_and_beyond(simulated):
 def test_a_first_action_that_cannot_be_heard_is_a_step_too(simulated):
     _, log = simulated
     fast = replace(log, rate_hz=500.0, runs=tuple(faster(run, 5) for run in log.runs))
-    slow, found = recorded.episodes(log, STEPS), recorded.episodes(fast, STEPS)
+    slow, found = walks.episodes(log, STEPS), walks.episodes(fast, STEPS)
     assert found.commands.command.shape == (4, STEPS + 2, 3)
     np.testing.assert_allclose(found.commands.phase, slow.commands.phase, atol=1e-6)
 
@@ -337,7 +337,7 @@ def test_torque_that_was_not_measured_is_what_the_controller_commanded(simulated
     _, log = simulated
     run = log.runs[0]
     signals = {name: values for name, values in run.signals.items() if name != "tau"}
-    found = recorded.episodes(replace(log, runs=(replace(run, signals=signals),)), STEPS)
+    found = walks.episodes(replace(log, runs=(replace(run, signals=signals),)), STEPS)
     target = run.signals["target"]
     target = np.concatenate([target[:1], target[:-1]])
     wanted = np.clip(60 * (target - run.signals["q"]) - 2 * run.signals["dq"], -60, 60)
@@ -376,7 +376,7 @@ def without(log, *names):
 )
 def test_what_is_no_walk_is_named(simulated, damage, named):
     with pytest.raises(ValueError, match=named):
-        recorded.episodes(damage(simulated[1]), STEPS)
+        walks.episodes(damage(simulated[1]), STEPS)
 
 
 def still(run):
