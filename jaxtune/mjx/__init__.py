@@ -16,9 +16,9 @@ This package is the only one in jaxtune that imports MuJoCo; the tuner does with
 """
 
 from jaxtune.mjx.derived_fields import set_const
+from jaxtune.mjx.entry import Entry
 from jaxtune.mjx.episodes import Robot, in_chunks, rollout
 from jaxtune.mjx.parameters import (
-    Entry,
     Params,
     apply,
     apply_mujoco,

@@ -18,7 +18,7 @@ import mujoco
 import numpy as np
 from mujoco import mjx
 
-from jaxtune.mjx.parameters import Entry
+from jaxtune.mjx.entry import Entry
 
 Names = str | Sequence[str] | None
 """One name, several, or None for all objects of the kind."""

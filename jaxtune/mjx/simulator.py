@@ -25,8 +25,9 @@ from mujoco import mjx
 from jaxtune import dist as dists
 from jaxtune.mjx import parameters
 from jaxtune.mjx.derived_fields import DERIVED
+from jaxtune.mjx.entry import Entry
 from jaxtune.mjx.episodes import rollout
-from jaxtune.mjx.parameters import Entry, Params
+from jaxtune.mjx.parameters import Params
 from jaxtune.types import Coords, ParamDist, Trajectory
 
 Act = Callable[[Any, Any, jax.Array], jax.Array]

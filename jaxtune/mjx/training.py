@@ -10,8 +10,9 @@ import jax.numpy as jnp
 from brax.envs.base import Env as BraxEnv
 from brax.envs.base import State as BraxState
 
+from jaxtune.mjx.entry import Entry
 from jaxtune.mjx.episodes import Robot
-from jaxtune.mjx.parameters import Entry, Params, nominal
+from jaxtune.mjx.parameters import Params, nominal
 
 
 class TrainingBatch(BraxEnv):
