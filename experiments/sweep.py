@@ -110,7 +110,7 @@ def program(learner: Learner, truth: Mapping[str, float], policy: Policy) -> Cal
       policy: what walks in every lane; it is never trained.
     """
     target = MjxTarget(robot=learner.robot, params=truth)
-    fixed = dataclasses.replace(learner.tuner(target), train_policy=_keep, update=tuner.vote_update)
+    fixed = dataclasses.replace(learner.tuner(target), train_policy=tuner.keep, update=tuner.vote_update)
     dist = learner.dist(parameters.nominal(learner.entries), 1.0)  # each lane sets a radius of its own
 
     def one(step_size, widen_factor, radius, level, seed):
@@ -123,11 +123,6 @@ def program(learner: Learner, truth: Mapping[str, float], policy: Policy) -> Cal
         return state.dist, info
 
     return jax.jit(lambda columns: jax.vmap(one)(*columns.T))
-
-
-def _keep(key, policy, dist):
-    """Returns the policy as it is; stands in for the tuner's `train_policy`, since nothing is trained."""
-    return policy, {}
 
 
 def mean_error(learner: Learner, truth: Mapping[str, float], centre: Coords, off: Sequence[str]) -> np.ndarray:

@@ -130,7 +130,8 @@ class HalfCheetah:
         self._env = gymnasium.make("HalfCheetah-v5").unwrapped
         self._nominal = self._env.model
         self._sizes = sizes
-        self.tune = HostTuner(config=sizes.tuner, simulate=one_by_one(self._play_coords)).tune
+        self._simulate = one_by_one(self._play_coords)
+        self.tune = HostTuner(config=sizes.tuner, simulate=self._simulate).tune
 
     def policy(self, out: Path) -> np.ndarray:
         kept = out / "policy.npy"
@@ -140,11 +141,8 @@ class HalfCheetah:
         return np.load(kept)
 
     def measure(self, key: jax.Array, policy: np.ndarray, truth: Mapping[str, float]) -> Trajectory:
-        coords = {name: np.float32(value) for name, value in parameters.to_coords(self.entries, truth).items()}
-        count = self._sizes.tuner.set_episodes
-        return one_by_one(self._play_coords)(
-            key, policy, {name: np.full(count, value) for name, value in coords.items()}
-        )
+        coords, count = parameters.to_coords(self.entries, truth), self._sizes.tuner.set_episodes
+        return self._simulate(key, policy, {name: np.full(count, value) for name, value in coords.items()})
 
     def _play_coords(self, seed: int, policy: np.ndarray, coords: Mapping[str, float]) -> dict[str, list]:
         steps = min(150, self._sizes.episode_steps)

@@ -116,8 +116,7 @@ class Entry:
         if not self.fields and self.kind != "control":
             raise ValueError("fields: got none, expected at least one")
         met = []
-        for field in self.fields:
-            name, *column = (field,) if isinstance(field, str) else field
+        for name, *column in self.cells:
             array = getattr(model, name, None)
             if not hasattr(array, "shape"):
                 raise ValueError(f"fields: got '{name}', which mjx.Model does not have")
@@ -144,9 +143,14 @@ class Entry:
             )
 
     @property
+    def cells(self) -> tuple[tuple, ...]:
+        """Fields as tuples: (name, column), or (name,) for all columns."""
+        return tuple((field,) if isinstance(field, str) else field for field in self.fields)
+
+    @property
     def field_names(self) -> tuple[str, ...]:
         """Names of the fields, without their columns."""
-        return tuple(field if isinstance(field, str) else field[0] for field in self.fields)
+        return tuple(name for name, *_ in self.cells)
 
     @property
     def unit(self) -> float:

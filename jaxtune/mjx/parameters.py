@@ -201,8 +201,7 @@ def _cells(model, params, entries):
     The values are a scalar, or one per row where the parameter has one per target.
     """
     for name, entry in select(entries, tuple(params)).items():
-        for field in entry.fields:
-            field, *column = (field,) if isinstance(field, str) else field
+        for field, *column in entry.cells:
             try:
                 rows, owner = entry.rows(model, field)
             except ValueError as error:
