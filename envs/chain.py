@@ -4,7 +4,7 @@ The effects are rows of `envs.effects`, which draws the stages that they act at;
 them. `envs.rig` uses it for a robot whose base is fixed, `envs.corrected` for a BITeno that walks.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import chex
@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from mujoco import mjx
 
+from envs import stepping
 from jaxtune.types import Effect
 
 MIN_FRICTION_NM = 1e-6
@@ -79,8 +80,6 @@ class Chain:
     lead_s: float = 0.0
     """How far positions of the simulation are ahead of its velocities; half a step makes semi-implicit Euler of second
     order, which is then the leapfrog scheme."""
-    advance: Callable[[mjx.Model, mjx.Data], mjx.Data] = mjx.step
-    """One step of the physics."""
 
     def step(self, model: mjx.Model, data: mjx.Data, memory: dict, values, x) -> tuple[mjx.Data, dict, dict]:
         """Simulates one step of the physics, from the controller's inputs to the robot's motion.
@@ -112,7 +111,7 @@ class Chain:
             qfrc_applied=data.qfrc_applied.at[self.dof].set(torque + rubbing),
             xfrc_applied=data.xfrc_applied.at[self.bodies, :3].set(wrench.force),
         )
-        return self.advance(moved, data), memory, read
+        return stepping.step(moved, data), memory, read
 
     def read(self, values, memory: dict, joint: jax.Array, x) -> jax.Array:
         """Reads the joints through the effects of transmission and sensors, without advancing a memory.

@@ -17,7 +17,7 @@ import mujoco
 import numpy as np
 from mujoco import mjx
 
-from envs import sensing, stepping
+from envs import sensing
 from envs.axes import Axis, describe_axis
 from envs.chain import MIN_FRICTION_NM, Chain
 from envs.effects import EVERY
@@ -96,9 +96,7 @@ class Rig:
         # A robot on a rig has no feet on the ground, so effects of contact have no place and drop out below.
         self.places = {"joint": self.joints, "body": self.bodies, "foot": (), "robot": ("robot",)}
         self.effects = {row.name: row for row in EVERY.values() if self.places[row.on] and row.needs != "free"}
-        self.chain = Chain(
-            self.dt, tuple(self.effects.values()), self.qpos, self.dof, self._bodies, 0.5 * self.dt, stepping.step
-        )
+        self.chain = Chain(self.dt, tuple(self.effects.values()), self.qpos, self.dof, self._bodies, 0.5 * self.dt)
         self.axes = self._describe_axes()
         # The IMU is taken to sit on the first body, which carries the others.
         self._gravity = sensing.projected_gravity(jnp.asarray(model.body_quat[1], jnp.float32))

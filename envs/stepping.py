@@ -1,6 +1,6 @@
-"""A step of MJX whose constraint solver has exact line searches: about twice as fast for a robot on a rig.
+"""A step of MJX whose constraint solver has exact line searches: about twice as fast as its own for one robot.
 
-On a CPU, MJX spends more than half of such a robot's step in the line searches of its solver. The cost of friction,
+On a CPU, MJX spends half of the step of a robot and more in the line searches of its solver. The cost of friction,
 limits and equalities along a direction is piecewise quadratic, so its minimum can be computed at once: the slope is
 evaluated at all kinks, and is linear between the two around its zero.
 """
@@ -40,7 +40,7 @@ def solve(model: mjx.Model, data: mjx.Data) -> mjx.Data:
       data: with its constraints, and its accelerations without them.
 
     Returns:
-      The data with `qacc` and `qfrc_constraint`.
+      The data with `qacc`, `qfrc_constraint`, and `efc_force`, of which forces of contacts are computed.
     """
     rows = data._impl
     jacobian, stiffness, reference = rows.efc_J, rows.efc_D, rows.efc_aref
@@ -87,7 +87,8 @@ def solve(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
     last = data.qacc_warmstart
     found = jax.lax.fori_loop(0, model.opt.iterations, improve, jnp.where(cost(last) < cost(free), last, free))
-    return data.replace(qacc=found, qfrc_constraint=-jacobian.T @ jnp.clip(pressed(found), low, high))
+    force = -jnp.clip(pressed(found), low, high)
+    return data.replace(qacc=found, qfrc_constraint=jacobian.T @ force, _impl=rows.replace(efc_force=force))
 
 
 def _solved(matrix: jax.Array, vector: jax.Array) -> jax.Array:

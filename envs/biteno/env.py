@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 from mujoco import mjx
 
-from envs import sensing
+from envs import sensing, stepping
 from envs.biteno import constants, gait, rewards
 from envs.biteno.task import Drive, Motion, State, TaskConfig
 from envs.chain import MIN_FRICTION_NM
@@ -183,7 +183,9 @@ class Biteno:
         model = self.model(params)
         # The solver starts from the last step's accelerations, as it would in one continuous simulation.
         data = self._data.replace(qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.qacc_warmstart)
-        data, _ = jax.lax.scan(lambda data, ctrl: (mjx.step(model, data.replace(ctrl=ctrl)), None), data, drive.targets)
+        data, _ = jax.lax.scan(
+            lambda data, ctrl: (stepping.step(model, data.replace(ctrl=ctrl)), None), data, drive.targets
+        )
         return Motion(
             qpos=data.qpos,
             qvel=data.qvel,

@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 from mujoco import mjx
 
+from envs import stepping
 from envs.sensing import projected_gravity
 from jaxtune.mjx import Simulator, action_delay, field, friction, mass, strength
 
@@ -74,7 +75,7 @@ class Go2:
     def step(self, state: State, action: jax.Array) -> State:
         """Moves the robot by one policy step, under an action [12]."""
         data = state.data.replace(ctrl=_STAND_RAD + _ACTION_RAD * action)
-        data, _ = jax.lax.scan(lambda data, _: (mjx.step(self._mjx_model, data), None), data, length=_SUBSTEPS)
+        data, _ = jax.lax.scan(lambda data, _: (stepping.step(self._mjx_model, data), None), data, length=_SUBSTEPS)
         rotation = data.xmat[1]
         linear, angular = rotation.T @ data.qvel[:3], data.qvel[3:6]
         terms = {

@@ -6,8 +6,8 @@ import mujoco
 import numpy as np
 import pytest
 import reference
-from mujoco import mjx
 
+from envs import stepping
 from envs.biteno import Biteno, Motion, TaskConfig, constants
 from jaxtune.mjx import TrainingBatch
 
@@ -430,7 +430,7 @@ def test_a_step_remembers_its_action_and_the_error_it_left(start, step):
 
 def idle(monkeypatch, move=lambda model, data: data):
     """Has another physics stand in, for the sake of a quick compilation."""
-    monkeypatch.setattr(mjx, "step", move)
+    monkeypatch.setattr(stepping, "step", move)
 
 
 def test_raiberts_base_is_the_reference_of_phase_and_command(start, monkeypatch):
