@@ -300,7 +300,7 @@ class Rig:
         # Part of a motor's torque accelerates its own rotor and does not press on the gears (`envs.effects`).
         rotor, acceleration = model.dof_armature[self.dof], jnp.gradient(truth[:, 1], self.dt, axis=0)
         # Encoders sit on the motor. Until its offset from the joint is known, its readings stand for the joint's.
-        memory = chain.start(values, truth[0], jax.tree.map(lambda x: x[0], drive))
+        memory = chain.start(values, truth[0], jax.tree.map(lambda x: x[0], drive), segment.past)
 
         def remember(memory, inputs):
             state, carried, x = inputs

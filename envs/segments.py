@@ -36,6 +36,8 @@ COMPARED = ("q", "dq", "tau", "abs_tau", "gravity")
 HISTORY_S = LONGEST_S + 0.02
 """Length of the history before a segment, in s: the longest delay and some time for lags to settle."""
 
+_PAST_S, _PAST_STEP_S = 2.0, 0.01  # before the history: how far back positions are kept, and the time between them
+
 
 @chex.dataclass(frozen=True)
 class Segment:
@@ -57,6 +59,9 @@ class Segment:
     # [before + 1 + ahead, 2, joints] rad and rad/s, smoothed. Index `before` is the start; the `LONGEST_S / dt` steps
     # `ahead` of it are what undoing a sensor's delay needs.
     measured: jax.Array
+    # [past, joints] rad, smoothed positions every 10 ms in the 2 s that lead to the first of `measured`. Bristles of dry
+    # friction are wound by them; in slow motion the history alone is too short for that.
+    past: jax.Array
     row_step: jax.Array  # [rows] the last step at or before each row; 0 is the segment's start
     row_share: jax.Array  # [rows] share of a step between that step and the row
 
@@ -229,12 +234,14 @@ def _of_run(run: Run, states: np.ndarray, start: np.ndarray, rows: np.ndarray, a
     # delay of whole rows would then seem likelier than any other.
     acceleration = np.gradient(velocity, run.time, axis=0)
     between_rows = [hermite(run.time, *pair, fine)[0] for pair in ((position, velocity), (velocity, acceleration))]
+    past = begin - HISTORY_S + _PAST_STEP_S * np.arange(-round(_PAST_S / _PAST_STEP_S), 1)
     return Segment(
         target=target,
         between=between,
         **{name: values.astype(np.float32)[last] for name, values in held.items()},
         sample=np.diff(ticks, axis=1, prepend=-np.inf) > 0,
         measured=np.stack(between_rows, axis=2).astype(np.float32),
+        past=hermite(run.time, position, velocity, past)[0].astype(np.float32),
         row_step=step,
         row_share=np.clip(at - step, 0.0, 1.0).astype(np.float32),
     )

@@ -91,6 +91,7 @@ def segment(rig, start, target, kp=0.0, kd=0.0, limit=np.inf, feed=0.0, emf=0.0,
         **{name: np.broadcast_to(value, target.shape).astype(np.float32) for name, value in held.items()},
         sample=(np.arange(len(target)) - before) % every == 0,
         measured=measured.astype(np.float32),
+        past=measured[:1, 0].astype(np.float32),
         row_step=np.arange(steps, dtype=np.int32),
         row_share=np.zeros(steps, np.float32),
     )

@@ -4,6 +4,7 @@ The signal is [2, joints]: the bound of dry friction in Nm, for which the engine
 Nm. Where bristles are, they take the bound over.
 """
 
+import jax
 import jax.numpy as jnp
 
 from jaxtune.types import Effect, Parameter
@@ -21,10 +22,14 @@ def _presliding(values, friction, now, memory):
     return jnp.stack([jnp.where(there, 0.0, bound), torque - jnp.where(there, bound * wound, 0.0)]), wound
 
 
-def _slack(values, friction, dt):
-    """Starts with bristles that stand upright; the history of a segment winds them up."""
-    del values, dt
-    return jnp.zeros_like(friction[0])
+def _wound(values, positions, dt):
+    """Starts with bristles as past positions [past, joints] have wound them, upright before the first of these."""
+    del dt
+
+    def wind(wound, moved):
+        return jnp.clip(wound + moved / jnp.maximum(values["travel_rad"], 1e-9), -1.0, 1.0), None
+
+    return jax.lax.scan(wind, jnp.zeros_like(positions[0]), jnp.diff(positions, axis=0))[0]
 
 
 PRESLIDING = Effect(
@@ -35,7 +40,7 @@ PRESLIDING = Effect(
     parameters=(Parameter(name="travel_rad", bounds=(0.0, 0.05), prior=0.005),),
     sizes=(0.0005, 0.005),
     act=_presliding,
-    start=_slack,
+    start=_wound,
     sentence="Friction sets in over a small travel instead of at once.",
     excited_by="slow triangular reversals of a few milliradians",
 )

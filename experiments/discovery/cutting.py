@@ -108,7 +108,10 @@ def told_alike(null: Cuts, measured: Cuts) -> Cuts:
     """
     return {
         split: {
-            horizon: replace(own, inputs=measured[split][horizon].inputs.replace(measured=own.inputs.measured))
+            horizon: replace(
+                own,
+                inputs=measured[split][horizon].inputs.replace(measured=own.inputs.measured, past=own.inputs.past),
+            )
             for horizon, own in lengths.items()
         }
         for split, lengths in null.items()

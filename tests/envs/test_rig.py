@@ -1,14 +1,16 @@
 """A robot on the rig moves as MuJoCo C moves it."""
 
+import jax
 import mujoco
 import numpy as np
 import pytest
 import reference
 import rigs
 
-from envs import models
+from envs import models, segments
 from envs.biteno import constants
 from envs.effects import LIBRARY
+from envs.logs import Controller, Run
 from envs.models import suspended
 from envs.rig import Rig
 
@@ -164,6 +166,40 @@ def test_a_wound_up_arm_rests_where_its_springs_let_it(arm, plain, damping):
     np.testing.assert_allclose(read["tau"][-1], data.qfrc_bias, rtol=1e-3)
     # Without them it is out of balance, by 0.1 rad of the shoulder's posture.
     assert np.abs(arm.play(segment)["q"] - motor).max() > 2e-3
+
+
+def test_bristles_of_a_segment_are_where_its_motion_has_wound_them(arm):
+    # Up and down again by 60 mrad, in 2 s each: after the reversal bristles of 4 mrad need longer than the 0.06 s before
+    # a segment to be wound the other way.
+    dt, rows = arm.rig.dt, slice(None, None, 5)
+    target = START + np.concatenate([np.linspace(0.0, 0.06, 2000), np.linspace(0.06, 0.0, 2000)])[:, None]
+    rubbing = {
+        "coulomb": {name: {"torque_nm": 0.5} for name in rigs.ARM_JOINTS},
+        "presliding": {name: {"travel_rad": 0.004} for name in rigs.ARM_JOINTS},
+    }
+    drive = {"kp": np.array([60.0, 40.0]), "kd": np.array([2.0, 1.0]), "torque_limit_nm": np.array([20.0, 20.0])}
+    read = arm.play(rigs.segment(arm.rig, START, target, drive["kp"], drive["kd"], 20.0, steps=4000), **rubbing)
+    run = Run(
+        name="run_000",
+        condition="slow",
+        split=None,
+        controller=Controller(kind="pd", rate_hz=rigs.CONTROL_HZ, gains=drive, between_rows="hold"),
+        time=dt * np.arange(4000)[rows],
+        signals={"q": read["q"][rows], "dq": read["dq"][rows], "target": target[rows]},
+    )
+
+    cut = segments.cut([run], 0.15, dt).segments
+    measured = segments.cut([run], 0.15, dt).signals["q"]
+
+    def error(past):
+        played = [
+            arm.play(jax.tree.map(lambda leaf, one=one: leaf[one], cut.replace(past=past)), **rubbing)["q"]
+            for one in range(len(measured))
+        ]
+        return np.sqrt(((np.array(played) - measured) ** 2).mean())
+
+    assert np.ptp(read["q"], axis=0).min() > 0.03
+    assert error(cut.past) < 0.2 * error(np.zeros_like(cut.past))
 
 
 def test_the_imu_reads_gravity_as_it_is_mounted(arm):
