@@ -59,8 +59,8 @@ class Segment:
     # [before + 1 + ahead, 2, joints] rad and rad/s, smoothed. Index `before` is the start; the `LONGEST_S / dt` steps
     # `ahead` of it are what undoing a sensor's delay needs.
     measured: jax.Array
-    # [past, joints] rad, smoothed positions every 10 ms in the 2 s that lead to the first of `measured`. Bristles of dry
-    # friction are wound by them; in slow motion the history alone is too short for that.
+    # [past, joints] rad, smoothed positions every 10 ms in the 2 s that lead to the first of `measured`. They wind up
+    # the bristles of dry friction; in slow motion the history alone is too short for that.
     past: jax.Array
     row_step: jax.Array  # [rows] the last step at or before each row; 0 is the segment's start
     row_share: jax.Array  # [rows] share of a step between that step and the row

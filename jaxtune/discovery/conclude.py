@@ -20,7 +20,7 @@ from jaxtune.discovery.decide import (
     units_of,
     weigh_evidence,
 )
-from jaxtune.discovery.evaluate import rms
+from jaxtune.discovery.evaluate import rms, usual
 from jaxtune.discovery.fit import Fit, begin, polish, refine, taken_over
 from jaxtune.discovery.noise_floor import Floor, NoiseFloor, Say
 from jaxtune.discovery.problem import Hypothesis, Problem, acts_within
@@ -244,9 +244,8 @@ def _gap_on_select(at: Floor, residual: np.ndarray) -> float:
 
 
 def _open_gaps(problem: Problem, at: Floor, candidate: Candidate) -> np.ndarray:
-    """Gaps of all positions on `train` and `select`, [positions]."""
-    found = rms(at, np.concatenate([candidate.fit.residual, candidate.select]))
-    return found[[signal == "q" for signal, _ in problem.cells]]
+    """Gaps of all positions on `train` and `select`, [positions], rare segments left out."""
+    return usual(at, candidate)[[signal == "q" for signal, _ in problem.cells]]
 
 
 def _at_bounds(problem: Problem, fit: Fit, price: float) -> dict[int, float]:

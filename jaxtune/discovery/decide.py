@@ -64,7 +64,8 @@ class Evidence:
     """Fall of the cost on `select` alone, where nothing was fitted, prior included."""
     floors: float
     """Root of the largest fall of a single component's mean square on `select`, in floor units. It is that of all
-    segments or of typical ones (`Counts.variances`), where it is the larger share of what is left."""
+    segments but a few (`Counts.usual`) or of typical ones (`Counts.variances`), where it is the larger share of what is
+    left."""
     left: float
     """Rms of the worst component on `select` with the effect, in floor units, of the same segments."""
     relief: float
@@ -162,7 +163,7 @@ def weigh_evidence(
     clearest = int(distance.argmax())
     relief = ablated.fit.penalty - candidate.fit.penalty
     mean_squares = [_finite(one[held_out:]) / at.counts.bins for one in (before, now)]
-    measures = [[one.mean(axis=0) for one in mean_squares], [at.counts.variances(one) for one in mean_squares]]
+    measures = [[measure(one) for one in mean_squares] for measure in (at.counts.usual, at.counts.variances)]
     falls = [(np.sqrt(max((was - now).max(), 0.0)), np.sqrt(now.max())) for was, now in measures]
     floors, left = max(falls, key=lambda pair: pair[0] / pair[1])
     evidence = Evidence(

@@ -12,12 +12,14 @@ def rms(at: Floor, residual: np.ndarray) -> np.ndarray:
     return np.sqrt((at.unflatten(residual) ** 2).mean(axis=(0, 1)))
 
 
-def worst(at: Floor, candidate: Candidate) -> float:
-    """Returns the rms of the worst component of all signals on `train` and `select`, in floor units.
+def usual(at: Floor, candidate: Candidate) -> np.ndarray:
+    """Root mean squares [components] on `train` and `select` in floor units, without the worst segments of each.
 
-    A model whose worst component is near one is at the floor: the logs hold nothing more to find.
+    Which segments these are is in `Counts.usual`. A model whose worst component is near one is at the floor: the logs
+    hold nothing more to find.
     """
-    return float(rms(at, np.concatenate([candidate.fit.residual, candidate.select])).max())
+    residual = np.concatenate([candidate.fit.residual, candidate.select])
+    return np.sqrt(at.counts.usual(at.counts.mean_squares(residual)))
 
 
 def position_gap(problem: Problem, root_mean_squares: np.ndarray) -> float:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from jaxtune.discovery.decide import Candidate, ablate, key_of, total_cost
-from jaxtune.discovery.evaluate import worst
+from jaxtune.discovery.evaluate import usual
 from jaxtune.discovery.fit import Fit, begin, polish, refine, taken_over
 from jaxtune.discovery.localise import localise
 from jaxtune.discovery.noise_floor import Floor, NoiseFloor, Say
@@ -123,7 +123,7 @@ def _next_base(at: Floor, state: State) -> Candidate | None:
 
 def _free(settings: Settings, problem: Problem, at: Floor, base: Candidate, state: State) -> list[Hypothesis]:
     """Lists what may join a model: forms of its effects, and other effects unless it is at the floor or full."""
-    full = state.screened and (len(base.effects) >= settings.most or worst(at, base) <= settings.at_floor)
+    full = state.screened and (len(base.effects) >= settings.most or usual(at, base).max() <= settings.at_floor)
     forms = [form for form in _unfree(problem, at) if any(form.shapes(h) for h in base.effects)]
     left_out = {h.key for h in state.best.hypotheses} - {h.key for h in base.hypotheses}
     return [

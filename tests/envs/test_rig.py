@@ -169,8 +169,8 @@ def test_a_wound_up_arm_rests_where_its_springs_let_it(arm, plain, damping):
 
 
 def test_bristles_of_a_segment_are_where_its_motion_has_wound_them(arm):
-    # Up and down again by 60 mrad, in 2 s each: after the reversal bristles of 4 mrad need longer than the 0.06 s before
-    # a segment to be wound the other way.
+    # Up and down again by 60 mrad, in 2 s each: after the reversal bristles of 4 mrad need longer than the 0.06 s
+    # before a segment to be wound the other way.
     dt, rows = arm.rig.dt, slice(None, None, 5)
     target = START + np.concatenate([np.linspace(0.0, 0.06, 2000), np.linspace(0.06, 0.0, 2000)])[:, None]
     rubbing = {

@@ -84,3 +84,13 @@ def test_the_pooled_cost_is_that_of_the_floor_below_it_and_logarithmic_above():
     # 10 rows; mean squares 0.6 and e^2: 10 * 0.5 (0.6 + 1 + 2).
     assert COUNTS.pooled_cost(np.array([0.6, np.e**2]), 10) == pytest.approx(18.0)
     np.testing.assert_allclose(COUNTS.pooled_weights(np.array([0.6, 9.0])), [0.5, 0.5 / 9.0])
+
+
+def test_a_rare_segment_is_left_out_of_the_usual_and_a_common_one_is_not():
+    # 100 segments of two components, a mean square of 1 each: the worst 2 are left out, in every component its own.
+    mean_squares = np.ones((100, 2))
+    mean_squares[[3, 50], 0] = 400.0
+    mean_squares[[7, 8, 9], 1] = 99.0
+    np.testing.assert_allclose(Counts.usual(mean_squares), [1.0, (97 * 1.0 + 99.0) / 98])
+    # Of few segments each counts.
+    np.testing.assert_allclose(Counts.usual(np.array([[1.0], [4.0]])), [2.5])
