@@ -48,7 +48,8 @@ def main(args: Args) -> None:
     """Reads the logs, runs the discovery, prints its verdict, and writes summary, details, model and report.
 
     Raises:
-      ValueError: an option is wrong, a log cannot be used, or the folder holds another run.
+      ValueError: an option is wrong, a log cannot be used, or the folder holds another run or belongs to a process that
+        still works there.
     """
     checkpoint.set_up_compiler(checkpoint.for_simulation())
     _check(args)
@@ -58,7 +59,7 @@ def main(args: Args) -> None:
         console.print(f"note: {note}", highlight=False, markup=False, soft_wrap=True)
     identity = {name: value for name, value in vars(args).items() if name not in ("out", "trust_log")}
     checkpoint.open_run(args.out, identity | {"logs": [str(path) for path in args.logs]})
-    with bars() as progress:
+    with checkpoint.lock(args.out / "summary.json"), bars() as progress:
         task = progress.add_task("simulating null logs", total=None)
         answer = investigate(
             args.logs,

@@ -56,18 +56,25 @@ class Benchmark:
 
         Returns:
           Content of `summary.json`.
+
+        Raises:
+          ValueError: another process answers the case.
         """
-        if self._answered(case) is None:
-            folder, log, began = self.out / "answers" / name_of(case), self.write(case), time.monotonic()
-            try:
-                gate.check(*read_logs([log]))
-                investigate([log], folder)
-            except Exception as error:  # one bad case must not end a night's work
-                folder.mkdir(parents=True, exist_ok=True)
-                answer = {"verdict": "failed", "message": f"{type(error).__name__}: {error}", "effects": []}
-                answer |= {"parameter_changes": [], "seconds": time.monotonic() - began}
-                write_json(folder / "failed.json", answer | {"traceback": traceback.format_exc()})
-        return self._answered(case)
+        folder = self.out / "answers" / name_of(case)
+        with checkpoint.lock(folder):
+            return self._answered(case) or self._answer(case, folder)
+
+    def _answer(self, case: Case, folder: Path) -> dict:
+        log, began = self.write(case), time.monotonic()
+        try:
+            gate.check(*read_logs([log]))
+            return investigate([log], folder).summary
+        except Exception as error:  # one bad case must not end a night's work
+            folder.mkdir(parents=True, exist_ok=True)
+            answer = {"verdict": "failed", "message": f"{type(error).__name__}: {error}", "effects": []}
+            answer |= {"parameter_changes": [], "seconds": time.monotonic() - began}
+            write_json(folder / "failed.json", answer | {"traceback": traceback.format_exc()})
+            return answer
 
     def _answered(self, case: Case) -> dict | None:
         folder = self.out / "answers" / name_of(case)

@@ -10,6 +10,7 @@ import pytest
 
 from envs import effects
 from envs.logs import read, splits
+from experiments.common import checkpoint
 from experiments.discovery import benchmark, field
 from experiments.discovery.field import motions, outside, robots, sizes, writing
 from experiments.discovery.field.bench import FieldBench
@@ -199,3 +200,18 @@ def test_a_case_that_fails_is_recorded_and_the_next_one_goes_on(tmp_path, monkey
     assert bench.answer(bench.cases[0])["verdict"] == "failed"
     assert bench.answer(bench.cases[0])["message"] == "ValueError: no floor"
     assert len(asked) == 1
+
+
+def test_a_case_that_another_process_answers_is_refused_and_not_failed(tmp_path, monkeypatch):
+    bench = FieldBench(tmp_path, "field_smoke", 3, 0.1)
+    monkeypatch.setattr(FieldBench, "write", lambda self, case: pytest.fail("it was begun"))
+    first, second = bench.cases[:2]
+    with (
+        checkpoint.lock(tmp_path / "answers" / benchmark.name_of(first)),
+        pytest.raises(ValueError, match="another process works on"),
+    ):
+        bench.answer(first)
+    assert not (tmp_path / "answers" / benchmark.name_of(first)).exists()
+    # Another case is nobody's.
+    with pytest.raises(pytest.fail.Exception, match="it was begun"):
+        bench.answer(second)

@@ -11,6 +11,7 @@ from envs.diagnosis.contacts import contacts
 from envs.diagnosis.finding import MISLEADING
 from envs.logs import Controller, read, write
 from experiments import discover
+from experiments.common import checkpoint
 from experiments.discovery import gate
 from experiments.discovery.blind_cases import ARM
 from experiments.discovery.blind_robots import Truth, record
@@ -202,6 +203,18 @@ def test_the_command_refuses_with_the_doctors_sentence_before_it_makes_a_folder(
     with pytest.raises(ValueError, match=r"set `units: \{angle: deg\}` in meta.yaml"):
         discover.main(discover.Args(logs=(folder,), out=tmp_path / "out", horizons=HORIZONS))
     assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_in_which_another_process_works_is_refused_before_anything_is_computed(tmp_path, good, monkeypatch):
+    folder, out = tmp_path / "log", tmp_path / "out"
+    write(replace(good, robot="arm.xml"), folder)
+    shutil.copy(ARM, folder / "arm.xml")
+    monkeypatch.setattr(discover, "investigate", lambda *_, **__: pytest.fail("it was begun"))
+    args = discover.Args(logs=(folder,), out=out, horizons=HORIZONS, trust_log=True)
+    with pytest.raises(pytest.fail.Exception, match="it was begun"):
+        discover.main(args)
+    with checkpoint.lock(out / "summary.json"), pytest.raises(ValueError, match="another process works on"):
+        discover.main(args)
 
 
 def test_flags_that_switch_physics_off_are_refused_unless_they_are_cleared(tmp_path, good):
