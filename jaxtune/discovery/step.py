@@ -91,6 +91,8 @@ def step(
     state = state.with_screen(settings, problem, found)
     leads = shortlist(settings, found, state.price)
     leads = leads[: settings.swaps] if swapping else leads + shaped(_unfree(problem, at), leads[: settings.shaped])
+    if base.fit is state.nominal:
+        leads = leads + stuck(state.null.fit, [h for h in free if problem.is_nominal(h)], leads)
     say(f"fit {len(leads)}")
     fitted = fit_leads(settings, at, base.fit, base.hypotheses, leads)
     broken = {key_of((*base.hypotheses, *lead.hypotheses)) for lead in leads} - {one.key for one in fitted}
@@ -174,6 +176,28 @@ def shaped(forms: Sequence[Hypothesis], leads: Sequence[Lead]) -> list[Lead]:
             # The least size may be too small to have a slope.
             point = np.concatenate([lead.point, form.probes[1]])
             found.append(Lead((*lead.hypotheses, form), point, lead.start, lead.cost))
+    return found
+
+
+def stuck(null: Fit, hypotheses: Sequence[Hypothesis], leads: Sequence[Lead]) -> list[Lead]:
+    """Lists the nominal parameters that went as far as they may in the null, each as a lead that lets it go on.
+
+    The screen holds nominal parameters near their belief, from where it may not see that one of them alone is far off.
+
+    Args:
+      null: the model without effects.
+      hypotheses: about nominal parameters.
+      leads: those that are fitted anyway.
+    """
+    known = {lead.hypotheses[0].key for lead in leads if len(lead.hypotheses) == 1}
+    low, high = null.free.bounds.T
+    at_bound = (null.coordinates <= low) | (null.coordinates >= high)
+    found = []
+    for hypothesis in (one for one in hypotheses if len(one.places) == 1 and one.key not in known):
+        if at_bound[taken_over(null.free, hypothesis)].any():
+            (axis,) = np.flatnonzero(hypothesis.directions[0])
+            point = null.vector[axis] / hypothesis.directions[:, axis]
+            found.append(Lead((hypothesis,), point, null.coordinates, null.cost))
     return found
 
 
