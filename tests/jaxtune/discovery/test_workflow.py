@@ -282,3 +282,18 @@ def test_an_effect_costs_what_chance_gains_on_null_logs():
     found, _ = step.step(Settings(level=0.05), asked, floor, begun)
     every, _ = step.step(Settings(level=1.0), asked, floor, begun)
     assert found.price >= every.price >= 2.0 * np.log(len(asked.hypotheses))
+
+
+def test_a_nominal_parameter_that_stops_at_its_bound_is_a_lead_of_its_own():
+    asked = problem({"mass": 0.6})
+    _, begun = state.begin(asked, measured_floor(asked))
+    nominal = [one for one in HYPOTHESES if asked.is_nominal(one)]
+    assert {one.name for one in nominal} == {"mass", "damping"}
+    (lead,) = step.stuck(begun.null.fit, nominal, [])
+    # Three deviations of a tenth, from where the null stopped: beside it a fit may go on.
+    assert [one.name for one in lead.hypotheses] == ["mass"]
+    np.testing.assert_allclose(lead.point, [0.3], rtol=1e-6)
+    np.testing.assert_array_equal(lead.start, begun.null.fit.coordinates)
+    assert step.stuck(begun.null.fit, nominal, [lead]) == []
+    near = problem({"mass": 0.05})
+    assert step.stuck(state.begin(near, measured_floor(near))[1].null.fit, nominal, []) == []
