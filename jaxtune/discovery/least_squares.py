@@ -49,10 +49,12 @@ class Counts:
     def usual(mean_squares: np.ndarray) -> np.ndarray:
         """Averages mean squares [segments, components] over all segments but the worst fiftieth, [components].
 
-        A joint that slips a moment too late leaves one segment 20 floor units off, in robots that lack nothing too.
+        A joint that slips a moment too late leaves one segment 20 floor units off, in robots that lack nothing too. One
+        that is not finite is never left out.
         """
         kept = len(mean_squares) - round(len(mean_squares) / _RARE)
-        return np.sort(mean_squares, axis=0)[:kept].mean(axis=0)
+        found = np.sort(mean_squares, axis=0)[:kept].mean(axis=0)
+        return np.where(np.isfinite(mean_squares).all(axis=0), found, np.nan)
 
     def cost(self, mean_squares: np.ndarray) -> np.ndarray:
         """Computes C without the prior from mean squares [segments, components]; returns what each segment adds."""

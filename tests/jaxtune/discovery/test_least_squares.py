@@ -92,5 +92,7 @@ def test_a_rare_segment_is_left_out_of_the_usual_and_a_common_one_is_not():
     mean_squares[[3, 50], 0] = 400.0
     mean_squares[[7, 8, 9], 1] = 99.0
     np.testing.assert_allclose(Counts.usual(mean_squares), [1.0, (97 * 1.0 + 99.0) / 98])
+    mean_squares[11, 1] = np.inf
+    np.testing.assert_array_equal(np.isnan(Counts.usual(mean_squares)), [False, True])
     # Of few segments each counts.
     np.testing.assert_allclose(Counts.usual(np.array([[1.0], [4.0]])), [2.5])
