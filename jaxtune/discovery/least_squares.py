@@ -49,7 +49,7 @@ class Counts:
     def usual(mean_squares: np.ndarray) -> np.ndarray:
         """Averages mean squares [segments, components] over all segments but the worst fiftieth, [components].
 
-        A leg that lacked nothing had one segment of 148 that was 18 floor units off, where the median was 0.8. A segment
+        A leg that lacked nothing had one segment that was 18 floor units off, where the median was 0.8. A segment
         that is not finite is never left out.
         """
         kept = len(mean_squares) - round(len(mean_squares) / _RARE)
