@@ -258,12 +258,13 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Form:
-    """Another form of an effect: one parameter more, which is free only after the effect was found."""
+    """Another form of an effect: parameters more, usually one, which are free only after the effect was found."""
 
     name: str
     effect: str
     """Row that has the parameter: the effect itself, or another one that acts beside it at the same places."""
-    parameter: str
+    parameter: str | None = None
+    """None for all parameters of that row."""
 
 
 @dataclass(frozen=True, kw_only=True)

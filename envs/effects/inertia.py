@@ -4,7 +4,7 @@
 confused with torque scale and friction; what separates them is a swing with the motors off.
 """
 
-from jaxtune.types import Effect, Parameter
+from jaxtune.types import Effect, Form, Parameter
 
 _INERTIA = {"family": "inertia", "on": "body", "enters": "model"}
 
@@ -35,8 +35,9 @@ ROWS = (
         name="payload",
         parameters=(Parameter(name="kg", scale="mass", bounds=(0.0, 4.0), prior=0.3, fields=("body_mass",)),),
         sizes=(0.05,),
-        sentence="A small heavy object is attached at the link's centre of mass.",
+        sentence="A small heavy object is attached to the link, at its centre of mass or beside it.",
         excited_by="a motor-off swing, and postures of high gravity torque",
+        forms=(Form("off_centre", "com_offset"),),
         **_INERTIA,
     ),
 )

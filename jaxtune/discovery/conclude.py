@@ -29,7 +29,6 @@ from jaxtune.discovery.result import AcceptedTerm, Settings, Suspect
 from jaxtune.discovery.state import State
 
 _CLEAR = 2.0  # standard errors
-_PERFECT = 1.0  # floor units
 _SUSPECTS = 8
 _BOUND = 1e-6  # of the width of the bounds: how near to one a coordinate is at it
 
@@ -80,10 +79,10 @@ def conclude(settings: Settings, problem: Problem, floor: NoiseFloor, state: Sta
     say("learned torque")
     learned = learn(settings, problem, at, best)
     models = _by_select(at, state, best, learned)
-    null, after, bound = (_open_gaps(problem, at, one) for one in (state.null, best, learned))
-    share = explained(null, after, np.minimum(bound, after))
-    enough = share >= settings.share and explained(null, after, np.ones(len(null))) >= settings.least
-    explains = after.max() <= settings.at_floor or (bool(terms) and enough)
+    null, after, bound = (total_cost(at, one, 0.0) for one in (state.null, best, learned))
+    share = explained(null, after, min(bound, after))
+    enough = share >= settings.share and explained(null, after, _floor_cost(at, best)) >= settings.least
+    explains = _open_gaps(problem, at, best).max() <= settings.at_floor or (bool(terms) and enough)
     changed = _at_bounds(problem, best.fit, state.price) if explains else {}
     if not explains:
         verdict = "unnamed"
@@ -159,19 +158,18 @@ def _rivals(candidates: Sequence[Candidate], probabilities: np.ndarray) -> tuple
     return tuple(found.items())[:2]
 
 
-def explained(null: np.ndarray, after: np.ndarray, bound: np.ndarray) -> float:
-    """The share of the explainable gap that is explained: (E(null) - E(after)) / (E(null) - E(bound)), from 0 to 1.
+def explained(null: float, after: float, bound: float) -> float:
+    """The share of the explainable misfit that is explained: (C(null) - C(after)) / (C(null) - C(bound)), from 0 to 1.
 
-    E is the energy above the floor, summed over positions: max(gap^2 - 1, 0).
+    C is the cost, prior included: a null may imitate an effect with parameters that are far off, and no gap shows it.
 
     Args:
-      null: [positions] gaps of the model without effects, in floor units.
-      after: [positions] of the model with them.
-      bound: [positions] with a learned torque too; what that leaves, no effect of a joint explains either.
+      null: cost of the model without effects.
+      after: of the model with them.
+      bound: of the model with a learned torque too; what that leaves, no effect of a joint explains either.
     """
-    energy = [float(np.maximum(gaps**2 - _PERFECT, 0.0).sum()) for gaps in (null, after, bound)]
-    room = energy[0] - energy[2]
-    return float(np.clip((energy[0] - energy[1]) / room, 0.0, 1.0)) if room > 1e-6 else 1.0
+    room = null - bound
+    return float(np.clip((null - after) / room, 0.0, 1.0)) if room > 1e-6 else 1.0
 
 
 def learn(settings: Settings, problem: Problem, at: Floor, best: Candidate) -> Candidate:
@@ -241,6 +239,11 @@ def _gap_on_select(at: Floor, residual: np.ndarray) -> float:
     """Rms of the worst component on `select`; infinite where the model breaks."""
     found = float(rms(at, residual).max())
     return found if np.isfinite(found) else np.inf
+
+
+def _floor_cost(at: Floor, candidate: Candidate) -> float:
+    """Cost of a model that leaves the noise floor everywhere, of parameters that are as they were believed to be."""
+    return float(at.counts.cost(np.ones_like(squares(at, candidate))).sum())
 
 
 def _open_gaps(problem: Problem, at: Floor, candidate: Candidate) -> np.ndarray:

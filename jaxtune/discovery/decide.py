@@ -67,7 +67,8 @@ class Evidence:
     segments but a few (`Counts.usual`) or of typical ones (`Counts.variances`), where it is the larger share of what is
     left."""
     left: float
-    """Rms of the worst component on `select` with the effect, in floor units, of the same segments."""
+    """Rms of the same component on `select` with the effect, in floor units, of the same segments. What is left at
+    other joints says nothing about an effect."""
     relief: float
     """Fall of what the prior says against the other coordinates: without the effect they imitate it."""
     interval: tuple[float, float]
@@ -164,7 +165,11 @@ def weigh_evidence(
     relief = ablated.fit.penalty - candidate.fit.penalty
     mean_squares = [_finite(one[held_out:]) / at.counts.bins for one in (before, now)]
     measures = [[measure(one) for one in mean_squares] for measure in (at.counts.usual, at.counts.variances)]
-    falls = [(np.sqrt(max((was - now).max(), 0.0)), np.sqrt(now.max())) for was, now in measures]
+    where = [int((was - now).argmax()) for was, now in measures]
+    falls = [
+        (np.sqrt(max(was[at_most] - now[at_most], 0.0)), np.sqrt(now[at_most]))
+        for at_most, (was, now) in zip(where, measures, strict=True)
+    ]
     floors, left = max(falls, key=lambda pair: pair[0] / pair[1])
     evidence = Evidence(
         gain=total_cost(at, ablated, 0.0) - total_cost(at, candidate, 0.0),

@@ -90,7 +90,7 @@ def step(
         found = screen(at, base.fit, free, pairs=settings.firsts, library=library, say=say)
     state = state.with_screen(settings, problem, found)
     leads = shortlist(settings, found, state.price)
-    leads = leads[: settings.swaps] if swapping else leads + shaped(_unfree(problem, at), leads[: settings.shaped])
+    leads = leads[: settings.swaps] if swapping else leads + shaped(_unfree(problem, at), free, leads, settings.shaped)
     if base.fit is state.nominal:
         leads = leads + stuck(state.null.fit, [h for h in free if problem.is_nominal(h)], leads)
     say(f"fit {len(leads)}")
@@ -165,17 +165,28 @@ def _unfree(problem: Problem, at: Floor) -> list[Hypothesis]:
     return [form for form in problem.forms if not taken_over(at.prior, form).any()]
 
 
-def shaped(forms: Sequence[Hypothesis], leads: Sequence[Lead]) -> list[Lead]:
-    """Adds to leads of one effect each of the forms that it may have.
+def shaped(forms: Sequence[Hypothesis], free: Sequence[Hypothesis], leads: Sequence[Lead], count: int) -> list[Lead]:
+    """Adds to the first leads each of the forms that they may have, and what such a form is without them.
 
-    Else what another form of the right effect leaves would be explained by a second effect.
+    Else what another form of the right effect leaves would be explained by a second effect. And play with a spring
+    that turns out to have no play is a spring: a form that is an effect of its own is fitted alone too.
+
+    Args:
+      forms: of all effects.
+      free: effects that may join the model.
+      leads: best first.
+      count: leads of one effect that get their forms.
     """
+    known = {lead.hypotheses[0].key for lead in leads if len(lead.hypotheses) == 1}
     found = []
-    for lead in leads:
+    for lead in leads[:count]:
         for form in (form for form in forms if form.shapes(lead.hypotheses[0])):
             # The least size may be too small to have a slope.
-            point = np.concatenate([lead.point, form.probes[1]])
-            found.append(Lead((*lead.hypotheses, form), point, lead.start, lead.cost))
+            point = form.probes[1]
+            found.append(Lead((*lead.hypotheses, form), np.concatenate([lead.point, point]), lead.start, lead.cost))
+            alone = [h for h in free if h.key not in known and np.array_equal(h.directions, form.directions)]
+            found += [Lead((h,), point, lead.start, lead.cost) for h in alone]
+            known.update(h.key for h in alone)
     return found
 
 

@@ -72,6 +72,21 @@ def test_evidence_compares_with_the_model_without_the_effect(stepped):
     assert known.gain == pytest.approx(evidence.gain, rel=0.05)
 
 
+def test_what_is_left_counts_where_the_effect_helps(stepped):
+    asked, floor, found = stepped
+    (coulomb,) = found.best.hypotheses
+    at = floor[asked.main_horizon]
+    plain, ablated = weigh_evidence(asked, floor, found.best, coulomb, {})
+    # The component that the effect does not help most is off by 50 floor units, with it and without it.
+    (before, now) = (at.unflatten(one.select).copy() for one in (ablated, found.best))
+    other = 1 - int(((before**2).mean(axis=(0, 1)) - (now**2).mean(axis=(0, 1))).argmax())
+    before[..., other], now[..., other] = 50.0, 50.0
+    far = replace(found.best, select=now.ravel())
+    evidence, _ = weigh_evidence(asked, floor, far, coulomb, {"null": replace(ablated, select=before.ravel())})
+    assert evidence.left == pytest.approx(plain.left, rel=0.2)
+    assert evidence.left < 2.0
+
+
 def test_whole_runs_are_drawn_where_there_are_enough():
     run = np.repeat(np.arange(12), 5)
     squares = np.ones((60, 1))

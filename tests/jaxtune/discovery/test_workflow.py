@@ -267,13 +267,13 @@ def test_where_nothing_joins_and_nothing_replaces_the_search_ends():
     assert [hypothesis.name for hypothesis in found.best.hypotheses] == ["coulomb"]
 
 
-def test_the_explained_share_counts_all_positions_above_the_floor():
-    null, bound = np.array([3.0, 2.0]), np.array([1.0, 0.5])
-    assert explained(null, null, bound) == 0.0
-    assert explained(null, bound, bound) == 1.0
-    assert explained(null, np.array([1.0, 2.0]), bound) == pytest.approx(8.0 / 11.0)
-    # What no torque explains is not asked for; below the floor nothing is won.
-    assert explained(null, np.array([2.0, 1.0]), np.array([2.0, 0.1])) == 1.0
+def test_the_explained_share_is_of_what_a_learned_torque_explains():
+    assert explained(300.0, 300.0, 100.0) == 0.0
+    assert explained(300.0, 100.0, 100.0) == 1.0
+    assert explained(300.0, 150.0, 100.0) == pytest.approx(0.75)
+    # A model can cost more than the null, and nothing may be left to explain.
+    assert explained(300.0, 310.0, 100.0) == 0.0
+    assert explained(300.0, 300.0, 300.0) == 1.0
 
 
 def test_an_effect_costs_what_chance_gains_on_null_logs():
@@ -297,3 +297,20 @@ def test_a_nominal_parameter_that_stops_at_its_bound_is_a_lead_of_its_own():
     assert step.stuck(begun.null.fit, nominal, [lead]) == []
     near = problem({"mass": 0.05})
     assert step.stuck(state.begin(near, measured_floor(near))[1].null.fit, nominal, []) == []
+
+
+def test_a_form_that_is_an_effect_of_its_own_is_fitted_alone_too():
+    coulomb, push = HYPOTHESES[2:4]
+    first = step.Lead((coulomb,), np.array([0.8]), np.zeros(2), 10.0)
+    second = step.Lead((HYPOTHESES[1],), np.array([0.3]), np.zeros(2), 11.0)
+    found = step.shaped([DIRECTION, WARPED], HYPOTHESES, [first, second], 2)
+    assert [[h.key for h in lead.hypotheses] for lead in found] == [
+        ["coulomb@slider", "coulomb(direction_dependent)@slider"],
+        ["push@slider"],
+        ["coulomb@slider", "coulomb(warped)@slider"],
+    ]
+    np.testing.assert_array_equal(found[1].point, DIRECTION.probes[1])
+    # One that is fitted anyway needs no second start, and only the first leads get forms.
+    known = step.Lead((push,), np.array([0.3]), np.zeros(2), 12.0)
+    assert len(step.shaped([DIRECTION, WARPED], HYPOTHESES, [first, second, known], 1)) == 2
+    assert step.shaped([DIRECTION], HYPOTHESES, [second, first], 1) == []
