@@ -107,7 +107,7 @@ def show(console: Console, question: Question, summary: dict, free: dict) -> Non
     table.add_row("whole runs, mean in rad", *(f"{error[name]:.4f}" for name in ("before", "null", "after")))
     console.print(table)
     if summary["effects"] or summary["not_named"]:
-        console.print(f"explained: {summary['explained_share']:.0%} of the misfit that can be explained")
+        console.print(f"explained: {summary['explained_share']:.0%} of what can be explained")
     suspects = [
         f"{one['name']} at {place_in_words(question, one)} {one['probability']:.2f}" for one in summary["suspects"]
     ]

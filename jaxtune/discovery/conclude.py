@@ -30,6 +30,7 @@ from jaxtune.discovery.state import State
 
 _CLEAR = 2.0  # standard errors
 _SUSPECTS = 8
+_PERFECT = 1.0  # floor units
 _BOUND = 1e-6  # of the width of the bounds: how near to one a coordinate is at it
 
 
@@ -79,9 +80,9 @@ def conclude(settings: Settings, problem: Problem, floor: NoiseFloor, state: Sta
     say("learned torque")
     learned = learn(settings, problem, at, best)
     models = _by_select(at, state, best, learned)
-    null, after, bound = (total_cost(at, one, 0.0) for one in (state.null, best, learned))
-    share = explained(null, after, min(bound, after))
-    enough = share >= settings.share and explained(null, after, _floor_cost(at, best)) >= settings.least
+    share = _explained_share(problem, at, state.null, best, learned)
+    null, after = (_energy(_open_gaps(problem, at, one)) for one in (state.null, best))
+    enough = share >= settings.share and explained(null, after, 0.0) >= settings.least
     explains = _open_gaps(problem, at, best).max() <= settings.at_floor or (bool(terms) and enough)
     changed = _at_bounds(problem, best.fit, state.price) if explains else {}
     if not explains:
@@ -159,17 +160,31 @@ def _rivals(candidates: Sequence[Candidate], probabilities: np.ndarray) -> tuple
 
 
 def explained(null: float, after: float, bound: float) -> float:
-    """The share of the explainable misfit that is explained: (C(null) - C(after)) / (C(null) - C(bound)), from 0 to 1.
-
-    C is the cost, prior included: a null may imitate an effect with parameters that are far off, and no gap shows it.
+    """The share of a misfit that is explained: (null - after) / (null - bound), from 0 to 1; 1 where there is none.
 
     Args:
-      null: cost of the model without effects.
+      null: misfit of the model without effects.
       after: of the model with them.
-      bound: of the model with a learned torque too; what that leaves, no effect of a joint explains either.
+      bound: the least that can be reached.
     """
     room = null - bound
     return float(np.clip((null - after) / room, 0.0, 1.0)) if room > 1e-6 else 1.0
+
+
+def _explained_share(problem: Problem, at: Floor, null: Candidate, best: Candidate, learned: Candidate) -> float:
+    """The share that effects explain of what they and a learned torque explain together, by gaps or by cost.
+
+    The smaller one counts. In gaps a wrong effect can seem to explain much of an error that it only makes smaller; in
+    the cost, a little of a large one.
+    """
+    energies = [_energy(_open_gaps(problem, at, one)) for one in (null, best, learned)]
+    costs = [total_cost(at, one, 0.0) for one in (null, best, learned)]
+    return min(explained(before, after, min(after, bound)) for before, after, bound in (energies, costs))
+
+
+def _energy(gaps: np.ndarray) -> float:
+    """The energy above the floor of gaps [positions] in floor units: the sum of max(gap^2 - 1, 0)."""
+    return float(np.maximum(gaps**2 - _PERFECT, 0.0).sum())
 
 
 def learn(settings: Settings, problem: Problem, at: Floor, best: Candidate) -> Candidate:
@@ -239,11 +254,6 @@ def _gap_on_select(at: Floor, residual: np.ndarray) -> float:
     """Rms of the worst component on `select`; infinite where the model breaks."""
     found = float(rms(at, residual).max())
     return found if np.isfinite(found) else np.inf
-
-
-def _floor_cost(at: Floor, candidate: Candidate) -> float:
-    """Cost of a model that leaves the noise floor everywhere, of parameters that are as they were believed to be."""
-    return float(at.counts.cost(np.ones_like(squares(at, candidate))).sum())
 
 
 def _open_gaps(problem: Problem, at: Floor, candidate: Candidate) -> np.ndarray:

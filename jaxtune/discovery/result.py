@@ -32,11 +32,11 @@ class Settings:
     """Largest number of effects that are accepted."""
     level: float = 0.05
     """Probability of naming something where nothing is missing, which the thresholds allow."""
-    share: float = 0.8
-    """Share of the explainable misfit (cost) that the accepted effects must explain together; with less the verdict
-    is `unnamed`. See `conclude.explained`."""
+    share: float = 0.75
+    """Share of the explainable gap, and of the explainable cost, that the accepted effects must explain together; with
+    less the verdict is `unnamed`."""
     least: float = 0.3
-    """The same share of the whole misfit above the floor: a learned torque cannot explain everything either."""
+    """The same share of the whole gap above the floor: a learned torque cannot explain everything either."""
     at_floor: float = 1.5
     """Gap in floor units that counts as none. No further effect is looked for once every signal is below it."""
     promising: float = 0.3
@@ -120,8 +120,8 @@ class Result:
     """Keys and vectors [axes] of the two models that are most believed, of those with effects; their effects differ in
     more than form."""
     explained_share: float
-    """Share of the explainable misfit that the reported effects explain, on `train` and `select`; see
-    `conclude.explained`."""
+    """Share that the reported effects explain on `train` and `select`, of what they and a learned torque explain
+    together: of the gap or of the cost, whichever is smaller."""
     withdrawn: bool
     """True if `proposed` was worse on `sealed` than the better of the nominal model and the null; then `model` is that
     one."""

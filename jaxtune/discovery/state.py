@@ -113,16 +113,20 @@ def begin(problem: Problem, floor: NoiseFloor) -> tuple[NoiseFloor, State]:
 def to_json(state: State) -> dict[str, Any]:
     """Turns a state into numbers, texts, lists and dictionaries of them.
 
-    Of fits only the coordinates are kept: their residuals and slopes are found by simulating again.
+    Of fits only the coordinates are kept: their residuals and slopes are found by simulating again. Most models have
+    most of what is free in common, so that is kept once.
     """
+    rows: dict[tuple, int] = {}
+    numbers = [[rows.setdefault(row, len(rows)) for row in _rows(one.fit.free)] for one in state.candidates]
     return {
+        "rows": [list(row) for row in rows],
         "candidates": [
             {
                 "hypotheses": [hypothesis.key for hypothesis in one.hypotheses],
-                "free": {name: part.tolist() for name, part in zip(_PARTS, one.fit.free.parts(), strict=True)},
+                "free": mine,
                 "coordinates": one.fit.coordinates.tolist(),
             }
-            for one in state.candidates
+            for one, mine in zip(state.candidates, numbers, strict=True)
         ],
         "best": state.best.key,
         "finished": state.finished,
@@ -137,10 +141,17 @@ def to_json(state: State) -> dict[str, Any]:
 
 
 def from_json(problem: Problem, floor: NoiseFloor, begun: State, saved: Mapping[str, Any]) -> State:
-    """Restores the state that `to_json` turned into `saved`, for the same problem and noise floor."""
+    """Restores the state that `to_json` turned into `saved`, for the same problem and noise floor.
+
+    Raises:
+      ValueError: another version saved it.
+    """
+    if "rows" not in saved:
+        raise ValueError("the saved state is of another version: remove state.json to begin anew")
     by_key = {hypothesis.key: hypothesis for hypothesis in (*problem.hypotheses, *problem.forms)}
     at = floor[problem.main_horizon]
-    frees = [Free(**{name: np.array(values) for name, values in one["free"].items()}) for one in saved["candidates"]]
+    rows = np.array(saved["rows"])
+    frees = [_free(rows[one["free"]]) for one in saved["candidates"]]
     points = [np.array(one["coordinates"]) for one in saved["candidates"]]
     vectors = np.stack([point @ free.directions for point, free in zip(points, frees, strict=True)])
     simulated = zip(at.residuals["train"](vectors), at.residuals["select"](vectors), strict=True)
@@ -169,4 +180,11 @@ def from_json(problem: Problem, floor: NoiseFloor, begun: State, saved: Mapping[
     )
 
 
-_PARTS = ("directions", "sd", "bounds", "nominal")
+def _rows(free: Free) -> list[tuple[float, ...]]:
+    """All that is known of each coordinate, in one row."""
+    return [tuple(row) for row in np.column_stack(free.parts()).tolist()]
+
+
+def _free(rows: np.ndarray) -> Free:
+    """The coordinates of some rows."""
+    return Free(rows[:, :-4], rows[:, -4], rows[:, -3:-1], rows[:, -1].astype(bool))

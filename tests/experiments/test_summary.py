@@ -129,4 +129,4 @@ def test_page_and_console_say_what_was_found(tmp_path, asked, withdrawn):
     said = console.export_text()
     assert ("was withdrawn" in said) is withdrawn
     assert "constant_push at elbow, which may only make up for the form of coulomb@elbow" in said
-    assert "93% of the misfit that can be explained" in said
+    assert "93% of what can be explained" in said
