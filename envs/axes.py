@@ -9,10 +9,10 @@ from jaxtune.types import Effect, Parameter
 
 # Parameters that every model has, by the effect that changes them, and by which share of its nominal value each may be
 # wrong (one prior standard deviation). Discovery fits them under all hypotheses, the null included, so that an
-# inaccurate number is not taken for a missing effect. Gains are set, and better known than a mass.
+# inaccurate number is not taken for a missing effect. Gains are set, and better known than a mass; a damping gain less
+# so, since the velocity that it multiplies was filtered.
 _PRIOR_SHARE = 0.1
-_SET_SHARE = 0.035  # of gains, which somebody set
-_NOMINAL_RATIOS = {"link_mass": _PRIOR_SHARE, "gain_error": _SET_SHARE, "damping_gain": _SET_SHARE}
+_NOMINAL_RATIOS = {"link_mass": _PRIOR_SHARE, "gain_error": 0.035, "damping_gain": 0.05}
 _NOMINAL_FIELDS = {"armature": "dof_armature", "viscous": "dof_damping", "coulomb": "dof_frictionloss"}
 _MOST_TAKEN = 0.9  # of a field of the model: armature and damping must stay positive
 

@@ -33,7 +33,7 @@ ROWS = (
         family="actuator",
         on="joint",
         enters="speed",
-        parameters=(Parameter(name="ratio", form="ratio", bounds=(-1.0, 1.0), prior=0.035),),
+        parameters=(Parameter(name="ratio", form="ratio", bounds=(-1.0, 1.0), prior=0.05),),
         sizes=(0.05,),
         act=_damping_gain,
         sentence="The controller's damping gain is not the one that was set.",

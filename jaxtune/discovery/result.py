@@ -32,7 +32,7 @@ class Settings:
     """Largest number of effects that are accepted."""
     level: float = 0.05
     """Probability of naming something where nothing is missing, which the thresholds allow."""
-    share: float = 0.75
+    share: float = 0.7
     """Share of the explainable gap, and of the explainable cost, that the accepted effects must explain together; with
     less the verdict is `unnamed`."""
     least: float = 0.3
