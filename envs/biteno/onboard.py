@@ -27,6 +27,7 @@ def meta(task: TaskConfig) -> dict:
             {"name": name, "size": len(scale), "scale": scale.tolist()} for name, scale in sensing.LAYOUT.items()
         ],
         "stand_rad": constants.STAND_RAD.tolist(),
+        "joint_range_rad": [model.joint(name).range.tolist() for name in constants.JOINTS],
         "action_limit": ACTION_LIMIT,
         "action_scale": task.action_scale,
         "base": task.base,

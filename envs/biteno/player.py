@@ -42,7 +42,7 @@ class Player(Network):
         self.phase = np.mod(phase + np.array(self.meta["clock"]["offsets"]), 1.0)
         self.action = np.zeros(len(self.meta["joints"]))
         self.target = None
-        """Last joint target [joints], rad; None before the first step."""
+        """Last joint target [joints] before it was limited, rad; None before the first step."""
 
     def step(
         self,
@@ -57,7 +57,8 @@ class Player(Network):
         """Computes the joint targets that hold until the next step.
 
         The target is `base + action_scale * action`, where the action is the network's output for the observation, and
-        `base` is the reference walk or the standing pose.
+        `base` is the reference walk or the standing pose. What is returned never leaves the joints' ranges. The policy
+        observes the target as it was meant, since that is what it was trained with.
 
         Args:
           velocity: [3] m/s, of the trunk's origin, body frame.
@@ -78,7 +79,7 @@ class Player(Network):
         self.action = np.clip(self(obs), -meta["action_limit"], meta["action_limit"])
         base = self.reference(self.phase, command) if meta["base"] == "raibert" else np.array(meta["stand_rad"])
         self.target = base + meta["action_scale"] * self.action
-        return self.target.copy()
+        return np.clip(self.target, *np.array(meta["joint_range_rad"]).T)
 
     def tick(self) -> None:
         """Advances the gait clock by one policy period; call it once after every `step`."""

@@ -92,6 +92,7 @@ def test_the_player_walks_as_the_simulator_does(folder, played):
     assert len(np.unique(np.sign(state.command[:, 0, 0]))) > 1
     for robot in range(8):
         player = Player(folder / "policy.npz", phase=float(state.phase[robot, 0, 0]))
+        low, high = np.array(player.meta["joint_range_rad"]).T
         for step in range(10):
             at = jax.tree.map(lambda leaf, r=robot, s=step: leaf[r, s], state)
             np.testing.assert_allclose(player.phase, at.phase, atol=1e-5)
@@ -105,7 +106,9 @@ def test_the_player_walks_as_the_simulator_does(folder, played):
             )
             player.tick()
             np.testing.assert_allclose(player.action, drive.action[robot, step], atol=2e-4)
-            np.testing.assert_allclose(target, drive.target[robot, step], atol=1e-4)
+            np.testing.assert_allclose(player.target, drive.target[robot, step], atol=1e-4)
+            # The simulator lets a target pull beyond a joint's range; a robot is not sent there.
+            np.testing.assert_allclose(target, np.clip(drive.target[robot, step], low, high), atol=1e-4)
 
 
 def test_the_player_refuses_what_is_no_number(folder):
@@ -120,6 +123,20 @@ def test_the_player_refuses_what_is_no_number(folder):
     with pytest.raises(ValueError, match="gyro: got a number that is not finite"):
         player.step(**fine | {"gyro": np.array([0.0, np.nan, 0.0])})
     np.testing.assert_array_equal(player.target, before)
+
+
+def test_no_target_leaves_the_joints_ranges(folder):
+    player = Player(folder / "policy.npz")
+    low, high = np.array(player.meta["joint_range_rad"]).T
+    np.testing.assert_allclose(low, [-0.4, -1.4, 0.1, -0.8, -1.4, 0.1])
+    # Readings of a robot that was thrown make large actions.
+    rng, left = np.random.default_rng(0), 0
+    for _ in range(200):
+        parts = {name: 5.0 * rng.normal(size=3) for name in ("velocity", "command", "gyro", "gravity")}
+        target = player.step(**parts, joint=rng.normal(size=6), joint_velocity=30.0 * rng.normal(size=6))
+        assert ((low <= target) & (target <= high)).all()
+        left += bool((target != player.target).any())
+    assert left > 50
 
 
 def test_reference_and_observation_are_the_simulators(folder):
