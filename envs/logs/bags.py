@@ -24,12 +24,14 @@ from typing import Any
 
 import numpy as np
 
+from envs.logs.containment import TooLarge, check_size
 from envs.logs.sampling import COMMANDED, HELD, SENT, held, sampled
 
 SUFFIXES = (".bag", ".mcap", ".db3")
 """Suffixes of bags that are files; a folder with a `metadata.yaml` is a bag as well."""
 
 _PLACE = re.compile(r"(?P<topic>/[^.\[\]\s]+)\.(?P<field>\w+(?:\.\w+)*)(?:\[(?P<index>[^\[\]]+)\])?")
+_MESSAGE_BYTES = 512  # that the values of a message take until all are read
 _HOLE = 3.5  # periods of a topic without a message that count as a hole
 _MORE_ROWS = 500  # at most, after the last message of the topic that gives the rows
 
@@ -160,11 +162,14 @@ def _read_topics(path: Path, places: Mapping[str, _Place]) -> dict[str, _Topic]:
             for topic in found:
                 if topic not in reader.topics:
                     raise LookupError(f"there is no topic '{topic}', expected some of {', '.join(reader.topics)}")
+            check_size(path, _MESSAGE_BYTES * sum(reader.topics[topic].msgcount for topic in found))
             connections = [one for one in reader.connections if one.topic in found]
             for connection, recorded, raw in reader.messages(connections):
                 messages = found[connection.topic]
                 message = reader.deserialize(raw, connection.msgtype)
                 messages.append(_read(message, recorded, connection.topic, len(messages) + 1, places))
+    except TooLarge:
+        raise
     except Exception as error:  # a damaged bag fails in many ways
         raise ValueError(f"{path}: {type(error).__name__}: {error}") from error
     # One clock for all topics: stamps of some would be compared with the recorder's times of others.

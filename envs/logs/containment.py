@@ -92,5 +92,22 @@ def check_archive(path: Path) -> None:
             size = sum(item.file_size for item in archive.infolist())
     except (zipfile.BadZipFile, OSError) as error:
         raise ValueError(f"{path}: {type(error).__name__}: {error}") from error
+    check_size(path, size)
+
+
+class TooLarge(ValueError):
+    """A file that would fill the memory."""
+
+
+def check_size(path: Path, size: int) -> None:
+    """Refuses what would fill the memory.
+
+    Args:
+      path: of the file, for the message.
+      size: in bytes, once it is unpacked.
+
+    Raises:
+      TooLarge: it is more than `LARGEST_BYTES`.
+    """
     if size > LARGEST_BYTES:
-        raise ValueError(f"{path}: got {size / 2**30:.1f} GiB unpacked, expected at most {LARGEST_BYTES / 2**30:g} GiB")
+        raise TooLarge(f"{path}: got {size / 2**30:.1f} GiB unpacked, expected at most {LARGEST_BYTES / 2**30:g} GiB")

@@ -12,7 +12,9 @@ import pyarrow
 import pyarrow.csv
 import pyarrow.parquet
 
-from envs.logs.containment import check_archive
+from envs.logs.containment import check_archive, check_size
+
+_CELL_BYTES, _SHORTEST_CELL = 8, 2  # of a number in memory, and of one with its comma in a text
 
 
 def check_time(path: Path, name: str, time: np.ndarray) -> None:
@@ -72,6 +74,7 @@ def refuse_first(path: Path, name: str, values: np.ndarray, bad: np.ndarray, exp
 
 
 def _read_csv(path: Path) -> dict[str, np.ndarray]:
+    check_size(path, _CELL_BYTES // _SHORTEST_CELL * path.stat().st_size)
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
             names = next(csv.reader(file, strict=True), [])
@@ -150,6 +153,14 @@ def _read_npz(path: Path) -> dict[str, np.ndarray]:
 
 
 def _read_parquet(path: Path) -> dict[str, np.ndarray]:
+    try:
+        # What a table holds stands in its footer; the pages of a column of equal values are tiny.
+        held = pyarrow.parquet.read_metadata(path)
+        packed = sum(held.row_group(number).total_byte_size for number in range(held.num_row_groups))
+        size = max(packed, held.num_rows * held.num_columns * _CELL_BYTES)
+    except (pyarrow.ArrowException, OSError) as error:
+        raise ValueError(f"{path}: {type(error).__name__}: {error}") from error
+    check_size(path, size)
     try:
         table = pyarrow.parquet.read_table(path, partitioning=None, page_checksum_verification=True)
         table.validate(full=True)

@@ -7,6 +7,7 @@ from rosbags import rosbag1, rosbag2
 from rosbags.typesys import Stores, get_typestore
 
 from envs import logs
+from envs.logs import containment
 
 JOINTS = ["left_hip", "left_knee"]
 COLUMNS = {
@@ -214,4 +215,12 @@ def test_a_bag_cut_short_is_named(tmp_path, kind):
     (path,) = [p for p in folder.rglob("*") if p.suffix in (".bag", ".mcap", ".db3")]
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     with pytest.raises(ValueError, match="run_000"):
+        logs.read(folder)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_bag_of_too_many_messages_is_refused_unread(tmp_path, monkeypatch, kind):
+    folder = write(tmp_path, kind, recording())
+    monkeypatch.setattr(containment, "LARGEST_BYTES", 1000)
+    with pytest.raises(ValueError, match=r"^[^:]*run_000[^:]*: got .* GiB unpacked, expected at most"):
         logs.read(folder)

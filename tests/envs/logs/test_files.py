@@ -4,6 +4,8 @@ import dataclasses
 import zipfile
 
 import numpy as np
+import pyarrow
+import pyarrow.parquet
 import pytest
 import yaml
 
@@ -37,6 +39,8 @@ def put(folder, table=None, meta=(), name="run_000.csv"):
     table = columns() if table is None else table
     if name.endswith(".npz"):
         np.savez(folder / name, **table)
+    elif name.endswith(".parquet"):
+        pyarrow.parquet.write_table(pyarrow.table(table), folder / name)
     else:
         cells = [[x if isinstance(x, str) else repr(float(x)) for x in column] for column in table.values()]
         lines = [",".join(table), *map(",".join, zip(*cells, strict=True))]
@@ -209,10 +213,22 @@ def test_a_run_that_is_a_link_out_of_the_folder_is_refused_unread(tmp_path):
     assert "hunter2" not in str(refused.value)
 
 
-def test_a_small_archive_that_fills_the_memory_is_refused(tmp_path, monkeypatch):
-    folder = put(tmp_path / "log", name="run_001.npz")
+@pytest.mark.parametrize("suffix", [".csv", ".npz", ".parquet"])
+def test_a_small_file_that_fills_the_memory_is_refused(tmp_path, monkeypatch, suffix):
+    folder = put(tmp_path / "log", name=f"run_001{suffix}")
     monkeypatch.setattr(containment, "LARGEST_BYTES", 100)
-    with pytest.raises(ValueError, match=r"run_001.npz: got .* GiB unpacked, expected at most"):
+    with pytest.raises(ValueError, match=rf"run_001{suffix}: got .* GiB unpacked, expected at most"):
+        logs.read(folder)
+
+
+def test_a_table_of_equal_values_counts_unpacked(tmp_path, monkeypatch):
+    folder = put(tmp_path / "log")
+    path = folder / "run_001.parquet"
+    pyarrow.parquet.write_table(pyarrow.table({"t": np.arange(100_000) / 100, "q.left_hip": np.zeros(100_000)}), path)
+    rows = 2 * 8 * 100_000
+    monkeypatch.setattr(containment, "LARGEST_BYTES", rows - 1)
+    assert path.stat().st_size < rows / 1.5
+    with pytest.raises(ValueError, match=r"run_001.parquet: got .* GiB unpacked"):
         logs.read(folder)
 
 
