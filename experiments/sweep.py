@@ -19,7 +19,7 @@ from rich.table import Table
 
 from envs.targets.mjx import MjxTarget
 from experiments.common import checkpoint, plots
-from experiments.common.cli import console, run
+from experiments.common.cli import bars, console, run
 from experiments.common.config import Preset, named_values, preset
 from experiments.walking.cases import Case, check_positive, checked_case, errors
 from experiments.walking.learner import Learner, Policy
@@ -145,19 +145,34 @@ def main(args: Args) -> None:
     """Runs the sweep, prints a table with the best combination first, and writes summary.json and heat_map.png.
 
     Raises:
-      ValueError: an option is wrong, or the folder holds another run.
+      ValueError: an option is wrong, or the folder holds another run or belongs to a process that still works there.
     """
     checkpoint.set_up_compiler(preset(args.preset).xla_flags)
     sizes, robot, entries, case = check(args)
     args = dataclasses.replace(args, policy=args.policy or default_policy(robot))
     learner = Learner(sizes, entries, kind=robot)
     checkpoint.open_run(args.out, {**dataclasses.asdict(args), "out": None, "sizes": sizes})
+    with checkpoint.lock(args.out / "summary.json"):
+        sweep(args, learner, case)
+
+
+def sweep(args: Args, learner: Learner, case: Case) -> None:
+    """Tunes in all lanes, and writes and prints what they found.
+
+    Args:
+      args: options of the sweep.
+      learner: gives the tuner its functions.
+      case: how the target differs.
+    """
     policy = starting_policy(args.policy, learner, args.out)
-    grid = lanes(args)
+    grid, entries = lanes(args), learner.entries
     truth = case.true_params(entries, args.start)
-    sweep = program(learner, truth, policy)
+    tune = program(learner, truth, policy)
     begin = time.monotonic()
-    dist, info = jax.block_until_ready(sweep(jnp.asarray(grid.reshape(-1, grid.shape[-1]))))
+    with bars() as progress:
+        # One program: nothing is known of how far it is.
+        progress.add_task(f"compiling, then tuning {grid[..., 0].size} simulators", total=None)
+        dist, info = jax.block_until_ready(tune(jnp.asarray(grid.reshape(-1, grid.shape[-1]))))
     seconds = time.monotonic() - begin
 
     off = case.off(entries)

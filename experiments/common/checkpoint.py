@@ -26,6 +26,8 @@ import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
 
+from experiments.common.cli import console
+
 _PACKAGES = ("jaxtune", "jax", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "orbax-checkpoint", "numpy")
 
 _DRAFT = ".tmp"  # suffix of a file that is being written, or that a killed run left behind
@@ -47,11 +49,15 @@ def set_up_compiler(xla_flags: str) -> None:
     if xla_flags:
         os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {xla_flags}".strip()
     os.environ.setdefault("NPROC", str(max(_LEAST_THREADS, cores())))
-    if os.environ.get("JAX_COMPILATION_CACHE_DIR"):
-        return
+    chosen = os.environ.get("JAX_COMPILATION_CACHE_DIR")
     base = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
-    jax.config.update("jax_compilation_cache_dir", str(base / "jaxtune" / "xla"))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
+    kept = Path(chosen) if chosen else base / "jaxtune" / "xla"
+    if not kept.is_dir() or not any(kept.iterdir()):
+        text = f"first run: programs are compiled, which takes minutes; later runs find them in {kept}"
+        console.print(text, highlight=False, markup=False, soft_wrap=True)
+    if not chosen:
+        jax.config.update("jax_compilation_cache_dir", str(kept))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
 
 
 def cores() -> int:

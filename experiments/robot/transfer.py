@@ -119,7 +119,8 @@ def play(transfer: Transfer, programs: Programs) -> list[Round]:
       All rounds of the run; `summary.json` holds them too.
 
     Raises:
-      ValueError: an option is wrong, the folder holds another run, or a round cannot be played.
+      ValueError: an option is wrong, the folder holds another run or belongs to a process that still works there, or
+        a round cannot be played.
     """
     start = check(transfer)[3]
     policy_files.require_onnx()
@@ -128,16 +129,17 @@ def play(transfer: Transfer, programs: Programs) -> list[Round]:
     # A policy that cannot be loaded must be an error before the folder is made. One from scratch is kept in the folder.
     policy = None if transfer.policy == "scratch" else starting_policy(transfer.policy, learner)
     checkpoint.open_run(transfer.out, _identity(transfer, learner.preset))
-    policy = policy or starting_policy(transfer.policy, learner, transfer.out)
-    rounds = Rounds(transfer.out, transfer.terms, programs, transfer.method, policy, start, transfer.radius)
-    history: list[Round] = []
-    for index in range(transfer.rounds):
-        history.append(rounds.play(index, history[-1] if history else None))
-        page = transfer.out / f"round_{index:03d}" / "report.html"
-        report.write(page, history, transfer.terms)
-        report.show(console, history[-1])
-        console.print(f"report in {page}")
-    checkpoint.write_json(transfer.out / "summary.json", {"rounds": history, "versions": checkpoint.versions()})
+    with checkpoint.lock(transfer.out / "summary.json"):
+        policy = policy or starting_policy(transfer.policy, learner, transfer.out)
+        rounds = Rounds(transfer.out, transfer.terms, programs, transfer.method, policy, start, transfer.radius)
+        history: list[Round] = []
+        for index in range(transfer.rounds):
+            history.append(rounds.play(index, history[-1] if history else None))
+            page = transfer.out / f"round_{index:03d}" / "report.html"
+            report.write(page, history, transfer.terms)
+            report.show(console, history[-1])
+            console.print(f"report in {page}")
+        checkpoint.write_json(transfer.out / "summary.json", {"rounds": history, "versions": checkpoint.versions()})
     return history
 
 

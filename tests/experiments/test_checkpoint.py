@@ -245,3 +245,15 @@ def test_a_training_that_was_killed_ends_as_if_it_had_not_been(learner, monkeypa
     assert drop(longer) == drop(curve)
     assert not (out / "training").exists()
     assert json.loads((out / "config.json").read_text())["state"] == "state_1"
+
+
+def test_the_first_run_says_that_programs_are_compiled(tmp_path, monkeypatch, capsys):
+    kept = tmp_path / "programs"
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(kept))
+    monkeypatch.setenv("XLA_FLAGS", "")
+    checkpoint.set_up_compiler("")
+    assert f"later runs find them in {kept}" in capsys.readouterr().out.replace("\n", "")
+    kept.mkdir()
+    (kept / "one").touch()
+    checkpoint.set_up_compiler("")
+    assert not capsys.readouterr().out

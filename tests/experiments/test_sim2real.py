@@ -342,6 +342,15 @@ def test_a_run_goes_on_in_the_model_that_it_began_with(programs, answered, tmp_p
         transfer.play(args, programs)
 
 
+def test_a_folder_in_which_another_process_works_is_refused(programs, tmp_path, monkeypatch):
+    monkeypatch.setattr(transfer, "Rounds", lambda *_, **__: pytest.fail("it was begun"))
+    args = replace(ARGS, out=tmp_path / "run")
+    with pytest.raises(pytest.fail.Exception, match="it was begun"):
+        transfer.play(args, programs)
+    with checkpoint.lock(args.out / "summary.json"), pytest.raises(ValueError, match="another process works on"):
+        transfer.play(args, programs)
+
+
 def test_errors_are_printed_as_they_are(monkeypatch, capsys):
     @dataclass
     class NoArgs:
