@@ -141,7 +141,7 @@ ROWS = (
             Parameter(name="torque_nm", form="reciprocal", scale="torque", bounds=(0.0, 3.0), prior=0.3),
             Parameter(name="softness", bounds=(0.0, 1.0), prior=0.3),
         ),
-        sizes=(0.1, 0.6),
+        sizes=(0.15, 0.6),
         forms=(Form("soft", "torque_limit", "softness"),),
         act=_torque_limit,
         sentence="The motor's torque has a limit that the model does not know.",

@@ -13,7 +13,7 @@ from jaxtune.types import Effect, Parameter
 _LARGE = 0.7  # of the bounds: the largest size that is screened
 _TRAVEL_RAD, _MOST_TRAVELS = 0.002, 5.0  # over which dry friction sets in, and how many of these at most
 _TORQUE_SHARE, _MOST_SHARES = 0.2, 3.0  # by which recorded torques are off, and how many of these at most
-_BENT, _STRAIGHT = 5, 3  # sizes of an effect without a slope at zero, and of one with
+_BENT, _STRAIGHT = 6, 3  # sizes of an effect without a slope at zero, and of one with
 
 
 def hypotheses(

@@ -63,12 +63,12 @@ class Evidence:
     confirmed: float
     """Fall of the cost on `select` alone, where nothing was fitted, prior included."""
     floors: float
-    """Root of the largest fall of a single component's mean square on `select`, in floor units. It is that of all
-    segments but a few (`Counts.usual`) or of typical ones (`Counts.variances`), where it is the larger share of what is
-    left."""
+    """Root of the largest fall of a single component's mean square, in floor units, on `train` and `select` together:
+    the few motions that show an effect, such as hard steps, may all be in one of them. It is that of all segments but
+    a few (`Counts.usual`) or of typical ones (`Counts.variances`), where it is the larger share of what is left."""
     left: float
-    """Rms of the same component on `select` with the effect, in floor units, of the same segments. What is left at
-    other joints says nothing about an effect."""
+    """Rms of the same component with the effect, in floor units, of the same segments. What is left at other joints
+    says nothing about an effect."""
     relief: float
     """Fall of what the prior says against the other coordinates: without the effect they imitate it."""
     interval: tuple[float, float]
@@ -163,19 +163,14 @@ def weigh_evidence(
     distance = np.where((hypothesis.probes != 0).any(axis=0), np.abs(values) / errors, 0.0)
     clearest = int(distance.argmax())
     relief = ablated.fit.penalty - candidate.fit.penalty
-    mean_squares = [_finite(one[held_out:]) / at.counts.bins for one in (before, now)]
+    mean_squares = [_finite(one) / at.counts.bins for one in (before, now)]
     measures = [[measure(one) for one in mean_squares] for measure in (at.counts.usual, at.counts.variances)]
-    where = [int((was - now).argmax()) for was, now in measures]
-    falls = [
-        (np.sqrt(max(was[at_most] - now[at_most], 0.0)), np.sqrt(now[at_most]))
-        for at_most, (was, now) in zip(where, measures, strict=True)
-    ]
-    floors, left = max(falls, key=lambda pair: pair[0] / pair[1])
+    floors, left = max((_largest_fall(*pair) for pair in measures), key=lambda pair: pair[0] / pair[1])
     evidence = Evidence(
         gain=total_cost(at, ablated, 0.0) - total_cost(at, candidate, 0.0),
         confirmed=_cost(at, before[held_out:]) - _cost(at, now[held_out:]) + relief,
-        floors=float(floors),
-        left=float(left),
+        floors=floors,
+        left=left,
         relief=relief,
         interval=(
             float(values[clearest] - 1.96 * errors[clearest]),
@@ -298,6 +293,12 @@ def rivals(
             elif other.key not in others and probability > settings.possible:
                 found[other.name] = max(found.get(other.name, 0.0), float(probability))
     return tuple(sorted(found, key=lambda name: -found[name]))[: settings.rivals]
+
+
+def _largest_fall(before: np.ndarray, now: np.ndarray) -> tuple[float, float]:
+    """Of mean squares [components]: the root of the largest fall, and the root of what is left there."""
+    where = int((before - now).argmax())
+    return float(np.sqrt(max(before[where] - now[where], 0.0))), float(np.sqrt(now[where]))
 
 
 def _finite(of_segments: np.ndarray) -> np.ndarray:

@@ -72,17 +72,39 @@ def test_evidence_compares_with_the_model_without_the_effect(stepped):
     assert known.gain == pytest.approx(evidence.gain, rel=0.05)
 
 
+def off(at, candidate, component, segments=slice(None), size=50.0):
+    """The same model, but off by `size` floor units in a component, in some segments of train and select."""
+    train, select = (at.unflatten(values).copy() for values in (candidate.fit.residual, candidate.select))
+    train[segments, :, component] = size
+    select[segments, :, component] = size
+    return replace(candidate, fit=replace(candidate.fit, residual=train.ravel()), select=select.ravel())
+
+
+def test_an_effect_that_shows_in_few_motions_matters(stepped):
+    asked, floor, found = stepped
+    (coulomb,) = found.best.hypotheses
+    at = floor[asked.main_horizon]
+    # Without it six segments of train are far off, as where a motor saturates, and none of select.
+    far = off(at, found.best, 0, slice(6))
+    far = replace(found.best, fit=replace(found.best.fit, residual=far.fit.residual))
+    evidence, _ = weigh_evidence(asked, floor, found.best, coulomb, {"null": replace(far, hypotheses=())})
+    assert evidence.floors > 5.0 * evidence.left
+    # One or two of a hundred are no evidence.
+    few = off(at, found.best, 0, slice(1))
+    few = replace(found.best, fit=replace(found.best.fit, residual=few.fit.residual))
+    evidence, _ = weigh_evidence(asked, floor, found.best, coulomb, {"null": replace(few, hypotheses=())})
+    assert evidence.floors < 0.5
+
+
 def test_what_is_left_counts_where_the_effect_helps(stepped):
     asked, floor, found = stepped
     (coulomb,) = found.best.hypotheses
     at = floor[asked.main_horizon]
     plain, ablated = weigh_evidence(asked, floor, found.best, coulomb, {})
     # The component that the effect does not help most is off by 50 floor units, with it and without it.
-    (before, now) = (at.unflatten(one.select).copy() for one in (ablated, found.best))
-    other = 1 - int(((before**2).mean(axis=(0, 1)) - (now**2).mean(axis=(0, 1))).argmax())
-    before[..., other], now[..., other] = 50.0, 50.0
-    far = replace(found.best, select=now.ravel())
-    evidence, _ = weigh_evidence(asked, floor, far, coulomb, {"null": replace(ablated, select=before.ravel())})
+    before, now = (at.unflatten(np.concatenate([one.fit.residual, one.select])) ** 2 for one in (ablated, found.best))
+    other = 1 - int((before.mean(axis=(0, 1)) - now.mean(axis=(0, 1))).argmax())
+    evidence, _ = weigh_evidence(asked, floor, off(at, found.best, other), coulomb, {"null": off(at, ablated, other)})
     assert evidence.left == pytest.approx(plain.left, rel=0.2)
     assert evidence.left < 2.0
 
