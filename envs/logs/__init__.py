@@ -8,7 +8,7 @@ those of the model: joint positions and targets in rad, velocities in rad/s, tor
 
 from envs.logs.controller import Controller, Impedance
 from envs.logs.files import read, read_observed, write
-from envs.logs.format import Log, Run, splits, with_halves_swapped
+from envs.logs.format import Log, Run, splits, with_halves_swapped, with_splits
 from envs.logs.xl330 import read_any, read_xl330
 
 __all__ = [
@@ -22,5 +22,6 @@ __all__ = [
     "read_xl330",
     "splits",
     "with_halves_swapped",
+    "with_splits",
     "write",
 ]

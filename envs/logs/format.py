@@ -122,8 +122,10 @@ class Log:
 def splits(log: Log) -> dict[str, tuple[Run, ...]]:
     """Divides the runs of a log into train, select (validation) and sealed (held-out test).
 
-    Conditions for which the log sets no split are distributed over the three in shares of 2 to 1 to 1, in the order of
-    their names. All runs of a condition go together, so that the test is on conditions that were not fitted.
+    Conditions for which the log sets no split are distributed over the three in shares of 2 to 1 to 1, the one that
+    drives its motors hardest first, so that each split has hard and soft motions. What shows in hard steps alone, such
+    as a torque limit, could otherwise be fitted and never confirmed. All runs of a condition go together, so that the
+    test is on conditions that were not fitted.
 
     Returns:
       Runs by split; each split has one or more.
@@ -137,8 +139,9 @@ def splits(log: Log) -> dict[str, tuple[Run, ...]]:
             raise ValueError(
                 f"runs: condition '{run.condition}' is in '{split_of[run.condition]}' and in '{run.split}'"
             )
+    hard = _hardness(log)
     # The split that is furthest below its share gets the next condition. Sorted, the result does not depend on files.
-    for condition in sorted({run.condition for run in log.runs} - set(split_of)):
+    for condition in sorted(hard.keys() - split_of.keys(), key=lambda name: (-hard[name], name)):
         counts = list(split_of.values())
         split_of[condition] = min(_SHARES, key=lambda split: counts.count(split) / _SHARES[split])
     chosen = {split: tuple(run for run in log.runs if split_of[run.condition] == split) for split in SPLITS}
@@ -149,6 +152,39 @@ def splits(log: Log) -> dict[str, tuple[Run, ...]]:
                 f"{', '.join(sorted(split_of))}, expected three conditions that differ in split or leave it open"
             )
     return chosen
+
+
+def with_splits(log: Log) -> Log:
+    """Returns the log with the split of every run written into it.
+
+    A log that is made from this one, such as a simulated one, is then split in the same way.
+
+    Raises:
+      ValueError: as `splits`.
+    """
+    split_of = {run.condition: split for split, runs in splits(log).items() for run in runs}
+    return replace(log, runs=tuple(replace(run, split=split_of[run.condition]) for run in log.runs))
+
+
+def _hardness(log: Log) -> dict[str, float]:
+    """How hard each condition drives the motors, 0 to 1: the largest error of each joint's position, their mean.
+
+    Errors are shares of the largest one that a joint has in any condition. Speeds take their place where a run has no
+    targets.
+    """
+    largest: dict[str, np.ndarray] = {}
+    told = all({"q", "target"} <= run.signals.keys() for run in log.runs)
+    for run in log.runs:
+        if told:
+            driven = run.signals["target"] - run.signals["q"]
+        elif "q" in run.signals:
+            driven = np.diff(run.signals["q"], axis=0) / np.diff(run.time)[:, None]
+        else:
+            driven = np.zeros((1, len(log.joints)))
+        most = np.abs(driven).max(axis=0)
+        largest[run.condition] = np.maximum(largest.get(run.condition, 0.0), most)
+    scale = np.maximum(np.max(list(largest.values()), axis=0), 1e-12)
+    return {condition: float((most / scale).mean().round(6)) for condition, most in largest.items()}
 
 
 def with_halves_swapped(log: Log) -> Log:

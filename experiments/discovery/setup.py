@@ -10,7 +10,7 @@ import numpy as np
 
 from envs import models, readings, segments
 from envs.effects import LEARNED, LIBRARY
-from envs.logs import Log, Run, read_any, splits, with_halves_swapped
+from envs.logs import Log, Run, read_any, splits, with_halves_swapped, with_splits
 from envs.null_logs import simulate_null_logs
 from envs.regimes import REGIMES
 from envs.rig import Rig
@@ -141,7 +141,7 @@ def build_question(
     """
     horizons = fitting_horizons(log, horizons)
     rate = check_simulatable(log, spec, horizons)
-    log, notes = drop_filtered(log)
+    log, notes = drop_filtered(with_splits(log))
     log = replace(log, runs=readings.with_noise(log.runs, without_sealed(log).runs))
     unsealed = without_sealed(log).runs
     plain = plain or Rig(spec, log.joints, rate)

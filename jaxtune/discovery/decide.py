@@ -76,7 +76,7 @@ class Evidence:
     inside: bool
     """True if all coordinates are inside their bounds."""
     horizons: int
-    """Number of horizons at which `select` costs less with it, prior included."""
+    """Number of horizons at which `train` and `select` cost less with it, prior included."""
 
 
 @dataclass(frozen=True)
@@ -85,6 +85,8 @@ class Thresholds:
 
     gain: float
     """Fall of the cost that the best hypothesis reaches on null logs with probability `Settings.level`."""
+    against: float = 0.05
+    """Share of the gain by which the cost may rise on `select`, which may hold no motion that shows the effect."""
     floors: float = 1.0
     of_left: float = 0.5
     """What `floors` has to reach as a share of `left`: where much is left, a small gain is of another form of an effect
@@ -188,7 +190,8 @@ def passes(evidence: Evidence, thresholds: Thresholds) -> dict[str, bool]:
     return {
         # With thousands of residuals every mimic of an engine gap is significant; null logs say what chance gains.
         "beyond_chance": evidence.gain > thresholds.gain,
-        "confirmed": evidence.confirmed > 0.0,
+        # Select may hold no motion that shows the effect, but it must not speak against it.
+        "confirmed": evidence.confirmed > -thresholds.against * evidence.gain,
         # What nominal parameters can imitate shows in how far they must go, and not in the residuals.
         "matters": evidence.floors >= max(thresholds.floors, thresholds.of_left * evidence.left)
         or evidence.relief >= thresholds.relief,
@@ -312,10 +315,10 @@ def _cost(at: Floor, of_segments: np.ndarray) -> float:
 
 
 def _horizons_better(floor: NoiseFloor, fit: Fit, other: Fit) -> int:
-    """Number of horizons at which `select` costs less with a model than with the other one."""
+    """Number of horizons at which `train` and `select` cost less with a model than with the other one."""
     better = 0
     for at in floor.values():
-        now, before = at.residuals["select"](np.stack([fit.vector, other.vector]))
-        costs = [_cost(at, (at.unflatten(one) ** 2).sum(axis=1)) for one in (now, before)]
+        both = [at.residuals[split](np.stack([fit.vector, other.vector])) for split in ("train", "select")]
+        costs = [_cost(at, (at.unflatten(one) ** 2).sum(axis=1)) for one in np.concatenate(both, axis=1)]
         better += costs[0] + fit.penalty < costs[1] + other.penalty
     return better

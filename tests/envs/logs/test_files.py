@@ -493,6 +493,27 @@ def test_splits_are_what_the_log_says_where_it_does(tmp_path):
         logs.splits(many(tmp_path, said))
 
 
+def test_every_split_has_hard_and_soft_motions(tmp_path):
+    said = [{"condition": name} for name in "abcdefgh"]
+    log = many(tmp_path, said)
+    # Positions of the last conditions are further from their targets.
+    runs = [
+        dataclasses.replace(
+            run, signals={**run.signals, "q": run.signals["target"] - 0.1 * (1 + number) * np.array([1.0, 0.5])}
+        )
+        for number, run in enumerate(log.runs)
+    ]
+    log = dataclasses.replace(log, runs=tuple(runs))
+    held = {split: {run.condition for run in runs} for split, runs in logs.splits(log).items()}
+    assert held == {"train": set("hed a".replace(" ", "")), "select": set("gc"), "sealed": set("fb")}
+    # What is written into the log stays, whatever becomes of its signals.
+    written = logs.with_splits(log)
+    soft = dataclasses.replace(
+        written, runs=tuple(dataclasses.replace(r, signals=log.runs[0].signals) for r in written.runs)
+    )
+    assert {split: {run.condition for run in runs} for split, runs in logs.splits(soft).items()} == held
+
+
 def test_halves_swap_whole_conditions(tmp_path):
     said = [
         {"condition": name, "split": split}

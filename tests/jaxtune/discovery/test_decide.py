@@ -28,7 +28,7 @@ def stepped():
     ("test", "change"),
     [
         ("beyond_chance", {"gain": 9.0}),
-        ("confirmed", {"confirmed": -0.1}),
+        ("confirmed", {"confirmed": -2.6}),
         ("matters", {"floors": 0.9}),
         # Much is left: another form of what is there already would do the same.
         ("matters", {"left": 4.5}),
