@@ -121,6 +121,31 @@ def conclude(settings: Settings, problem: Problem, floor: NoiseFloor, state: Sta
     )
 
 
+def renamed(problem: Problem, candidate: Candidate) -> Candidate:
+    """Lets the larger part give the name where two effects may each be a form of the other, such as delay and filter.
+
+    Args:
+      problem: the hypotheses and their forms.
+      candidate: a model.
+
+    Returns:
+      The same model, with another name for some of its parts.
+    """
+    other_names: dict[str, Hypothesis] = {}
+    for effect in candidate.effects:
+        for form in candidate.forms_of(effect):
+            twins = [h for h in problem.hypotheses if np.array_equal(h.directions, form.directions)]
+            shapes = [
+                other
+                for other in problem.forms
+                if np.array_equal(other.directions, effect.directions) and any(other.shapes(twin) for twin in twins)
+            ]
+            sizes = [np.abs(candidate.fit.coordinates[candidate.fit.along(one)]).max() for one in (effect, form)]
+            if shapes and sizes[1] > sizes[0]:
+                other_names |= {effect.key: twins[0], form.key: shapes[0]}
+    return replace(candidate, hypotheses=tuple(other_names.get(one.key, one) for one in candidate.hypotheses))
+
+
 def with_refinements(terms: Sequence[AcceptedTerm], own: float) -> list[AcceptedTerm]:
     """Marks effects that may only refine a stronger one at the same joints, because no form of the library is exact.
 
@@ -213,7 +238,7 @@ def _proved(
     """The cheapest model without the effects that do not pass, which are taken out one by one, the weakest first."""
     at, failed = floor[problem.main_horizon], []
     (fit,) = polish([state.best.fit], at.residuals["train"], 0)
-    best = replace(state.best, fit=fit)
+    best = renamed(problem, replace(state.best, fit=fit))
     of_effect = Thresholds(state.price)
     of_form = Thresholds(0.5 * state.price, floors=0.0, of_left=0.0, horizons=1)
     fitted = {one.key: one for one in state.candidates}

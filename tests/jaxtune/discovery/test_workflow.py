@@ -8,8 +8,9 @@ import pytest
 from slider import AXES, DIRECTION, HYPOTHESES, LEARNED, WARPED, WILD, problem
 
 from jaxtune.discovery import noise_floor, state, step, workflow
-from jaxtune.discovery.conclude import explained, with_refinements
-from jaxtune.discovery.decide import Evidence
+from jaxtune.discovery.conclude import explained, renamed, with_refinements
+from jaxtune.discovery.decide import Candidate, Evidence
+from jaxtune.discovery.fit import begin
 from jaxtune.discovery.prove import is_worse
 from jaxtune.discovery.result import AcceptedTerm, Settings
 from jaxtune.discovery.screen import Lead
@@ -314,3 +315,25 @@ def test_a_form_that_is_an_effect_of_its_own_is_fitted_alone_too():
     known = step.Lead((push,), np.array([0.3]), np.zeros(2), 12.0)
     assert len(step.shaped([DIRECTION, WARPED], HYPOTHESES, [first, second, known], 1)) == 2
     assert step.shaped([DIRECTION], HYPOTHESES, [second, first], 1) == []
+
+
+def test_the_larger_part_gives_the_name_where_two_effects_are_forms_of_each_other():
+    coulomb, push = HYPOTHESES[2:4]
+    other = replace(coulomb, name="push", family="external", form="with_friction")
+    asked = problem({"coulomb": 0.4, "push": 0.8}, forms=(DIRECTION, other))
+    floor, begun = state.begin(asked, measured_floor(asked))
+    evaluate = floor[asked.main_horizon].residuals["train"]
+
+    def model(sizes):
+        (fit,) = begin(
+            begun.null.fit, [(coulomb, DIRECTION)], [np.array(sizes)], [begun.null.fit.coordinates], evaluate
+        )
+        return Candidate((coulomb, DIRECTION), fit, begun.null.select)
+
+    assert [h.key for h in renamed(asked, model([0.8, 0.4])).hypotheses] == [coulomb.key, DIRECTION.key]
+    swapped = renamed(asked, model([0.4, -0.8]))
+    assert [h.key for h in swapped.hypotheses] == ["push@slider", "push(with_friction)@slider"]
+    assert [h.key for h in swapped.effects] == [push.key]
+    # A form that is no effect with the other one as its form changes no name.
+    alone = replace(asked, forms=(DIRECTION,))
+    assert [h.key for h in renamed(alone, model([0.4, -0.8])).effects] == [coulomb.key]
