@@ -296,7 +296,7 @@ def test_nominal_parameters_are_those_that_the_model_has(pendulum):
     expected = {
         ("coulomb", "hinge"): 0.0019,
         ("gain_error", "hinge"): 0.035,
-        ("damping_gain", "hinge"): 0.1,
+        ("damping_gain", "hinge"): 0.05,
         ("armature", "hinge"): 0.00019,
         ("link_mass", "arm"): 0.1,
     }
