@@ -1,7 +1,7 @@
 """The state of a discovery between two steps, and how it is saved.
 
-A step never changes a state: it returns another one. What is saved is enough to go on after the last step with the
-results of a run that was never interrupted.
+A step never changes a state: it returns another one. What is saved is enough to go on after the last step. Slopes are
+not saved, so numbers may differ a little from those of a run that was never interrupted.
 """
 
 from collections.abc import Mapping, Sequence
