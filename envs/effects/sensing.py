@@ -13,7 +13,7 @@ from envs.effects.memory import as_it_is, delay_line, delayed, lagged
 from jaxtune.types import Effect, Form, Parameter
 
 _SENSING = {"family": "sensing"}
-_HALF_SLOPE_S = 0.01
+_HALF_SLOPE_S = 0.01  # half of the window over which slopes of readings are taken
 
 
 def _encoder_bias(values, readings, now, memory):

@@ -80,10 +80,12 @@ def conclude(settings: Settings, problem: Problem, floor: NoiseFloor, state: Sta
     say("learned torque")
     learned = learn(settings, problem, at, best)
     models = _by_select(at, state, best, learned)
-    share = _explained_share(problem, at, state.null, best, learned)
-    null, after = (_energy(_open_gaps(problem, at, one)) for one in (state.null, best))
-    enough = share >= settings.share and explained(null, after, 0.0) >= settings.least
-    explains = _open_gaps(problem, at, best).max() <= settings.at_floor or (bool(terms) and enough)
+    compared = (state.null, best, learned)
+    gaps, costs = zip(*((_open_gaps(problem, at, one), total_cost(at, one, 0.0)) for one in compared), strict=True)
+    share, whole = _explained_shares([_energy(one) for one in gaps], costs)
+    explains = gaps[1].max() <= settings.at_floor or (
+        bool(terms) and share >= settings.share and whole >= settings.least
+    )
     changed = _at_bounds(problem, best.fit, state.price) if explains else {}
     if not explains:
         verdict = "unnamed"
@@ -196,15 +198,18 @@ def explained(null: float, after: float, bound: float) -> float:
     return float(np.clip((null - after) / room, 0.0, 1.0)) if room > 1e-6 else 1.0
 
 
-def _explained_share(problem: Problem, at: Floor, null: Candidate, best: Candidate, learned: Candidate) -> float:
-    """The share that effects explain of what they and a learned torque explain together, by gaps or by cost.
+def _explained_shares(energies: Sequence[float], costs: Sequence[float]) -> tuple[float, float]:
+    """The share that effects explain of what they and a learned torque explain together, and of all gaps.
 
-    The smaller one counts. In gaps a wrong effect can seem to explain much of an error that it only makes smaller; in
-    the cost, a little of a large one.
+    Of gaps and costs the smaller share counts. In gaps a wrong effect can seem to explain much of an error that it only
+    makes smaller; in the cost, a little of a large one.
+
+    Args:
+      energies: of the gaps of the null, of the model with effects, and with a learned torque too.
+      costs: of the same models.
     """
-    energies = [_energy(_open_gaps(problem, at, one)) for one in (null, best, learned)]
-    costs = [total_cost(at, one, 0.0) for one in (null, best, learned)]
-    return min(explained(before, after, min(after, bound)) for before, after, bound in (energies, costs))
+    both = [explained(null, after, min(after, bound)) for null, after, bound in (energies, costs)]
+    return min(both), explained(energies[0], energies[1], 0.0)
 
 
 def _energy(gaps: np.ndarray) -> float:
