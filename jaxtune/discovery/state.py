@@ -1,7 +1,7 @@
 """The state of a discovery between two steps, and how it is saved.
 
-A step never changes a state: it returns another one. What is saved is enough to go on after the last step. Slopes are
-not saved, so numbers may differ a little from those of a run that was never interrupted.
+A step never changes a state: it returns another one. Every step goes on from what was saved of the step before,
+simulated again, so a run that was interrupted finds the same numbers as one that was not.
 """
 
 from collections.abc import Mapping, Sequence
@@ -113,8 +113,8 @@ def begin(problem: Problem, floor: NoiseFloor) -> tuple[NoiseFloor, State]:
 def to_json(state: State) -> dict[str, Any]:
     """Turns a state into numbers, texts, lists and dictionaries of them.
 
-    Of fits only the coordinates are kept: their residuals and slopes are found by simulating again. Most models have
-    most of what is free in common, so that is kept once.
+    Of fits only the coordinates are kept: their residuals are found by simulating again, and steps that need slopes
+    take them. Most models have most of what is free in common, so that is kept once.
     """
     rows: dict[tuple, int] = {}
     numbers = [[rows.setdefault(row, len(rows)) for row in _rows(one.fit.free)] for one in state.candidates]
@@ -130,6 +130,7 @@ def to_json(state: State) -> dict[str, Any]:
         ],
         "best": state.best.key,
         "finished": state.finished,
+        "screened": state.screened,
         "tried": list(state.tried),
         "price": state.price,
         "penalty": state.penalty,
@@ -146,7 +147,7 @@ def from_json(problem: Problem, floor: NoiseFloor, begun: State, saved: Mapping[
     Raises:
       ValueError: another version saved it.
     """
-    if "rows" not in saved:
+    if not {"rows", "screened"} <= saved.keys():
         raise ValueError("the saved state is of another version: remove state.json to begin anew")
     by_key = {hypothesis.key: hypothesis for hypothesis in (*problem.hypotheses, *problem.forms)}
     at = floor[problem.main_horizon]
@@ -170,7 +171,7 @@ def from_json(problem: Problem, floor: NoiseFloor, begun: State, saved: Mapping[
         best=next(one for one in candidates if one.key == saved["best"]),
         finished=saved["finished"],
         tried=tuple(saved["tried"]),
-        screened=True,
+        screened=saved["screened"],
         price=saved["price"],
         penalty=saved["penalty"],
         not_testable=tuple(saved["not_testable"]),

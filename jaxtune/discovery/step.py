@@ -116,6 +116,8 @@ def _next_base(at: Floor, state: State) -> Candidate | None:
     if len(best.effects) < 2:
         return None
     fitted = {one.key: one for one in state.candidates}
+    (fit,) = polish([best.fit], at.residuals["train"], 0)
+    best = replace(best, fit=fit)
     without = [ablate(at, best, effect, fitted) for effect in best.effects]
     without = [one for one in without if one.key not in state.tried]
     if not without:

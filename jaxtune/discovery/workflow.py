@@ -7,6 +7,7 @@ The null is the nominal model with its nominal parameters and other unknowns fit
 """
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 from jaxtune.discovery import noise_floor, state
@@ -43,14 +44,16 @@ def discover(
     """
     floor = noise_floor.measure(problem, say)
     say("null")
-    floor, found = state.begin(problem, floor)
-    if saved:
-        found = state.from_json(problem, floor, found, saved)
+    floor, begun = state.begin(problem, floor)
+    found = state.from_json(problem, floor, begun, saved) if saved else begun
     while not found.finished:
         found, info = step(settings, problem, floor, found, say)
         for line in info.lines():
             say(line)
-        save(state.to_json(found))
+        saved = state.to_json(found)
+        save(saved)
+        # One batch more in a step, so that an interrupted run, which has nothing else, finds the same numbers.
+        found = state.from_json(problem, floor, replace(begun, library=found.library), saved)
     conclusion = conclude(settings, problem, floor, found, say)
     say("proof on the sealed runs")
     return prove(problem, floor, found, conclusion)

@@ -11,12 +11,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from experiments.discovery.field.bench import FieldBench
+
 ROOT = Path(__file__).parents[2]
 ROBOT = f"{ROOT / 'tests' / 'sled.py'}:simulator"
 # A checkpoint after every chunk of updates, not every minute.
 TRAIN = "from experiments.walking import policies; policies._KEEP_S = 0.0; from experiments import train as command"
 SIM2SIM = "from experiments import sim2sim as command"
 SIM2REAL = "from experiments import sim2real as command"
+DISCOVER = "from experiments import discover as command"
 STUB = "from experiments import robot_stub as command"
 
 
@@ -137,3 +140,18 @@ def test_a_transfer_that_is_killed_five_times(environment, tmp_path):
         os.killpg(robot.pid, signal.SIGKILL)
         robot.communicate()
     same(read(out / "summary.json"), read(tmp_path / "whole" / "summary.json"))
+
+
+@pytest.mark.slow
+def test_a_discovery_that_is_killed_five_times(environment, tmp_path):
+    bench = FieldBench(tmp_path / "bench", "field_smoke", 0, 0.1)
+    log = bench.write(next(case for case in bench.cases if case.effects))
+    options = ["--logs", str(log), "--trust-log", "--out"]
+    end(start(DISCOVER, [*options, str(tmp_path / "whole")], environment))
+    out = tmp_path / "killed"
+    begun = (out / "state.json").exists
+    killed(DISCOVER, [*options, str(out)], environment, begun, 5, np.random.default_rng(5))
+    for name in ("summary.json", "details.json"):
+        same(read(out / name), read(tmp_path / "whole" / name))
+    for name in ("model.xml", "effects.json"):
+        assert (out / "model" / name).read_text() == (tmp_path / "whole" / "model" / name).read_text()

@@ -213,11 +213,16 @@ def test_a_run_that_was_cut_goes_on_after_its_last_step():
     truth = {"coulomb": 1.2, "push": 1.2}
     saved = []
     result = workflow.discover(problem(truth), save=lambda state: saved.append(json.loads(json.dumps(state))))
-    resumed = workflow.discover(problem(truth), saved=saved[0])
-    assert [term.hypothesis.key for term in resumed.terms] == [term.hypothesis.key for term in result.terms]
-    np.testing.assert_allclose(resumed.fit.vector, result.fit.vector, atol=1e-5)
-    assert resumed.gap == pytest.approx(result.gap, rel=1e-4)
-    assert resumed.not_testable == result.not_testable
+    assert len(saved) > 2
+    for cut, kept in enumerate(saved[:-1]):
+        rest = []
+        resumed = workflow.discover(problem(truth), saved=kept, save=rest.append)
+        assert json.loads(json.dumps(rest)) == saved[cut + 1 :]
+        assert [term.hypothesis.key for term in resumed.terms] == [term.hypothesis.key for term in result.terms]
+        np.testing.assert_array_equal(resumed.fit.vector, result.fit.vector)
+        assert resumed.gap == result.gap
+        assert resumed.details == result.details
+        assert resumed.not_testable == result.not_testable
 
 
 def test_a_step_changes_nothing_that_it_is_given():
