@@ -27,7 +27,7 @@ from envs.rig import Rig
 from experiments.common import checkpoint
 from experiments.common.cli import console, run
 from experiments.common.config import preset
-from experiments.walking import foreign
+from experiments.walking import costs, foreign
 from experiments.walking.learner import Learner
 from experiments.walking.policies import starting_policy
 from experiments.walking.robots import BITENO
@@ -40,6 +40,7 @@ FIELDS = ("novelty", "threshold", "p_value")
 """Numbers of a gate call that `alarm` keeps."""
 
 _SIDE_BY_SIDE, _STEPS = 64, 200  # robots and steps of `rig`
+_MOST = 8  # CPU devices
 _LINE_SEARCHES = 6  # of MJX's solver, the fewest with which dry friction comes out right
 
 _HEADINGS = {"rings": "rejects"}  # of the table; the key in JSON stays
@@ -49,10 +50,14 @@ _HEADINGS = {"rings": "rejects"}  # of the table; the key in JSON stays
 class Args:
     """Measures one thing, prints it as a table and writes it as JSON."""
 
-    what: tyro.conf.Positional[Literal["speed", "targets", "rig", "logs", "alarm", "tuner"]]
-    """speed: training steps per second, with exact and fast physics. targets: simulation steps per second of every
-    engine that is installed. rig: simulation steps per second of suspended robots, with the step of MJX and with that
-    of discovery. logs: seconds to read ten minutes of 40 columns at 1 kHz. alarm: how often the gate
+    what: tyro.conf.Positional[
+        Literal["speed", "devices", "profile", "estimates", "targets", "rig", "logs", "alarm", "tuner"]
+    ]
+    """speed: training steps per second, with exact and fast physics. devices: steps per second of episodes and of
+    training on one device, two, four and so on. profile: where the time of a tuning goes. estimates: errors of the
+    regression and of the search-parameter model on the same episodes. targets: simulation steps per second of every
+    engine that is installed. rig: simulation steps per second of suspended robots, with the step of MJX
+    and with that of discovery. logs: seconds to read ten minutes of 40 columns at 1 kHz. alarm: how often the gate
     rejects in its first call, over many seeds. tuner: seconds to compile and to run a tuning, and four runs side by
     side, of the CheetahRun of MuJoCo Playground."""
     out: Path = Path("runs/bench")
@@ -285,14 +290,26 @@ def tuner_programs(args: Args) -> dict:
     return rows
 
 
+MEASURES = {
+    "speed": speed,
+    "devices": lambda args: costs.on_devices(preset(args.preset), args.policy),
+    "profile": lambda args: costs.profile(preset(args.preset), args.policy),
+    "estimates": lambda args: costs.estimates(preset(args.preset), args.policy, args.radius, args.seeds),
+    "targets": targets,
+    "rig": rig,
+    "logs": logs,
+    "alarm": alarm,
+    "tuner": tuner_programs,
+}
+
+
 def main(args: Args) -> None:
     """Measures one thing, prints a table, and writes it as JSON with the time and the memory that it took."""
-    checkpoint.set_up_compiler(
-        checkpoint.for_simulation(most=1) if args.what == "rig" else preset(args.preset).xla_flags
-    )
+    alone = args.what == "rig"
+    flags = checkpoint.for_simulation() if alone else preset(args.preset).xla_flags
+    checkpoint.set_up_compiler(flags, most=1 if alone else _MOST)
     begin = time.monotonic()
-    measures = {"speed": speed, "targets": targets, "rig": rig, "logs": logs, "alarm": alarm, "tuner": tuner_programs}
-    rows = measures[args.what](args)
+    rows = MEASURES[args.what](args)
     table = Table(title=args.what)
     for column in ("", *next(iter(rows.values()))):
         table.add_column(_HEADINGS.get(column, column))

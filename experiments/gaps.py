@@ -19,6 +19,7 @@ from experiments.common.config import preset
 from experiments.walking.learner import Learner
 from experiments.walking.policies import starting_policy
 from experiments.walking.quality import quality
+from jaxtune import devices
 from jaxtune.mjx import parameters
 
 SWEEPS = {
@@ -89,6 +90,7 @@ def main(args: Args) -> None:
     key, steps = jax.random.PRNGKey(args.seed), round(sizes.task.episode_s / constants.POLICY_DT_S)
 
     # Parameters are arguments, so that one compiled program serves all points.
+    @devices.on_all
     @jax.jit
     def walk(policy, params):
         return MjxTarget(robot=learner.robot, params=params).record(key, learner.act(policy), args.episodes, steps)

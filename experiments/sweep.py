@@ -1,8 +1,9 @@
 """Runs the tuner with every combination of its settings: `python -m experiments.sweep --out DIR`.
 
-Every combination of step size, widening factor, first radius, level and seed is a lane of one vmapped `Tuner.run`
-against one target. The policy is fixed, so a lane costs only simulation and the training of the tuner's two models.
-The update is the paper's, because the posterior update has no step size.
+Every combination of step size, widening factor, first radius, level and seed is a lane: a whole run of Algorithm 1
+against one target, `Tuner.run` with the training of the policy in it. Lanes are vmapped and spread over all devices, so
+many at a time as `--lanes` says, always by the same compiled program. What they found is written after each of these
+pieces, and the same command goes on after the last one.
 """
 
 import dataclasses
@@ -22,21 +23,25 @@ from experiments.common import checkpoint, plots
 from experiments.common.cli import bars, console, run
 from experiments.common.config import Preset, named_values, preset
 from experiments.walking.cases import Case, check_positive, checked_case, errors
+from experiments.walking.comparison import UPDATES, with_update
 from experiments.walking.learner import Learner, Policy
 from experiments.walking.policies import default_policy, starting_policy
 from experiments.walking.robots import Kind, kind
-from jaxtune import dist as dists
-from jaxtune import tuner
+from jaxtune import devices, tuner
 from jaxtune.mjx import Entry, parameters
 from jaxtune.types import Coords, Verdict
+
+RESULTS = ("error", "gate_calls", "accepted", "return", "falls")
+"""What is kept of every lane: mean error of the parameters that are off, gate calls and accepted sets over all tunings,
+and mean return and falls of the last policy in the target."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Args:
-    """Tunes one simulator with every combination of the tuner's settings, as one compiled program."""
+    """Tunes one simulator with every combination of the tuner's settings, by one compiled program."""
 
     out: Path = Path("runs/sweep")
-    """Folder of summary.json and heat_map.png."""
+    """Folder of summary.json and heat_map.png. The same command with the same folder goes on after the last lanes."""
     robot: str = "biteno"
     """Robot and task: biteno, go2, playground:NAME (an environment of MuJoCo Playground), or path/to/file.py:function,
     which returns a jaxtune.mjx.Simulator or an environment."""
@@ -47,6 +52,8 @@ class Args:
     truth: tuple[str, ...] = ()
     """True values of the target, name=value, in place of what the case says; parameters that are left out are
     nominal."""
+    update: str = "vote"
+    """How the distribution moves: vote (the paper's steps) or posterior, which has no step size."""
     step_sizes: tuple[float, ...] = (0.25, 0.5, 1.0)
     """Steps of the paper's update, in radii per unit of vote."""
     widen_factors: tuple[float, ...] = (1.5, 2.0)
@@ -59,8 +66,12 @@ class Args:
     """Number of random seeds of every combination; they count from 0."""
     preset: str = "cpu"
     """Size of the run: smoke (a minute, to see that it works), cpu (two cores) or gpu (one GPU)."""
+    fixed_policy: bool = False
+    """Leave the policy as it is, where it is trained after every tuning otherwise."""
+    lanes: int | None = None
+    """Runs side by side, and between two files of results; the preset's number if not given."""
     policy: str | None = None
-    """Policy, which stays fixed: walk (biteno's, ships with the package), scratch (trained first), or a folder of
+    """Starting policy: walk (biteno's, ships with the package), scratch (trained first), or a folder of
     experiments.train; if not given, the one that ships, or scratch where none does."""
     parameters: str | None = None
     """Parameters that are tuned: names joined by commas, or a set: for biteno legs6 (foot friction and the six link
@@ -88,7 +99,13 @@ def check(args: Args) -> tuple[Preset, Kind, dict[str, Entry], Case]:
         tuner.knobs(step_size=step_size, widen_factor=widen_factor, level=level)
     if case.target != "mjx":
         raise ValueError(f"case: got '{args.case}', expected friction or mass: a sweep needs a target in mjx")
-    return dataclasses.replace(sizes, tuner=sizes.sweep, episode_steps=sizes.sweep_steps), robot, entries, case
+    if args.update not in UPDATES:
+        raise ValueError(f"update: got '{args.update}', expected one of {', '.join(UPDATES)}")
+    if args.update == "posterior" and len(args.step_sizes) > 1:
+        raise ValueError(f"step_sizes: got {len(args.step_sizes)}, expected one: the posterior update has no step size")
+    if args.lanes is not None and args.lanes < 1:
+        raise ValueError(f"lanes: got {args.lanes}, expected 1 or more")
+    return sizes.for_sweep(), robot, entries, case
 
 
 def lanes(args: Args) -> np.ndarray:
@@ -101,28 +118,41 @@ def lanes(args: Args) -> np.ndarray:
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
 
 
-def program(learner: Learner, truth: Mapping[str, float], policy: Policy) -> Callable:
-    """Makes the sweep one compiled function of its lanes, [lanes, 5] -> (distribution, info), both [lanes, ...].
+def lane(args: Args, learner: Learner, truth: Mapping[str, float], policy: Policy) -> Callable:
+    """Makes a whole run a function of its settings and seed, [5] in the order of `lanes`.
 
     Args:
+      args: how the distribution moves, and whether the policy is trained.
       learner: gives the tuner its functions.
       truth: the target's physical values by name.
-      policy: what walks in every lane; it is never trained.
+      policy: what walks first in every lane.
+
+    Returns:
+      A pure function. It returns the last distribution, the infos of all tunings without what training reported, and
+      the mean return and the falls of the last policy in the target.
     """
-    target = MjxTarget(robot=learner.robot, params=truth)
-    fixed = dataclasses.replace(learner.tuner(target), train_policy=tuner.keep, update=tuner.vote_update)
+    target, sizes = MjxTarget(robot=learner.robot, params=truth), learner.preset
+    machine = with_update(learner.tuner(target), args.update)
+    if args.fixed_policy:
+        machine = dataclasses.replace(machine, train_policy=tuner.keep)
     dist = learner.dist(parameters.nominal(learner.entries), 1.0)  # each lane sets a radius of its own
 
-    def one(step_size, widen_factor, radius, level, seed):
+    def one(settings):
+        step_size, widen_factor, radius, level, seed = settings
         knobs = tuner.knobs().replace(step_size=step_size, widen_factor=widen_factor, level=level)
         begin = dist.replace(radius=dict.fromkeys(dist.radius, radius))
-        state = fixed.init(policy, begin, knobs)
+        state = machine.init(policy, begin, knobs)
         # Lanes are rows of one float array, so the seed comes as a float.
-        state, info = fixed.run(jax.random.PRNGKey(seed.astype(int)), state, learner.preset.sweep_tunings)
-        # The policy is the same in every lane, and returning it would copy it as often.
-        return state.dist, info
+        key = jax.random.PRNGKey(seed.astype(int))
+        state, info = machine.run(key, state, sizes.tunings)
+        # The same key in all lanes: returns compare.
+        walks = target.episodes(
+            jax.random.PRNGKey(0), learner.act(state.policy), sizes.evaluation_episodes, sizes.episode_steps
+        )
+        # Policies are not returned, since every lane has one of its own.
+        return state.dist, info.replace(train={}), walks.score.sum(axis=-1).mean(), walks.fell.sum()
 
-    return jax.jit(lambda columns: jax.vmap(one)(*columns.T))
+    return one
 
 
 def mean_error(learner: Learner, truth: Mapping[str, float], centre: Coords, off: Sequence[str]) -> np.ndarray:
@@ -165,44 +195,60 @@ def sweep(args: Args, learner: Learner, case: Case) -> None:
       case: how the target differs.
     """
     policy = starting_policy(args.policy, learner, args.out)
-    grid, entries = lanes(args), learner.entries
-    truth = case.true_params(entries, args.start)
-    tune = program(learner, truth, policy)
-    begin = time.monotonic()
+    grid = lanes(args)
+    truth, off = case.true_params(learner.entries, args.start), case.off(learner.entries)
+    several = jax.vmap(lane(args, learner, truth, policy))
+    tune = devices.on_all(jax.jit(lambda rows: devices.spread(several, (rows,))))
+    rows = grid.reshape(-1, grid.shape[-1])
+    size = min(args.lanes or learner.preset.sweep_lanes, len(rows))
+    (args.out / "lanes").mkdir(exist_ok=True)
     with bars() as progress:
-        # One program: nothing is known of how far it is.
-        progress.add_task(f"compiling, then tuning {grid[..., 0].size} simulators", total=None)
-        dist, info = jax.block_until_ready(tune(jnp.asarray(grid.reshape(-1, grid.shape[-1]))))
-    seconds = time.monotonic() - begin
-
-    off = case.off(entries)
-    final = mean_error(learner, truth, dist.centre, off).reshape(grid.shape[:-1])
-    calls = np.asarray(info.calls).sum(axis=-1).reshape(grid.shape[:-1])
+        task = progress.add_task(f"tuning {len(rows)} simulators", total=len(rows))
+        pieces = []
+        for start in range(0, len(rows), size):
+            path = args.out / "lanes" / f"{start:04d}.json"
+            if not path.exists():
+                # The last piece is filled up: another size would be another program.
+                some = rows[(start + np.arange(size)) % len(rows)]
+                begin = time.monotonic()
+                found = _results(learner, truth, off, *jax.device_get(tune(jnp.asarray(some))))
+                found = {name: values[: len(rows) - start] for name, values in found.items()}
+                checkpoint.write_json(path, found | {"seconds": time.monotonic() - begin})
+            pieces.append(checkpoint.read_json(path))
+            progress.update(task, completed=min(start + size, len(rows)))
     names = ("step_size", "widen_factor", "radius", "level")
-    rows = [
-        dict(zip(names, map(float, grid[index][0, :-1]), strict=True))
-        | {"error": final[index].tolist(), "gate_calls": calls[index].tolist()}
-        for index in np.ndindex(grid.shape[:-2])
-    ]
-    accepted = np.asarray(info.verdicts == Verdict.ACCEPT).any(axis=-1).reshape(*grid.shape[:-1], -1)
-    for row, index in zip(rows, np.ndindex(grid.shape[:-2]), strict=True):
-        row["accepted"] = accepted[index].sum(axis=-1).tolist()
-    checkpoint.write_json(
-        args.out / "summary.json",
-        {
-            "case": args.case,
-            "start": args.start,
-            "preset": args.preset,
-            "off": off,
-            "lanes": grid[..., 0].size,
-            "rows": rows,
-            "params": dists.names(dist),
-            "seconds": {"total": seconds},
-            "versions": checkpoint.versions(),
-        },
-    )
-    _draw(args, final.mean(axis=-1))
-    _table(args, rows, seconds, grid[..., 0].size)
+    of_lanes = {name: np.concatenate([piece[name] for piece in pieces]).reshape(grid.shape[:-1]) for name in RESULTS}
+    summary = {
+        "case": args.case,
+        "start": args.start,
+        "preset": args.preset,
+        "update": args.update,
+        "trained": not args.fixed_policy,
+        "off": off,
+        "lanes": len(rows),
+        "rows": [
+            dict(zip(names, map(float, grid[index][0, :-1]), strict=True))
+            | {name: values[index].tolist() for name, values in of_lanes.items()}
+            for index in np.ndindex(grid.shape[:-2])
+        ],
+        "params": sorted(learner.entries),
+        "seconds": {"total": sum(piece["seconds"] for piece in pieces)},
+        "versions": checkpoint.versions(),
+    }
+    checkpoint.write_json(args.out / "summary.json", summary)
+    _draw(args, of_lanes["error"].mean(axis=-1))
+    _table(args, summary)
+
+
+def _results(learner, truth, off, dist, info, value, falls) -> dict[str, list]:
+    """What is kept of some lanes, [lanes] by name."""
+    return {
+        "error": mean_error(learner, truth, dist.centre, off).tolist(),
+        "gate_calls": info.calls.sum(axis=-1).tolist(),
+        "accepted": (info.verdicts == Verdict.ACCEPT).any(axis=-1).sum(axis=-1).tolist(),
+        "return": value.tolist(),
+        "falls": falls.tolist(),
+    }
 
 
 def _draw(args: Args, mean: np.ndarray) -> None:
@@ -213,17 +259,17 @@ def _draw(args: Args, mean: np.ndarray) -> None:
     plots.sweep(args.out / "heat_map.png", panels, rows, columns, ["step size", "first radius", *titles])
 
 
-def _table(args: Args, rows: Sequence[dict], seconds: float, count: int) -> None:
-    table = Table(title=f"case {args.case}, start {args.start:g}X: {count} lanes in {seconds:.0f} s, one program")
-    columns = "step size", "widening factor", "first radius", "level", "error at the end", "gate calls", "accepted"
-    for column in columns:
+def _table(args: Args, summary: dict) -> None:
+    count, seconds = summary["lanes"], summary["seconds"]["total"]
+    table = Table(title=f"case {args.case}, start {args.start:g}X: {count} runs in {seconds:.0f} s, one program")
+    columns = "step size", "widening factor", "first radius", "level"
+    for column in (*columns, "error at the end", "return in target", "gate calls", "accepted"):
         table.add_column(column, justify="right")
-    for row in sorted(rows, key=lambda row: np.mean(row["error"])):
+    for row in sorted(summary["rows"], key=lambda row: np.mean(row["error"])):
         table.add_row(
             *(f"{row[name]:g}" for name in ("step_size", "widen_factor", "radius", "level")),
-            f"{np.mean(row['error']):.3f} +- {np.std(row['error']):.3f}",
-            f"{np.mean(row['gate_calls']):.1f}",
-            f"{np.mean(row['accepted']):.1f}",
+            *(f"{np.mean(row[name]):.3g} +- {np.std(row[name]):.2g}" for name in ("error", "return")),
+            *(f"{np.mean(row[name]):.1f}" for name in ("gate_calls", "accepted")),
         )
     console.print(table)
 

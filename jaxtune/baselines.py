@@ -46,7 +46,8 @@ def spm(tuner: Tuner) -> Tuner:
     The result keeps the tuner's settings and its functions for training, simulating and measuring. It replaces the gate
     by `open_gate` and the update by `vote_update`, so a comparison shows what gate and posterior add.
     """
-    return dataclasses.replace(tuner, verify=open_gate, update=vote_update)
+    config = dataclasses.replace(tuner.config, refinements=0)
+    return dataclasses.replace(tuner, config=config, verify=open_gate, update=vote_update)
 
 
 @dataclass(frozen=True, kw_only=True)

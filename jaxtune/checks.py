@@ -19,11 +19,11 @@ def check_simulated(trajectory: Trajectory, episodes: int, config: TunerConfig) 
       ValueError: a field has another shape than `Trajectory` says, or an episode is shorter than a window.
     """
     steps = _check_shapes("simulate", trajectory, episodes, "one per draw of the coordinates")
-    window = max(config.spm.window, config.dvm.window)
+    window = config.longest_window
     if steps < window:
         raise ValueError(
             f"simulate: got episodes of {steps} steps, expected at least {window}, the length of a window "
-            "(SPMConfig.window, DVMConfig.window)"
+            "(SPMConfig.window, DVMConfig.window, RegressionConfig.window)"
         )
 
 

@@ -27,7 +27,7 @@ import optax
 from flax import linen as nn
 from jaxtyping import Array, Bool, Float
 
-from jaxtune import windows
+from jaxtune import devices, windows
 from jaxtune.types import Trajectory
 
 _STRIDE = 2
@@ -149,6 +149,7 @@ def train(key: jax.Array, config: DVMConfig, trajectory: Trajectory) -> tuple[DV
       The model, and its ELBO in nats per window, as the mean over the last tenth of the steps.
     """
     key_init, key_train, key_reference = jax.random.split(key, 3)
+    trajectory = devices.gather(trajectory)
     scaler = windows.fit_scaler(trajectory)
     network = _VAE(config, scaler.mean.size)
     variables = network.init(key_init, jnp.zeros((1, config.window, scaler.mean.size)), jnp.zeros((1, config.latent)))
@@ -159,7 +160,7 @@ def train(key: jax.Array, config: DVMConfig, trajectory: Trajectory) -> tuple[DV
 
     def loss(variables, key):
         key_window, key_noise = jax.random.split(key)
-        window, _ = windows.draw(key_window, trajectory, config.batch, config.window)
+        window, _ = devices.share(windows.draw(key_window, trajectory, config.batch, config.window))
         noise = jax.random.normal(key_noise, (config.batch, config.latent))
         elbo, _ = network.apply(variables, scaler(window), noise)
         return -scale * elbo.mean()

@@ -24,8 +24,8 @@ import jax
 import numpy as np
 
 from jaxtune.checks import check_measured, check_set
-from jaxtune.rules import TunerConfig, Update, Verify, calibrated_gate, no_update, posterior_update
-from jaxtune.tuner import Info, Measure, TrainPolicy, Tuner, TunerState, keep, make_info
+from jaxtune.rules import TunerConfig, Update, Verify, calibrated_gate, posterior_update
+from jaxtune.tuner import Info, Measure, TrainPolicy, Tuner, TunerState, broken, keep, make_info
 from jaxtune.types import Trajectory, Verdict
 
 HostSimulate = Callable[[jax.Array, Any, dict[str, np.ndarray]], Trajectory]
@@ -86,18 +86,22 @@ class HostTuner:
           ValueError: episodes, simulated or measured, do not have the shapes that they should.
         """
         check_set(measured, self.config)
-        key_gate, key_update = jax.random.split(key)
         carry = self._tuner.before(state.dist)
-        while carry["verdict"] == Verdict.WIDEN:
-            key_collect, key_verify = jax.random.split(jax.random.fold_in(key_gate, carry["calls"]))
+        while carry["left"] > 0:
+            key_collect, key_verify, key_update = jax.random.split(jax.random.fold_in(key, carry["rounds"]), 3)
             collected = self._tuner.collect(key_collect, state.policy, carry["dist"])
             check_measured(measured, collected.trajectory, self.config)
-            gate = self._verify(key_verify, collected, measured, state.knobs)
-            carry = self._decide(carry, collected, gate, state.knobs)
-        moved, update = carry["dist"], no_update(carry["dist"])
-        if carry["verdict"] == Verdict.ACCEPT:
-            moved, update = self._update(key_update, collected, measured, carry["dist"], state.knobs)
-        return state.replace(dist=moved), make_info(carry, update, measured)
+            if carry["verdict"] == Verdict.WIDEN:
+                gate = self._verify(key_verify, collected, measured, state.knobs)
+                carry = self._decide(carry, collected, gate, state.knobs)
+            else:
+                carry = carry | {"not_finite": carry["not_finite"] + broken(collected)}
+            if carry["verdict"] == Verdict.ACCEPT:
+                updated = self._update(key_update, collected, measured, carry["dist"], state.knobs)
+                carry = self._refine(carry, *updated)
+            else:
+                carry = carry | {"rounds": carry["rounds"] + 1}
+        return state.replace(dist=carry["dist"]), make_info(carry, measured)
 
     @cached_property
     def _tuner(self) -> Tuner:
@@ -113,6 +117,10 @@ class HostTuner:
     @cached_property
     def _update(self):
         return jax.jit(lambda key, *args: self.update(key, self.config, *args))
+
+    @cached_property
+    def _refine(self):
+        return jax.jit(self._tuner.refine)
 
     @cached_property
     def _decide(self):

@@ -30,9 +30,12 @@ import jax.numpy as jnp
 import optax
 from brax.envs.base import Env, State
 from brax.training.acme import running_statistics, specs
-from brax.training.acting import generate_unroll
+from brax.training.acting import actor_step
 from brax.training.agents.ppo import losses, networks
+from brax.training.types import Transition
 from flax import linen
+
+from jaxtune import devices
 
 _LEARNING_RATE_RANGE = (1e-5, 1e-2)  # smallest and largest step size that the divergence may steer to
 
@@ -188,7 +191,8 @@ class PPO:
           state: the learner.
           env: a batch of environments that reset themselves, with `truncation` in their state's `info`, as
             `brax.envs.wrappers.training.wrap` makes it.
-          env_state: the environments' state, [num_envs].
+          env_state: the environments' state, [num_envs] on every leaf. Devices in scope (`jaxtune.devices`) share the
+            environments.
 
         Returns:
           The learner, the environments' state, and metrics as scalars: the environment's own (means over the rollout),
@@ -196,21 +200,11 @@ class PPO:
           `std` of the actions.
         """
         key_unroll, key_learn = jax.random.split(key)
-
-        def act(carry, key):
-            # One step a call: Brax's unroll returns transitions, but not the environments' metrics of every step.
-            following, transition = generate_unroll(
-                env, carry, self.act(state, deterministic=False), key, 1, extra_fields=("truncation",)
-            )
-            return following, (jax.tree.map(lambda x: x[0], transition), following.metrics)
-
-        env_state, (data, env_metrics) = jax.lax.scan(
-            act, env_state, jax.random.split(key_unroll, self.config.unroll_steps)
-        )
+        keys = jax.random.split(key_unroll, self.config.num_envs)
+        env_state, data, env_metrics = self.collect(keys, state, env, env_state)
+        data = devices.gather(data)
         # As in Brax's own training, the loss already reads observations with the updated statistics.
         normalizer = running_statistics.update(state.normalizer, data.observation)
-        # Brax's loss takes environments first, [num_envs, unroll_steps].
-        data = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), data)
         (params, opt_state), learned = jax.lax.scan(
             lambda carry, key: self._pass(key, carry, normalizer, data),
             (state.params, state.opt_state),
@@ -220,12 +214,43 @@ class PPO:
         state = PPOState(params=params, normalizer=normalizer, opt_state=opt_state)
         return state, env_state, jax.tree.map(jnp.mean, metrics)
 
+    def collect(
+        self, keys: jax.Array, state: PPOState, env: Env, env_state: State
+    ) -> tuple[State, Transition, dict[str, jax.Array]]:
+        """Collects `unroll_steps` steps of every environment: the first half of an update.
+
+        Args:
+          keys: [num_envs] random keys; with one of its own an environment does not depend on the device that it is on.
+          state: the learner; its policy explores.
+          env: a batch of environments that reset themselves.
+          env_state: the environments' state.
+
+        Returns:
+          The environments' state, transitions [num_envs, unroll_steps] and the environment's metrics of every step.
+        """
+
+        def of_some(state, keys, env_state):
+            policy = jax.vmap(self.act(state, deterministic=False))
+
+            def act(env_state, step):
+                now = jax.vmap(jax.random.fold_in, (0, None))(keys, step)
+                # Not Brax's `generate_unroll`, which gives all environments one key, and no metrics.
+                following, transition = actor_step(env, env_state, policy, now, extra_fields=("truncation",))
+                return following, (transition, following.metrics)
+
+            env_state, found = jax.lax.scan(act, env_state, jnp.arange(self.config.unroll_steps))
+            # Brax's loss takes environments first.
+            return env_state, *jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), found)
+
+        return devices.spread(of_some, (keys, env_state), shared=(state,))
+
     def _pass(self, key, carry, normalizer, data):
         """Goes once over the rollout, environments shuffled into minibatches."""
         key_shuffle, key_loss = jax.random.split(key)
         # Whole environments are shuffled, not single steps: the loss computes advantages along time.
         order = jax.random.permutation(key_shuffle, self.config.num_envs)
         batches = jax.tree.map(lambda x: x[order].reshape(self.config.minibatches, -1, *x.shape[1:]), data)
+        batches = devices.share(batches, axis=1)
         keys = jax.random.split(key_loss, self.config.minibatches)
         return jax.lax.scan(lambda carry, item: self._descend(*item, carry, normalizer), carry, (keys, batches))
 

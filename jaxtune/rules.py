@@ -1,8 +1,9 @@
 """The two decisions of a tuning: is the measured set covered, and where does the distribution move?
 
 A `Tuner` is given one function for each; `jaxtune.tuner` draws where they are called. `verify` trains a verification
-model (`jaxtune.dvm`) and scores the measured set; its default is `calibrated_gate`. `update` trains a search-parameter
-model (`jaxtune.spm`) and moves the distribution; its default is `posterior_update`, and `vote_update` is the paper's.
+model (`jaxtune.dvm`) and scores the measured set; its default is `calibrated_gate`. `update` estimates the coordinates
+of the measured set and moves the distribution; its default is `posterior_update`, by regression (`jaxtune.regression`).
+`vote_update` is the paper's, by a search-parameter model (`jaxtune.spm`).
 To change a decision, write a function with the same arguments (`Verify`, `Update`) and hand it to the tuner.
 
 Departures from the paper:
@@ -11,26 +12,32 @@ Departures from the paper:
   known rate of false alarms. Sets are scored by mean ranks, not by the mean of Eq. 2.
 - Its vote can only raise a parameter; here it has a sign.
 - Both models are trained anew for every distribution, never continued.
-- `posterior_update` is not in the paper. One sweep over guesses gives an estimate and an interval, so it may replace
-  several tunings.
+- `posterior_update` is not in the paper. It gives an estimate and intervals at once, so it may replace several tunings.
+  It estimates by regression, since a sweep of guesses through the search-parameter model had twice the error on the
+  same episodes of a walking robot, and took a hundred times as long (`experiments.bench estimates`).
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 
 import chex
 import jax
 import jax.numpy as jnp
 
+from jaxtune import devices, dvm, regression, spm
 from jaxtune import dist as dists
-from jaxtune import dvm, spm
 from jaxtune.dvm import DVMConfig
+from jaxtune.regression import RegressionConfig
 from jaxtune.spm import SPMConfig
 from jaxtune.types import ParamDist, Trajectory
 
 # An interval counts as informative if it is narrower than this share of the interval that ignores the data. The share
 # is below 1 because both are quantiles over a few dozen sets and differ by chance.
 _IDENTIFIABLE = 0.9
+_LEAST_ERROR = 1e-4  # radii; without noise a regression may be exact
+SETS = {"cpu": 1, "other": 64}
+"""Held-out sets that are scored side by side on a device (`devices.in_chunks`)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,14 +63,24 @@ class TunerConfig:
     """Smallest novelty decrease that counts as progress, measured from the last call that made some. The novelty is a
     mean rank between 0 and 1. The value was chosen, not calibrated: the novelty of a first call varies by 0.01 to 0.04
     between seeds (`experiments.bench alarm`)."""
+    refinements: int = 3
+    """Times that an accepted set is read again, in the distribution that the update narrowed. Use 0 with `vote_update`,
+    whose steps are meant for one set each."""
     coverage: float = 0.9
     """Share of held-out sets whose true coordinates the interval of the posterior update must contain."""
     min_radius: float = 0.1
     """Smallest radius, in coordinates, that the posterior update narrows to."""
+    regression: RegressionConfig = field(default_factory=RegressionConfig)
+    """Sizes of the regression that the posterior update estimates with."""
     spm: SPMConfig = field(default_factory=SPMConfig)
-    """Sizes of the search-parameter model."""
+    """Sizes of the search-parameter model, which the vote update trains."""
     dvm: DVMConfig = field(default_factory=DVMConfig)
     """Sizes of the verification model."""
+
+    @property
+    def longest_window(self) -> int:
+        """Steps that an episode must have at least."""
+        return max(self.regression.window, self.spm.window, self.dvm.window)
 
 
 @chex.dataclass(frozen=True)
@@ -149,7 +166,7 @@ class UpdateInfo:
     step: jax.Array  # movement of the centre, before it is clipped to the bounds
     interval: jax.Array  # half width of the interval around the new centre; nan where the rule gives none
     identifiable: jax.Array  # False where the measured set says no more than the distribution did
-    loss: jax.Array  # scalar, logistic loss of the search-parameter model, nats per coordinate
+    loss: jax.Array  # scalar: `vote_update`'s logistic loss in nats, `posterior_update`'s error of episodes left out
 
 
 Verify = Callable[[jax.Array, TunerConfig, Collected, Trajectory, Knobs], GateInfo]
@@ -188,7 +205,7 @@ def calibrated_gate(
       step that is not finite, and where no simulated observation ever changes.
     """
     model, elbo = dvm.train(key, config.dvm, collected.trajectory)
-    held_out = jax.lax.map(lambda episodes: dvm.novelty(config.dvm, model, episodes), collected.held_out)
+    held_out = devices.in_chunks(partial(dvm.novelty, config.dvm), (collected.held_out,), SETS, shared=(model,))
     scored = dvm.novelty(config.dvm, model, measured)
     novelty, valid, covered = jax.tree.map(lambda sets, one: jnp.concatenate([sets, one[None]]), held_out, scored)
     novelty = jnp.where(covered, novelty, jnp.inf)
@@ -249,45 +266,50 @@ def posterior_update(
 ) -> tuple[ParamDist, UpdateInfo]:
     """Moves the centre to the posterior's median and narrows the radius to its interval: the default update.
 
-    A sweep of guesses through the search-parameter model gives each coordinate's estimate where the logit of
-    p(truth > guess) crosses zero (see `spm.estimate`). Held-out sets, whose coordinates are known, calibrate it. With Q
-    the conformal quantile `coverage` over held-out sets, and all values in radii,
+    A regression on D_q gives each coordinate's estimate (`jaxtune.regression`). Held-out sets, whose coordinates are
+    known, calibrate it. With Q the conformal quantile `coverage` over held-out sets, e the regression's error of an
+    episode that it leaves out, and all values in radii,
 
-        interval     = Q(|estimate - truth|)
+        interval     = e Q(max over coordinates of |estimate - truth| / e)
         ignorant     = Q(|middle of the box - truth|)
-        identifiable = interval < 0.9 ignorant
+        identifiable = Q(|estimate - truth|) < 0.9 ignorant
         step         = estimate(measured)                           where identifiable, else 0
-        radius      <- max(radius * interval, min_radius)           where identifiable and inside the box; never larger
+        radius      <- max(radius * interval, min_radius)           where identifiable, if all are inside; never larger
 
-    A coordinate that is not identifiable keeps centre and radius. One whose interval reaches past the box moves, but
-    keeps its radius.
+    The intervals hold together: all truths at once lie in them with probability `coverage`, if the measured set is a
+    draw like the held-out ones. A coordinate that is not identifiable keeps centre and radius. Where the interval of
+    one that is reaches past the box, all keep their radii, and centres move.
 
     Args:
-      key: random key, for training the search-parameter model.
+      key: not used.
       config: sizes, with `coverage` and `min_radius`.
       collected: D_q and held-out sets, drawn from `dist`.
       measured: the accepted measured set, [set_episodes, time].
       dist: the distribution that the episodes were drawn from.
       knobs: not used.
     """
-    model, loss = spm.train(key, config.spm, collected.trajectory, collected.sampled_coords, dist)
-    held_out = jax.lax.map(lambda episodes: spm.estimate(config.spm, model, episodes), collected.held_out)
+    model = regression.train(config.regression, collected.trajectory, collected.sampled_coords, dist)
+    estimate = partial(regression.estimate, config.regression)
+    held_out = devices.in_chunks(estimate, (collected.held_out,), SETS, shared=(model,))
     # The errors on robots with known coordinates stand for the error on the measured one.
     truth = dists.normalise(dist, collected.held_out_coords)
     low, high = dists.normalised_box(dist)
-    interval = _conformal_quantile(jnp.abs(held_out - truth), config.coverage)
+    error = jnp.abs(held_out - truth)
+    # What scales the errors must not come from the sets that calibrate them.
+    scale = jnp.maximum(model.error, _LEAST_ERROR)
+    interval = scale * _conformal_quantile((error / scale).max(axis=-1), config.coverage)
     ignorant = _conformal_quantile(jnp.abs((low + high) / 2 - truth), config.coverage)
-    identifiable = interval < _IDENTIFIABLE * ignorant
-    step = jnp.where(identifiable, spm.estimate(config.spm, model, measured), 0.0)
+    identifiable = _conformal_quantile(error, config.coverage) < _IDENTIFIABLE * ignorant
+    step = jnp.where(identifiable, estimate(model, measured), 0.0)
     moved = dists.move(dist, step)
     radius = dists.ravel(dist.radius)
     narrowed = jnp.clip(radius * interval, jnp.minimum(config.min_radius, radius), radius)
-    # Held-out truths all lie in the box, so their errors say nothing of truths beyond it. Narrowing at the edge could
-    # exclude such a truth for good.
-    inside = (step - interval >= low) & (step + interval <= high)
+    # Held-out truths all lie in the box, so their errors say nothing of truths beyond it. One that is outside in one
+    # coordinate may bend the estimates of all, and narrowing could exclude it for good.
+    inside = (((step - interval >= low) & (step + interval <= high)) | ~identifiable).all()
     radius = jnp.where(identifiable & inside, narrowed, radius)
     moved = moved.replace(radius=dists.unravel(dists.names(dist), radius))
-    return moved, UpdateInfo(step=step, interval=interval, identifiable=identifiable, loss=loss)
+    return moved, UpdateInfo(step=step, interval=interval, identifiable=identifiable, loss=model.error.mean())
 
 
 def no_gate_log(config: TunerConfig) -> dict:

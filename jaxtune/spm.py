@@ -29,8 +29,8 @@ import optax
 from flax import linen as nn
 from jaxtyping import Array, Bool, Float
 
+from jaxtune import devices, windows
 from jaxtune import dist as dists
-from jaxtune import windows
 from jaxtune.types import Coords, ParamDist, Trajectory
 
 _SCALED = 2048  # windows from which mean and standard deviation of the moments are computed
@@ -110,23 +110,7 @@ class SPM:
 
 def _read(steps: windows.Scaler, moments: windows.Scaler, window: Float[Array, "batch time channels"]):
     """Computes the network's input: the standardised moments of each window, clipped."""
-    return jnp.clip(moments(_moments(steps(window))), -_FAR, _FAR)
-
-
-def _moments(window: Float[Array, "batch time channels"]) -> Float[Array, "batch moments"]:
-    """Computes a window's moments: each channel's mean and spread of first and second differences, and covariances.
-
-    Covariances are taken between all channels, within a step and between the deviation at one step and the change to
-    the next. The gait clock is among the channels of a walking robot, so these covariances hold phases.
-    """
-    batch, time, channels = window.shape
-    mean = window.mean(axis=1)
-    centred = window - mean[:, None]
-    step = jnp.diff(window, axis=1)
-    upper = jnp.triu_indices(channels)  # covariances within a step are symmetric; those across steps are not
-    at_once = jnp.einsum("bti,btj->bij", centred, centred)[:, *upper] / time
-    ahead = jnp.einsum("bti,btj->bij", step, centred[:, :-1]).reshape(batch, -1) / time
-    return jnp.concatenate([mean, step.std(axis=1), jnp.diff(step, axis=1).std(axis=1), at_once, ahead], axis=-1)
+    return jnp.clip(moments(windows.moments(steps(window))), -_FAR, _FAR)
 
 
 def train(
@@ -151,11 +135,12 @@ def train(
       coordinates.
     """
     key_init, key_moments, key_train = jax.random.split(key, 3)
+    trajectory, coords = devices.gather((trajectory, coords))
     truth = dists.normalise(dist, coords)
     low, high = dists.normalised_box(dist)
     steps = windows.fit_scaler(trajectory)
     window, _ = windows.draw(key_moments, trajectory, _SCALED, config.window)
-    moments = windows.scaler(_moments(steps(window)))
+    moments = windows.scaler(windows.moments(steps(window)))
     network = _Network(config, truth.shape[-1])
     variables = network.init(key_init, moments.mean[None], jnp.zeros((1, 1, truth.shape[-1])))
     schedule = optax.cosine_onecycle_schedule(config.train_steps, config.learning_rate)
@@ -163,7 +148,7 @@ def train(
 
     def loss(variables, key):
         key_window, key_guess = jax.random.split(key)
-        window, episode = windows.draw(key_window, trajectory, config.batch, config.window)
+        window, episode = devices.share(windows.draw(key_window, trajectory, config.batch, config.window))
         shape = (config.batch, config.guesses, truth.shape[-1])
         # `vote` asks about the centre, so the centre is among the guesses of every window.
         guesses = jax.random.uniform(key_guess, shape, minval=low, maxval=high).at[:, 0].set(0.0)

@@ -11,7 +11,7 @@ ones, and trains a policy in it. One tuning is one `Tuner.step`:
       |   verify(D_q, held-out sets, measured set)  ->  novelty, threshold          |
       |   verdict:                                                                  |
       |     widen               radius <- min(radius * widen_factor, bounds) -------+
-      |     accept              dist <- update(D_q, held-out sets, measured set, dist)
+      |     accept              dist <- update(D_q, held-out sets, measured set, dist), and again in the narrower dist
       |     unexplained         the centre stays where it is: the model lacks physics
       |     radius_exhausted    the centre stays: no wider distribution is allowed
       |     not_finite          the centre stays: there was nothing to score
@@ -29,6 +29,8 @@ novelty that still counts as covered. The verdict is the first of these that hol
 
 Departures from the paper, besides those of gate and update (`jaxtune.rules`):
 
+- An accepted set is read up to `refinements` times more, with episodes simulated in the distribution that the update
+  narrowed. In a narrower distribution estimates are more exact, and the robot need not walk for it.
 - A tuning ends with training the policy, where the paper's begins with it. The last tuning therefore leaves a policy
   that was trained in the last distribution.
 - The radius grows only after a failed check (in print it grows before each), is capped by the bounds, and the loop ends
@@ -107,6 +109,8 @@ __all__ = [
     "vote_update",
 ]
 
+_CHANGED = 0.9  # of a radius: what is narrowed less than that, or moved by less than the rest, is as it was
+
 Policy = Any
 """Any pytree that the user's functions take as a policy; the tuner only passes it on."""
 TrainPolicy = Callable[[jax.Array, Policy, ParamDist], tuple[Policy, dict]]
@@ -139,21 +143,26 @@ class Info:
     radius: jax.Array  # [calls], the largest radius of the distribution that was tested, in coordinates
     gate: GateInfo  # [calls]
     update: UpdateInfo  # steps of zero where no update was made
-    dist: ParamDist  # the distribution that the last episodes were drawn from, before the update
+    dist: ParamDist  # the distribution that the last gate call tested, before the update
     measured_falls: jax.Array  # number of measured episodes that ended early
     not_finite: jax.Array  # number of episodes, simulated or measured, whose simulation broke
 
 
-def make_info(carry: dict, update: UpdateInfo, measured: Trajectory) -> Info:
-    """Puts together what happened in one tuning, from what its gate's loop carried last; `train` is empty."""
+def broken(collected: Collected) -> jax.Array:
+    """Counts simulated episodes in which the simulation broke."""
+    return collected.trajectory.not_finite.sum() + collected.held_out.not_finite.sum()
+
+
+def make_info(carry: dict, measured: Trajectory) -> Info:
+    """Puts together what happened in one tuning, from what its loop carried last; `train` is empty."""
     return Info(
         train={},
         calls=carry["calls"],
         verdicts=carry["verdicts"],
         radius=carry["radius"],
         gate=carry["gate"],
-        update=update,
-        dist=carry["dist"],
+        update=carry["update"],
+        dist=carry["tested"],
         measured_falls=measured.fell.sum(),
         not_finite=carry["not_finite"] + measured.not_finite.sum(),
     )
@@ -245,39 +254,45 @@ class Tuner:
         Raises:
           ValueError: episodes, simulated or measured, do not have the shapes that they should (`jaxtune.checks`).
         """
-        key_gate, key_update = jax.random.split(key)
-        carry = self._gate_loop(key_gate, state, measured)
-        # A branch, so that (unless vmapped) no search-parameter model is trained for a set that was not accepted.
-        moved, update = jax.lax.cond(
-            carry["verdict"] == Verdict.ACCEPT,
-            lambda: self.update(key_update, self.config, carry["collected"], measured, carry["dist"], state.knobs),
-            lambda: (carry["dist"], no_update(carry["dist"])),
-        )
-        return state.replace(dist=moved), make_info(carry, update, measured)
-
-    def _gate_loop(self, key, state, measured):
-        """Simulates, verifies and widens while the verdict is `widen`: the do-while of Algorithm 1."""
-
-        def body(carry):
-            # Every call simulates new robots and trains its models anew, because the distribution has changed.
-            key_collect, key_verify = jax.random.split(jax.random.fold_in(key, carry["calls"]))
-            collected = self.collect(key_collect, state.policy, carry["dist"])
-            gate = self.verify(key_verify, self.config, collected, measured, state.knobs)
-            return {**self.decide(carry, collected, gate, state.knobs), "collected": collected}
-
-        # A while loop needs a carry of fixed shapes: zeros stand for the episodes that the first call will collect.
+        # Only shapes: nothing is simulated here.
         shapes = jax.eval_shape(self.collect, key, state.policy, state.dist)
         check_measured(measured, shapes.trajectory, self.config)
-        blank = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-        return jax.lax.while_loop(
-            lambda carry: carry["verdict"] == Verdict.WIDEN, body, {**self.before(state.dist), "collected": blank}
-        )
+
+        def body(carry):
+            # Every round simulates new robots and trains its models anew, because the distribution has changed.
+            key_collect, key_verify, key_update = jax.random.split(jax.random.fold_in(key, carry["rounds"]), 3)
+            collected = self.collect(key_collect, state.policy, carry["dist"])
+            # Branches, so that (unless vmapped) no model is trained that is not needed.
+            carry = jax.lax.cond(
+                carry["verdict"] == Verdict.WIDEN,
+                lambda: self.decide(
+                    carry,
+                    collected,
+                    self.verify(key_verify, self.config, collected, measured, state.knobs),
+                    state.knobs,
+                ),
+                lambda: carry | {"not_finite": carry["not_finite"] + broken(collected)},
+            )
+            return jax.lax.cond(
+                carry["verdict"] == Verdict.ACCEPT,
+                lambda: self.refine(
+                    carry, *self.update(key_update, self.config, collected, measured, carry["dist"], state.knobs)
+                ),
+                lambda: carry | {"rounds": carry["rounds"] + 1},
+            )
+
+        carry = jax.lax.while_loop(lambda carry: carry["left"] > 0, body, self.before(state.dist))
+        return state.replace(dist=carry["dist"]), make_info(carry, measured)
 
     def before(self, dist: ParamDist) -> dict:
-        """Makes what the gate's loop carries before the first call; the verdict `widen` lets the loop begin."""
+        """Makes what the loop of a tuning carries before its first round; it ends when no rounds are `left`."""
         return {
+            "rounds": jnp.zeros((), int),
+            "left": jnp.asarray(1 + self.config.refinements, int),
             "calls": jnp.zeros((), int),
             "dist": dist,
+            "tested": dist,
+            "update": no_update(dist),
             "verdict": jnp.asarray(Verdict.WIDEN, int),
             "closest": jnp.asarray(jnp.inf, float),
             "stalled": jnp.zeros((), int),
@@ -295,16 +310,18 @@ class Tuner:
           knobs: for the widening factor.
 
         Returns:
-          What the loop carries to the next call; the loop ends unless its `verdict` is `widen`.
+          What the loop carries on; the loop ends where the verdict is neither `widen` nor `accept`.
         """
         calls, dist = carry["calls"], carry["dist"]
         closer = gate.novelty < carry["closest"] - self.config.least_fall
         stalled = jnp.where(closer, 0, carry["stalled"] + 1)
         verdict = jnp.asarray(self._verdict(gate, dist, calls, stalled), int)
-        broken = collected.trajectory.not_finite.sum() + collected.held_out.not_finite.sum()
+        goes_on = (verdict == Verdict.WIDEN) | (verdict == Verdict.ACCEPT)
         wider = dists.widen(dist, knobs.widen_factor)
-        return {
+        return carry | {
+            "left": jnp.where(goes_on, carry["left"], 0),
             "calls": calls + 1,
+            "tested": dist,
             "dist": jax.tree.map(lambda new, old: jnp.where(verdict == Verdict.WIDEN, new, old), wider, dist),
             "verdict": verdict,
             # Several small decreases may add up to one that counts as progress.
@@ -313,7 +330,32 @@ class Tuner:
             "verdicts": carry["verdicts"].at[calls].set(verdict),
             "radius": carry["radius"].at[calls].set(dists.ravel(dist.radius).max()),
             "gate": jax.tree.map(lambda log, value: log.at[calls].set(value), carry["gate"], gate),
-            "not_finite": carry["not_finite"] + broken,
+            "not_finite": carry["not_finite"] + broken(collected),
+        }
+
+    def refine(self, carry: dict, moved: ParamDist, update: UpdateInfo) -> dict:
+        """Takes an update of an accepted set, and decides whether the set is read again, in the narrower distribution.
+
+        That needs no further measured episode. It ends after `TunerConfig.refinements`, or where the distribution
+        hardly changed.
+
+        Args:
+          carry: from `decide`, or from the refinement before.
+          moved: what the update made of the distribution.
+          update: what it did.
+
+        Returns:
+          What the loop carries on. All updates of the set count as one, in radii of the distribution that was tested.
+        """
+        before, tested = carry["dist"], dists.ravel(carry["tested"].radius)
+        radius, known = dists.ravel(before.radius), carry["update"].identifiable | update.identifiable
+        changed = (dists.ravel(moved.radius) < _CHANGED * radius) | (jnp.abs(update.step) > 1.0 - _CHANGED)
+        whole = (dists.ravel(moved.centre) - dists.ravel(carry["tested"].centre)) / tested
+        return carry | {
+            "rounds": carry["rounds"] + 1,
+            "left": jnp.where(changed.any(), carry["left"] - 1, 0),
+            "dist": moved,
+            "update": update.replace(step=whole, interval=update.interval * radius / tested, identifiable=known),
         }
 
     def collect(self, key: jax.Array, policy: Policy, dist: ParamDist) -> Collected:

@@ -119,3 +119,19 @@ def fit_scaler(trajectory: Trajectory) -> Scaler:
     # What follows an end may be anything, and zero times nan is nan.
     channels = jnp.where(trajectory.alive[..., None], steps(trajectory), 0.0)
     return scaler(channels, trajectory.alive[..., None] / jnp.maximum(trajectory.alive.sum(), 1))
+
+
+def moments(window: Float[Array, "batch time channels"]) -> Float[Array, "batch moments"]:
+    """Computes a window's moments: each channel's mean and spread of first and second differences, and covariances.
+
+    Covariances are taken between all channels, within a step and between the deviation at one step and the change to
+    the next. The gait clock is among the channels of a walking robot, so these covariances hold phases.
+    """
+    batch, time, channels = window.shape
+    mean = window.mean(axis=1)
+    centred = window - mean[:, None]
+    step = jnp.diff(window, axis=1)
+    upper = jnp.triu_indices(channels)  # covariances within a step are symmetric; those across steps are not
+    at_once = jnp.einsum("bti,btj->bij", centred, centred)[:, *upper] / time
+    ahead = jnp.einsum("bti,btj->bij", step, centred[:, :-1]).reshape(batch, -1) / time
+    return jnp.concatenate([mean, step.std(axis=1), jnp.diff(step, axis=1).std(axis=1), at_once, ahead], axis=-1)

@@ -32,22 +32,30 @@ _PACKAGES = ("jaxtune", "jax", "mujoco", "mujoco-mjx", "brax", "flax", "optax", 
 
 _DRAFT = ".tmp"  # suffix of a file that is being written, or that a killed run left behind
 _LEAST_THREADS = 8  # of XLA's pool on a CPU
+_DEVICES = "--xla_force_host_platform_device_count"
 _LOCK = ".lock"  # suffix of a file whose lock says that a process works on a piece
 
 
-def set_up_compiler(xla_flags: str) -> None:
-    """Sets the flags of XLA, JAX's compiler, and keeps compiled programs on disk so that a second run starts sooner.
+def set_up_compiler(xla_flags: str, most: int = 8) -> None:
+    """Sets up XLA, JAX's compiler: its flags, its devices on a CPU, and where compiled programs are kept.
 
-    Call it before JAX makes its first array, because JAX reads the flags then and never again. Programs are kept in the
-    user's cache folder, or where `JAX_COMPILATION_CACHE_DIR` says. XLA also gets more threads than a small machine has
-    cores (environment variable `NPROC`, unless it is set): with one thread a core, programs on two cores were seen to
-    hang.
+    Call it before JAX makes its first array, because JAX reads the flags then and never again.
+
+    - On a CPU every core of this process is a device, so that all cores share the work (`jaxtune.devices`). XLA has a
+      single CPU device unless it is told otherwise.
+    - XLA gets more threads than a small machine has cores (environment variable `NPROC`, unless it is set): with one
+      thread a core, programs on two cores were seen to hang.
+    - Programs are kept on disk, in the user's cache folder or where `JAX_COMPILATION_CACHE_DIR` says, so that a second
+      run starts sooner.
 
     Args:
-      xla_flags: added to `XLA_FLAGS`.
+      xla_flags: added to `XLA_FLAGS`. A number of CPU devices that is set there already stays.
+      most: largest number of CPU devices.
     """
-    if xla_flags:
-        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {xla_flags}".strip()
+    flags = f"{os.environ.get('XLA_FLAGS', '')} {xla_flags}".strip()
+    if _DEVICES not in flags:
+        flags = f"{flags} {_DEVICES}={min(cores(), most)}"
+    os.environ["XLA_FLAGS"] = flags
     os.environ.setdefault("NPROC", str(max(_LEAST_THREADS, cores())))
     chosen = os.environ.get("JAX_COMPILATION_CACHE_DIR")
     base = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
@@ -65,21 +73,15 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def for_simulation(most: int = 8) -> str:
-    """Returns XLA flags for programs that simulate robots on CPU; pass them to `set_up_compiler`.
+def for_simulation() -> str:
+    """Returns XLA flags for programs that simulate any robot on CPU; pass them to `set_up_compiler`.
 
-    - Every core of this process is a JAX device. XLA uses a single CPU device otherwise, and a vmapped simulation would
-      run on one core. Programs that shard their work over devices, as discovery does, use all of them.
-    - The fusion emitters of JAX 0.10 are off. They compute each body's pose again for every body that hangs on it: a
-      step of MJX took 84 times as long for a chain of six joints, and 6 times for five (github.com/jax-ml/jax,
-      issue 33761). JAX 0.11 has no such flag, and does not need it.
-
-    Args:
-      most: largest number of devices.
+    The fusion emitters of JAX 0.10 are off. They compute each body's pose again for every body that hangs on it: a step
+    of MJX took 84 times as long for a chain of six joints, and 6 times for five (github.com/jax-ml/jax, issue 33761).
+    JAX 0.11 has no such flag, and does not need it.
     """
-    devices = f"--xla_force_host_platform_device_count={min(cores(), most)}"
     # XLA ends the process at a flag that it does not know.
-    return devices if jax.__version_info__ >= (0, 11) else f"{devices} --xla_cpu_use_fusion_emitters=false"
+    return "" if jax.__version_info__ >= (0, 11) else "--xla_cpu_use_fusion_emitters=false"
 
 
 def versions() -> dict[str, str]:

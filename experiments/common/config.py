@@ -6,7 +6,7 @@ in seconds to minutes; it shows that the command works, but is too small to tune
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from envs.biteno import TaskConfig
@@ -72,8 +72,25 @@ class Preset:
     """Policy steps of an episode in a sweep."""
     sweep_tunings: int = 3
     """Tunings of every combination in a sweep."""
+    sweep_ppo: PPOConfig = field(default_factory=lambda: PPOConfig(num_envs=64, minibatches=2))
+    """Sizes of PPO in a sweep."""
+    sweep_epochs: int = 10
+    """PPO updates in a tuning of a sweep."""
+    sweep_lanes: int = 8
+    """Runs of a sweep side by side."""
     xla_flags: str = ""
     """Flags that are added to `XLA_FLAGS`; only `smoke` has some, to compile faster."""
+
+    def for_sweep(self) -> "Preset":
+        """The same with the sizes of a sweep in the place of a single run's."""
+        return replace(
+            self,
+            ppo=self.sweep_ppo,
+            tuner=self.sweep,
+            episode_steps=self.sweep_steps,
+            tunings=self.sweep_tunings,
+            epochs=self.sweep_epochs,
+        )
 
 
 _TINY = TunerConfig(
@@ -99,6 +116,9 @@ _SMOKE = Preset(
     sweep=_TINY,
     sweep_steps=80,
     sweep_tunings=2,
+    sweep_ppo=PPOConfig(num_envs=16, unroll_steps=8, epochs=1, minibatches=2),
+    sweep_epochs=2,
+    sweep_lanes=2,
     xla_flags=QUICK_COMPILATION,
 )
 
@@ -117,6 +137,8 @@ _GPU = Preset(
     epochs=100,
     evaluation_episodes=256,
     scratch_updates=400,
+    sweep_ppo=PPOConfig(num_envs=256),
+    sweep_lanes=64,
 )
 
 PRESETS = {"smoke": _SMOKE, "cpu": Preset(), "gpu": _GPU}

@@ -56,7 +56,7 @@ def tuning(info: Info) -> dict:
         "radius": np.asarray(info.radius)[:calls],
         **gate,
         **update,
-        "spm_loss": float(info.update.loss),
+        "update_loss": float(info.update.loss),
         "measured_falls": int(info.measured_falls),
         "not_finite": int(info.not_finite),
         "training": {name: float(np.mean(value)) for name, value in info.train.items()},

@@ -11,6 +11,7 @@ from envs import segments
 from envs.effects.memory import LONGEST_S
 from envs.logs import Run
 from experiments.discovery.setup import Question
+from jaxtune import devices
 
 _WIDTH = 16  # simulations side by side
 
@@ -53,9 +54,13 @@ def simulate_runs(
     ]
 
 
+@devices.on_all
 @partial(jax.jit, static_argnums=0)
 def _play(simulate, system, values, inputs, steps):
-    return jax.vmap(lambda value, one: simulate(system, value, one, steps)["q"])(values, inputs)
+    def some(system, steps, values, inputs):
+        return jax.vmap(lambda value, one: simulate(system, value, one, steps)["q"])(values, inputs)
+
+    return devices.spread(some, (values, inputs), shared=(system, steps))
 
 
 def _padded(cut: segments.Segment, before: int) -> segments.Segment:

@@ -94,7 +94,7 @@ class Tuning:
     """Half width of the interval, by parameter, in radii."""
     identifiable: dict[str, bool]
     """Whether the log narrows a parameter down."""
-    spm_loss: float | None
+    update_loss: float | None
     """Final loss of the search-parameter model."""
     measured_falls: int
     """Number of falls in the part of the walks that was compared."""

@@ -35,7 +35,7 @@ from experiments.robot.fall_risk import fall_risk, summarise_log
 from experiments.robot.records import Measured, Moved, Prediction, Round, Suspicion, Tuning
 from experiments.walking.learner import Learner, Policy
 from experiments.walking.policies import policy_config
-from jaxtune import baselines, tuner
+from jaxtune import baselines, devices, tuner
 from jaxtune.tuner import Tuner, TunerState
 
 
@@ -74,9 +74,9 @@ class Programs:
     def __init__(self, learner: Learner):
         self.learner = learner
         self.machines = {name: strategy.tuner(learner.tuner()) for name, strategy in STRATEGIES.items()}
-        self.tune = {name: jax.jit(machine.tune) for name, machine in self.machines.items()}
-        self.train = jax.jit(learner.tuner().train)
-        self.predict = jax.jit(learner.predict, static_argnums=(3, 4))
+        self.tune = {name: devices.on_all(jax.jit(machine.tune)) for name, machine in self.machines.items()}
+        self.train = devices.on_all(jax.jit(learner.tuner().train))
+        self.predict = devices.on_all(jax.jit(learner.predict, static_argnums=(3, 4)))
         self.actions = jax.jit(learner.actions)
 
 

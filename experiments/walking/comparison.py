@@ -38,6 +38,12 @@ class Contender:
     """Measured sets that the method uses up in a tuning: one, or zero if it is never tuned."""
 
 
+def with_update(machine: tuner.Tuner, update: str) -> tuner.Tuner:
+    """Gives a tuner one of `UPDATES`; the paper's makes one step for every measured set."""
+    config = machine.config if update == "posterior" else replace(machine.config, refinements=0)
+    return replace(machine, config=config, update=UPDATES[update])
+
+
 def contenders(
     learner: Learner, target: Target, policy: Policy, *, radius: float, dr_radius: float, update: str
 ) -> dict[str, Contender]:
@@ -66,7 +72,7 @@ def contenders(
         hidden={name: jnp.full_like(value, target.params[name]) for name, value in policy.hidden.items()}
     )
     return {
-        "ours": Contender(replace(machine, update=UPDATES[update]), policy, start, 1),
+        "ours": Contender(with_update(machine, update), policy, start, 1),
         "spm": Contender(baselines.spm(machine), policy, start, 1),
         "dr": Contender(untuned, wide, learner.dist(nominal, dr_radius), 0),
         "oracle": Contender(untuned, knowing, learner.dist(truth, learner.preset.policy_radius), 0),

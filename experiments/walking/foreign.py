@@ -19,6 +19,7 @@ from experiments.common.config import Preset
 from experiments.walking.learner import Learner
 from experiments.walking.policies import starting_policy
 from experiments.walking.robots import kind
+from jaxtune import devices
 from jaxtune.host import HostTuner, one_by_one
 from jaxtune.mjx import Entry, Simulator, action_delay, apply_mujoco, field, friction, mass, parameters, strength
 from jaxtune.tuner import Info, TunerState
@@ -84,8 +85,8 @@ class Traced:
         robot = kind(f"{__file__}:{function}")
         self._learner = Learner(sizes, robot.entries, kind=robot)
         self.entries = robot.entries
-        self.tune = jax.jit(self._learner.tuner().tune)
-        self._simulate = jax.jit(self._learner.simulate)
+        self.tune = devices.on_all(jax.jit(self._learner.tuner().tune))
+        self._simulate = devices.on_all(jax.jit(self._learner.simulate))
 
     def policy(self, out: Path) -> Any:
         return starting_policy("scratch", self._learner, out)

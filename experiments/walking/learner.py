@@ -20,6 +20,7 @@ from envs.targets.mjx import MjxTarget, rollout, simulate
 from envs.targets.protocol import Act, Commands, Target
 from experiments.common.config import Preset
 from experiments.walking.robots import BITENO, Kind
+from jaxtune import devices
 from jaxtune import dist as dists
 from jaxtune.baselines import Untuned
 from jaxtune.mjx import Entry, TrainingBatch, parameters
@@ -68,7 +69,7 @@ class Learner:
         correction: Correction | None = None,
         kind: Kind = BITENO,
     ):
-        window = max(preset.tuner.spm.window, preset.tuner.dvm.window)
+        window = preset.tuner.longest_window
         if kind.episode_steps < window:
             raise ValueError(
                 f"robot '{kind.name}': got episodes of {kind.episode_steps} steps, expected at least {window}, a window"
@@ -85,7 +86,7 @@ class Learner:
         self._env = TrainingBatch(trained, self.robot.entries, self.longest)
         self._ppo = PPO(preset.ppo, self.robot.observation_size, self.robot.action_size)
         # One compiled program serves all methods, because they differ only in its arguments.
-        self._train = jax.jit(lambda key, policy, dist: self.train(key, policy, dist, preset.epochs))
+        self._train = devices.on_all(jax.jit(lambda key, policy, dist: self.train(key, policy, dist, preset.epochs)))
 
     def dist(self, centre: Mapping[str, float], radius: float) -> ParamDist:
         """Makes a uniform distribution around physical values, with the table's bounds.
@@ -147,6 +148,10 @@ class Learner:
         (ppo, robots), metrics = jax.lax.scan(update, (policy.learner, robots), jax.random.split(key_updates, updates))
         return policy.replace(learner=ppo, robots=robots), metrics
 
+    def collect(self, keys: jax.Array, policy: Policy) -> tuple[State, Any, dict]:
+        """Collects the rollout of one PPO update (`jaxtune.ppo.PPO.collect`), with keys [envs]."""
+        return self._ppo.collect(keys, policy.learner, self._env, policy.robots)
+
     def simulate(self, key: jax.Array, policy: Policy, coords: Coords) -> Trajectory:
         """Simulates one episode for every row of coordinates; this is the tuner's `simulate`.
 
@@ -181,7 +186,7 @@ class Learner:
         def play(key, policy, count, steps):
             return target.episodes(key, self.act(policy), count, steps)
 
-        return jax.jit(play, static_argnums=(2, 3)) if isinstance(target, MjxTarget) else play
+        return devices.on_all(jax.jit(play, static_argnums=(2, 3))) if isinstance(target, MjxTarget) else play
 
     def evaluate(self, key: jax.Array, policy: Policy, play: Callable[..., Trajectory]) -> tuple[float, int]:
         """Measures a policy's return and falls in a target, over `evaluation_episodes` episodes of the full time limit.
@@ -254,7 +259,7 @@ class Learner:
         """
         if isinstance(machine, Untuned):
             return replace(machine, tuner=replace(machine.tuner, train_policy=self._train)).step
-        tune = jax.jit(machine.tune)
+        tune = devices.on_all(jax.jit(machine.tune))
         count, steps = self.preset.tuner.set_episodes, self.preset.episode_steps
 
         def step(key, state):

@@ -17,6 +17,7 @@ from experiments.common.checkpoint import write_json
 from experiments.common.cli import bars
 from experiments.walking.learner import Learner, Policy
 from experiments.walking.robots import Kind
+from jaxtune import devices
 from jaxtune.mjx import parameters
 
 _KEEP_S = 60.0  # between two checkpoints of a training
@@ -56,7 +57,7 @@ def walk(
     policy = learner.init(key_init)
     dist = learner.dist(parameters.nominal(learner.entries), learner.preset.policy_radius)
     chunk = min(learner.preset.chunk, updates)
-    train = jax.jit(lambda key, policy: learner.train(key, policy, dist, chunk))
+    train = devices.on_all(jax.jit(lambda key, policy: learner.train(key, policy, dist, chunk)))
     task = progress.add_task("training", total=updates * learner.preset.ppo.steps_per_update) if progress else None
     curve = []
     identity = {

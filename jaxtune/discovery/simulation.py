@@ -9,8 +9,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh, PartitionSpec
 
+from jaxtune import devices
 from jaxtune.discovery.problem import Problem, Segments, Simulate
 
 _WIDTH = 64  # simulations that a device runs side by side
@@ -174,29 +174,23 @@ def binned(signals: Mapping[str, Any], rows: int):
     return (jnp if isinstance(parts[0], jax.Array) else np).concatenate(parts, axis=-1)
 
 
+@devices.on_all
 @partial(jax.jit, static_argnums=(0, 1))
 def _simulate_chunks(simulate: Simulate, bin_rows: int, system, count, steps, values, inputs):
     """Runs the first `count` chunks of values [chunks, width, axes] and inputs [chunks, width, ...]."""
 
-    def one(system, mine, segment, steps):
-        return binned(simulate(system, mine, segment, steps), bin_rows)
-
     def all_of(system, count, steps, values, inputs):
+        many = jax.vmap(lambda mine, segment: binned(simulate(system, mine, segment, steps), bin_rows))
         take = lambda index: jax.tree.map(lambda leaf: leaf[index], (values, inputs))  # noqa: E731
-        many = jax.vmap(one, in_axes=(None, 0, 0, None))
-        shape = jax.eval_shape(many, system, *take(0), steps)
+        shape = jax.eval_shape(many, *take(0))
 
         def work(index, found):
-            return found.at[index].set(many(system, *take(index), steps))
+            return found.at[index].set(many(*take(index)))
 
         return jax.lax.fori_loop(0, count, work, jnp.zeros((len(values), *shape.shape), shape.dtype))
 
-    # Nothing is exchanged: devices share the width, and each loops by itself.
-    mesh, across = Mesh(np.array(jax.devices()), ("width",)), PartitionSpec(None, "width")
-    specs = (PartitionSpec(), PartitionSpec(), PartitionSpec(), across, across)
-    return jax.shard_map(all_of, mesh=mesh, in_specs=specs, out_specs=across, check_vma=False)(
-        system, count, steps, values, inputs
-    )
+    # Devices share the width, and each loops by itself.
+    return devices.spread(all_of, (values, inputs), shared=(system, count, steps), axis=1)
 
 
 def _padded(leaf: np.ndarray, like: np.ndarray) -> np.ndarray:

@@ -17,7 +17,7 @@ This package is the only one in jaxtune that imports MuJoCo; the tuner does with
 
 from jaxtune.mjx.derived_fields import set_const
 from jaxtune.mjx.entry import Entry
-from jaxtune.mjx.episodes import Robot, in_chunks, rollout
+from jaxtune.mjx.episodes import Robot, rollout
 from jaxtune.mjx.parameters import (
     Params,
     apply,
@@ -47,7 +47,6 @@ __all__ = [
     "field",
     "friction",
     "from_coords",
-    "in_chunks",
     "mass",
     "model_of",
     "nominal",

@@ -5,11 +5,13 @@ from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
+from jax.tree_util import Partial
 
+from jaxtune import devices
 from jaxtune.mjx.parameters import Params
 from jaxtune.types import Trajectory
 
-_CHUNK = 256  # small batches are fastest on a CPU; larger ones are simulated in turn
+_CHUNK = {"cpu": 256, "other": 8192}  # robots side by side on a device: small batches stay in a CPU's cache
 
 
 class State(Protocol):
@@ -60,7 +62,8 @@ def rollout(
     Args:
       robot: robot and task.
       key: random key; resets and everything random in an episode depend on it alone.
-      act: the policy, `(observation, key) -> action [act]`.
+      act: the policy, `(observation, key) -> action [act]`. What it depends on and is traced is bound by
+        `jax.tree_util.Partial`, so that all devices get it.
       params: physical values by name, each [episodes].
       steps: length of an episode in control steps.
       given: pytree, [episodes, ...], of what else differs between episodes, such as commands.
@@ -77,7 +80,7 @@ def rollout(
     # minutes.
     params = jax.lax.optimization_barrier({name: jnp.asarray(value) for name, value in params.items()})
 
-    def episode(key, params, given):
+    def episode(act, key, params, given):
         key_reset, key_act = jax.random.split(key)
 
         def step(carry, now):
@@ -98,7 +101,9 @@ def rollout(
         return episodes, watched
 
     keys = jax.random.split(key, len(next(iter(params.values()))))
-    return in_chunks(episode, (keys, params, given))
+    # A partial's arguments are what a policy depends on.
+    act = act if isinstance(act, Partial) else Partial(act)
+    return devices.in_chunks(episode, (keys, params, given), _CHUNK, shared=(act,))
 
 
 def _checked(action: Any, size: int) -> jax.Array:
@@ -107,26 +112,3 @@ def _checked(action: Any, size: int) -> jax.Array:
         got = f"shape {action.shape}" if hasattr(action, "shape") else f"a {type(action).__name__}"
         raise ValueError(f"act: got {got}, expected an action of shape ({size},)")
     return action
-
-
-def in_chunks(function: Callable[..., Any], inputs: Any) -> Any:
-    """Maps a function over the first axis of its inputs, `_CHUNK` at a time in parallel.
-
-    Args:
-      function: of one item; it is vmapped.
-      inputs: tuple of arguments, pytrees whose leaves are all [count, ...].
-
-    Returns:
-      What the function returns, [count, ...].
-    """
-    several = jax.vmap(function)
-    count = len(jax.tree.leaves(inputs)[0])
-    if count <= _CHUNK:
-        return several(*inputs)
-    # Chunks of equal size need one compilation; the last one is filled up with repetitions.
-    chunks = -(-count // _CHUNK)
-    size = -(-count // chunks)
-    fill = jnp.arange(chunks * size) % count
-    inputs = jax.tree.map(lambda x: x[fill].reshape(chunks, size, *x.shape[1:]), inputs)
-    stacked = jax.lax.map(lambda item: several(*item), inputs)
-    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:count], stacked)

@@ -13,13 +13,14 @@ import copy
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any
 
 import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.tree_util import Partial
 from mujoco import mjx
 
 from jaxtune import dist as dists
@@ -218,7 +219,7 @@ class Simulator:
         Parameters that are left out stay nominal. An episode ends where the environment is done or a number is not
         finite; the latter is counted in `not_finite`.
         """
-        return rollout(self, key, partial(act, policy), params, self.steps)[0]
+        return rollout(self, key, Partial(act, policy), params, self.steps)[0]
 
     def reset(self, params: Params, key: jax.Array) -> State:
         """Starts an episode of one robot with these parameters; those that are left out are nominal."""

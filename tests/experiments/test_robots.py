@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -134,16 +135,71 @@ def test_the_whole_comparison_runs_on_another_robot(trained, tmp_path):
     assert len(summary["methods"]["ours"]["verdicts"][0]) >= 2
 
 
-def test_lanes_of_a_sweep_are_of_another_robot(trained):
-    options = {"step_sizes": (0.5,), "widen_factors": (1.5,), "radii": (0.2, 0.3), "levels": (0.9,), "seeds": 1}
-    args = sweep.Args(robot=ROBOT, parameters="mass,damping", truth=("damping=2",), preset="smoke", **options)
-    sizes, robot, entries, case = sweep.check(args)
+@pytest.fixture
+def swept(trained, tmp_path):
+    """Options of a sweep of four runs, one of them in a piece of its own."""
+    options = {"step_sizes": (0.5,), "widen_factors": (1.5,), "radii": (0.2, 0.3), "levels": (0.9,), "seeds": 2}
+    more = {"truth": ("damping=2",), "preset": "smoke", "lanes": 3, "policy": str(trained)}
+    return sweep.Args(robot=ROBOT, parameters="mass,damping", out=tmp_path / "sweep", **options, **more)
+
+
+def test_a_lane_of_a_sweep_is_a_run_of_its_own(trained, swept):
+    sizes, robot, entries, case = sweep.check(swept)
     learner = Learner(sizes, entries, kind=robot)
     assert case.off(entries) == ("damping",)
-    program = sweep.program(learner, case.true_params(entries, 0.5), starting_policy(str(trained), learner))
-    dist, info = jax.eval_shape(program, sweep.lanes(args).reshape(-1, 5))
-    assert dist.centre["damping"].shape == (2,)
-    assert info.calls.shape == (2, sizes.sweep_tunings)
+    policy = starting_policy(str(trained), learner)
+    one = sweep.lane(swept, learner, case.true_params(entries, 0.5), policy)
+    rows = sweep.lanes(swept).reshape(-1, 5)[1:3]
+    _, infos, returns, _ = jax.jit(jax.vmap(one))(rows)
+    single = jax.jit(one)
+    for index, row in enumerate(rows):
+        _, info, value, _ = single(row)
+        for ours, theirs in zip(jax.tree.leaves(infos), jax.tree.leaves(info), strict=True):
+            np.testing.assert_allclose(ours[index, 0], theirs[0], rtol=1e-5, atol=1e-5)
+        # Rounding may grow, but hardly over two short tunings.
+        np.testing.assert_allclose(returns[index], value, atol=0.05)
+    np.testing.assert_allclose(infos.radius[:, 0, 0], [0.2, 0.3], rtol=1e-6)
+
+
+@chex.dataclass
+class Found:
+    """What a sweep reads of a run's infos."""
+
+    calls: jax.Array
+    verdicts: jax.Array
+
+
+def test_a_sweep_goes_on_after_its_last_lanes(swept, monkeypatch):
+    begun = []
+
+    def lane(args, learner, truth, policy):
+        near = learner.dist(truth, 0.2)
+
+        def one(settings):
+            begun.append(1)
+            off = near.replace(centre={name: value + settings[2] for name, value in near.centre.items()})
+            info = Found(calls=jnp.array([1, 2]), verdicts=jnp.array([[0, -1], [1, 0]]))
+            return off, info, settings[4], jnp.zeros((), int)
+
+        return one
+
+    monkeypatch.setattr(sweep, "lane", lane)
+    sweep.main(swept)
+    summary = json.loads((swept.out / "summary.json").read_text())
+    assert summary["lanes"] == 4 and summary["trained"]
+    for row, radius in zip(summary["rows"], (0.2, 0.3), strict=True):
+        assert row["radius"] == pytest.approx(radius)
+        assert row["return"] == [0.0, 1.0]
+        assert (row["gate_calls"], row["accepted"]) == ([3, 3], [2, 2])
+        np.testing.assert_allclose(row["error"], np.exp(radius) - 1, rtol=1e-5)
+    (swept.out / "lanes" / "0000.json").unlink()
+    kept = (swept.out / "lanes" / "0003.json").stat().st_mtime_ns
+    sweep.main(swept)
+    assert json.loads((swept.out / "summary.json").read_text())["rows"] == summary["rows"]
+    assert (swept.out / "lanes" / "0003.json").stat().st_mtime_ns == kept
+    begun.clear()
+    sweep.main(swept)
+    assert not begun
 
 
 def test_what_is_exported_acts_as_what_was_trained(trained, tmp_path):

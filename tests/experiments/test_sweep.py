@@ -28,6 +28,9 @@ def test_a_folder_in_which_another_process_works_is_refused(tmp_path, monkeypatc
         ({"step_sizes": (0.5, 0.0)}, "step_size: got 0.0"),
         ({"levels": (1.5,)}, "level: got 1.5"),
         ({"seeds": 0}, "seeds: got 0"),
+        ({"update": "leap"}, "update: got 'leap', expected one of posterior, vote"),
+        ({"update": "posterior"}, "step_sizes: got 3, expected one"),
+        ({"lanes": 0}, "lanes: got 0"),
         ({"case": "delay"}, "a sweep needs a target in mjx|case: got 'delay'"),
     ],
 )

@@ -58,7 +58,9 @@ def test_spm_accepts_what_a_gate_would_reject_and_keeps_its_radius(spm, unanimou
 
 
 def test_spm_is_the_same_tuner_with_two_functions_swapped(tuner, spm):
-    assert dataclasses.replace(spm, verify=calibrated_gate, update=posterior_update) == tuner
+    assert dataclasses.replace(spm, config=tuner.config, verify=calibrated_gate, update=posterior_update) == tuner
+    # The paper's steps are meant for one set each.
+    assert spm.config == dataclasses.replace(tuner.config, refinements=0)
 
 
 def test_open_gate_needs_a_step_to_read(spm):

@@ -112,7 +112,7 @@ def test_chunks_change_nothing(monkeypatch, count):
     chunked = mjx.rollout(Script(), jax.random.key(1), act, params, 8)[0]
     assert chunked.fell.shape == (count,)
     assert chunked.obs.shape == (count, 8, 2)
-    monkeypatch.setattr("jaxtune.mjx.episodes._CHUNK", count)
+    monkeypatch.setattr("jaxtune.mjx.episodes._CHUNK", {"cpu": count})
     whole = mjx.rollout(Script(), jax.random.key(1), act, params, 8)[0]
     for got, expected in zip(jax.tree.leaves(chunked), jax.tree.leaves(whole), strict=True):
         np.testing.assert_array_equal(got, expected)

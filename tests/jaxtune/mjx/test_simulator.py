@@ -114,7 +114,7 @@ def test_simulate_takes_coordinates_and_measure_hides_parameters(sim, play):
 def test_chunks_change_nothing(sim, monkeypatch):
     params = {"mass": jnp.linspace(0.5, 2.0, 5)}
     whole = sim.rollout(jax.random.key(1), act, 1.0, params)
-    monkeypatch.setattr("jaxtune.mjx.episodes._CHUNK", 2)
+    monkeypatch.setattr("jaxtune.mjx.episodes._CHUNK", {"cpu": 2})
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5),
         whole,

@@ -1,0 +1,241 @@
+"""Where the time of a tuning goes, what more devices save of it, and how exact its estimates are.
+
+`experiments.bench` prints all three.
+"""
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+
+from envs.biteno import Drive, Motion, State
+from envs.targets import mujoco_c
+from envs.targets.host import Engine, HostTarget
+from envs.targets.mjx import MjxTarget
+from experiments.common.config import Preset
+from experiments.walking.learner import Learner, Policy
+from experiments.walking.policies import starting_policy
+from experiments.walking.robots import BITENO
+from jaxtune import devices, dvm, regression, rules, spm
+from jaxtune import dist as dists
+from jaxtune.mjx import parameters
+
+_STEPS = 50  # in which the speed of MuJoCo C is measured
+_TIMES = 3  # runs of a program, of which the fastest counts
+
+
+def profile(sizes: Preset, policy: str) -> dict[str, dict]:
+    """Times every part of a tuning of BITeno by itself, as one program each, on all devices.
+
+    Args:
+      sizes: of everything.
+      policy: what walks, as `experiments.walking.policies.starting_policy` takes it.
+
+    Returns:
+      By part: `calls` in a tuning whose set is accepted at once, `compile_s` of its program where none is kept on disk,
+      `run_s` of a call, `share` of the tuning's time without compilation, and `limit_s`, what MuJoCo C takes for the
+      same control steps on the same cores (nan for parts that simulate nothing).
+    """
+    jax.config.update("jax_enable_compilation_cache", False)
+    learner = Learner(sizes, BITENO.chosen("legs6"))
+    machine, config = learner.tuner(), sizes.tuner
+    dist = learner.dist(parameters.nominal(learner.entries), 0.2)
+    start = starting_policy(policy, learner)
+    key = jax.random.PRNGKey(0)
+    target = MjxTarget(robot=learner.robot, params=parameters.nominal(learner.entries))
+    keys = jax.random.split(key, sizes.ppo.num_envs)
+
+    rate = _physics_rate(learner, start)
+
+    def sets(score):
+        """Scores all held-out sets, and the measured one."""
+        return lambda model, collected, measured: (
+            devices.in_chunks(score, (collected.held_out,), rules.SETS, shared=(model,)),
+            score(model, measured),
+        )
+
+    def episodes(policy, count, steps):
+        return target.episodes(key, learner.act(policy), count, steps)
+
+    steps, count = learner.preset.episode_steps, config.episodes + config.held_out_sets * config.set_episodes
+    measured = _compiled(lambda one: episodes(one, config.set_episodes, steps))(start)
+    collected = _compiled(lambda one: machine.collect(key, one, dist))(start)
+    train_dvm = lambda data: dvm.train(key, config.dvm, data.trajectory)[0]  # noqa: E731
+    regress = lambda data: regression.train(config.regression, data.trajectory, data.sampled_coords, dist)  # noqa: E731
+    gate, model = (_compiled(program)(collected) for program in (train_dvm, regress))
+    parts = {
+        "measured episodes": (1, lambda one: episodes(one, config.set_episodes, steps), (start,)),
+        "simulated episodes": (1, lambda one: machine.collect(key, one, dist), (start,)),
+        "verification model": (1, train_dvm, (collected,)),
+        "its scores": (1, sets(lambda *args: dvm.novelty(config.dvm, *args)), (gate, collected, measured)),
+        "regression": (1, regress, (collected,)),
+        "its estimates": (
+            1,
+            sets(lambda *args: regression.estimate(config.regression, *args)),
+            (model, collected, measured),
+        ),
+        "policy: rollouts": (sizes.epochs, learner.collect, (keys, start)),
+        "policy: whole updates": (sizes.epochs, lambda one: learner.train(key, one, dist, 1), (start,)),
+        "evaluation": (1, lambda one: episodes(one, sizes.evaluation_episodes, learner.longest), (start,)),
+    }
+    simulated = {
+        "measured episodes": (config.set_episodes, steps),
+        "simulated episodes": (count, steps),
+        "policy: rollouts": (sizes.ppo.num_envs, sizes.ppo.unroll_steps),
+        "evaluation": (sizes.evaluation_episodes, learner.longest),
+    }
+    rows = {}
+    for name, (calls, program, inputs) in parts.items():
+        compile_s, run_s = _seconds(program, inputs)
+        many, long = simulated.get(name, (np.nan, np.nan))
+        limit = many * long / rate
+        rows[name] = {"calls": calls, "compile_s": compile_s, "run_s": run_s, "limit_s": limit}
+    learning = rows.pop("policy: whole updates")
+    learning["run_s"] -= rows["policy: rollouts"]["run_s"]
+    rows["policy: learning"] = learning
+    whole = sum(row["calls"] * row["run_s"] for row in rows.values())
+    return {name: row | {"share": row["calls"] * row["run_s"] / whole} for name, row in rows.items()}
+
+
+def on_devices(sizes: Preset, policy: str) -> dict[str, dict]:
+    """Measures steps per second of episodes and of training on one device, two, four and so on, up to all.
+
+    Numbers of devices take turns, and the fastest of three calls counts.
+
+    Args:
+      sizes: of everything.
+      policy: what walks, as `experiments.walking.policies.starting_policy` takes it.
+
+    Returns:
+      By number of devices: steps per second of both, and how many times as many as on one device.
+    """
+    key = jax.random.PRNGKey(0)
+    learner = Learner(sizes, BITENO.chosen("legs6"))
+    dist = learner.dist(parameters.nominal(learner.entries), sizes.policy_radius)
+    draws = dists.sample(key, dist, sizes.tuner.episodes)
+    programs = {
+        "episodes": jax.jit(lambda policy: learner.simulate(key, policy, draws)),
+        "training": jax.jit(lambda policy: learner.train(key, policy, dist, sizes.chunk)),
+    }
+    start, seconds = starting_policy(policy, learner), {}
+    for count in (2**n for n in range(len(jax.devices()).bit_length())):
+        seconds[count] = {name: [] for name in programs}
+    for _ in range(4):
+        for count, found in seconds.items():
+            for name, program in programs.items():
+                with jax.set_mesh(devices.mesh(count)):
+                    begin = time.monotonic()
+                    jax.block_until_ready(program(start))
+                found[name].append(time.monotonic() - begin)
+    steps = {
+        "episodes": sizes.tuner.episodes * learner.preset.episode_steps,
+        "training": sizes.chunk * sizes.ppo.steps_per_update,
+    }
+    rows = {}
+    for count, found in seconds.items():
+        best = {name: min(values[1:]) for name, values in found.items()}
+        rows[str(count)] = {f"{name}_per_second": steps[name] / best[name] for name in steps}
+        rows[str(count)] |= {f"{name}_gain": min(seconds[1][name][1:]) / best[name] for name in steps}
+    return rows
+
+
+def estimates(sizes: Preset, policy: str, radius: float, seeds: int) -> dict[str, dict]:
+    """Compares estimates of the coordinates of simulated robots, on the same episodes.
+
+    Args:
+      sizes: of a tuning; the number of robots is that of held-out sets.
+      policy: what walks.
+      radius: of the distribution.
+      seeds: every seed has episodes and models of its own.
+
+    Returns:
+      By method: mean and 0.9-quantile of |estimate - truth| in radii, over all robots, coordinates and seeds, and the
+      mean by coordinate; seconds to fit.
+    """
+    learner = Learner(sizes, BITENO.chosen("legs6"))
+    machine, config = learner.tuner(), sizes.tuner
+    dist = learner.dist(parameters.nominal(learner.entries), radius)
+    start = starting_policy(policy, learner)
+    fit_spm = lambda key, data: spm.train(key, config.spm, data.trajectory, data.sampled_coords, dist)[0]  # noqa: E731
+    regress = lambda key, data: regression.train(  # noqa: E731
+        config.regression, data.trajectory, data.sampled_coords, dist
+    )
+    methods = {
+        "search-parameter model": (fit_spm, lambda *args: spm.estimate(config.spm, *args)),
+        "regression": (regress, lambda *args: regression.estimate(config.regression, *args)),
+    }
+    collect = _compiled(lambda key: machine.collect(key, start, dist))
+    found = {name: ([], []) for name in methods}
+    for seed in range(seeds):
+        key_collect, key_fit = jax.random.split(jax.random.PRNGKey(seed))
+        data = collect(key_collect)
+        truth = np.asarray(dists.normalise(dist, data.held_out_coords))
+        for name, (fit, answer) in methods.items():
+            model, seconds = _timed(fit, (key_fit, data))
+            every = _compiled(
+                lambda model, sets, answer=answer: devices.in_chunks(answer, (sets,), rules.SETS, shared=(model,))
+            )
+            errors, times = found[name]
+            errors.append(np.abs(np.asarray(every(model, data.held_out)) - truth))
+            times.append(seconds)
+    rows = {}
+    for name, (errors, times) in found.items():
+        errors = np.concatenate(errors)
+        by_coordinate = dict(zip(dists.names(dist), errors.mean(axis=0).tolist(), strict=True))
+        rows[name] = {
+            "error": errors.mean(),
+            "error_90": np.quantile(errors, 0.9),
+            "fit_s": min(times),
+            **by_coordinate,
+        }
+    return rows
+
+
+def _timed(program: Callable, inputs: tuple) -> tuple[Any, float]:
+    """What a program returns, and the seconds that it takes when it is compiled."""
+    run = _compiled(program)
+    jax.block_until_ready(run(*inputs))
+    begin = time.monotonic()
+    found = jax.block_until_ready(run(*inputs))
+    return found, time.monotonic() - begin
+
+
+def _compiled(program: Callable) -> Callable:
+    return devices.on_all(jax.jit(program))
+
+
+def _seconds(program: Callable, inputs: tuple) -> tuple[float, float]:
+    """Seconds to trace and compile a program, and the fewest in which it runs."""
+    whole = devices.on_all(lambda *args: jax.jit(program).lower(*args).compile())
+    begin = time.monotonic()
+    compiled = whole(*inputs)
+    moments, run = [time.monotonic()], devices.on_all(compiled)
+    for _ in range(_TIMES):
+        jax.block_until_ready(run(*inputs))
+        moments.append(time.monotonic())
+    return moments[0] - begin, float(np.diff(moments).min())
+
+
+def _physics_rate(learner: Learner, policy: Policy) -> float:
+    """Control steps a second of MuJoCo C on all cores, its physics alone, while a policy walks."""
+    nominal = parameters.nominal(learner.entries)
+    engine = _Timed(mujoco_c.MujocoC(learner.robot, nominal))
+    HostTarget(learner.robot, nominal, engine).episodes(
+        jax.random.PRNGKey(0), learner.act(policy), learner.preset.ppo.num_envs, _STEPS
+    )
+    return learner.preset.ppo.num_envs / float(np.median(engine.seconds))
+
+
+class _Timed:
+    """An engine that notes how long every step takes."""
+
+    def __init__(self, engine: Engine):
+        self._engine, self.start, self.seconds = engine, engine.start, []
+
+    def move(self, state: State, drive: Drive) -> Motion:
+        begin = time.monotonic()
+        motion = jax.block_until_ready(self._engine.move(state, drive))
+        self.seconds.append(time.monotonic() - begin)
+        return motion

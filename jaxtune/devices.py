@@ -1,0 +1,142 @@
+"""Which devices share the work: those of the mesh that is in scope.
+
+    with jax.set_mesh(devices.mesh()):  # all devices of this machine, or of all hosts
+        state, info = tuner.run(key, state, num_tunings)
+
+Robots do not touch each other, so every device simulates its share of them from reset to end, and nothing crosses
+devices in between (`spread`). What learns from the episodes computes on shares of every batch, and its gradients are
+summed over devices (`share`). What is left runs on all devices alike.
+
+Without a mesh in scope everything runs on one device. So it does inside a function that is spread itself, such as a
+sweep whose lanes are on different devices. Random numbers depend on keys alone, never on the number of devices.
+"""
+
+from collections.abc import Callable, Mapping
+from functools import wraps
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
+
+AXIS = "devices"
+"""Name of the mesh's axis. A mesh of the user's own, with an axis of this name, does as well."""
+
+
+def mesh(count: int | None = None) -> Mesh:
+    """Makes a mesh of the first `count` devices, or of all.
+
+    Raises:
+      ValueError: there are not so many.
+    """
+    every = jax.devices()
+    count = len(every) if count is None else count
+    if not 1 <= count <= len(every):
+        raise ValueError(f"devices: got {count}, expected 1 to {len(every)}")
+    return jax.make_mesh((count,), (AXIS,), devices=every[:count], axis_types=(AxisType.Auto,))
+
+
+def count() -> int:
+    """Number of devices that share what is called here: 1 without a mesh, and inside what is spread already."""
+    here = jax.sharding.get_abstract_mesh()
+    return 1 if here.empty or AXIS not in here.axis_names or AXIS in here.manual_axes else here.shape[AXIS]
+
+
+def spread(function: Callable[..., Any], inputs: tuple, *, shared: tuple = (), axis: int = 0) -> Any:
+    """Calls a function of many independent rows on all devices, each with its share of the rows.
+
+    Args:
+      function: `(*shared, *inputs)`, of some of the rows; it gives as many back, and each depends on its own inputs
+        alone. It closes over constants only: JAX does not let it index what is traced outside.
+      inputs: pytrees whose leaves have the rows along `axis`.
+      shared: pytrees that are the same for all rows, such as a policy.
+      axis: where the rows are, in inputs and outputs.
+
+    Returns:
+      What the function returns, for all rows.
+    """
+    devices = count()
+    if devices == 1:
+        return function(*shared, *inputs)
+    rows = jax.tree.leaves(inputs)[0].shape[axis]
+    across = PartitionSpec(*[None] * axis, AXIS)
+    # Shares are of one size; the last one is filled up with repetitions.
+    fill = jnp.arange(-(-rows // devices) * devices) % rows
+    if len(fill) > rows:
+        inputs = jax.tree.map(lambda leaf: jnp.take(leaf, fill, axis=axis), inputs)
+    specs = (*[PartitionSpec()] * len(shared), *[across] * len(inputs))
+    found = jax.shard_map(function, in_specs=specs, out_specs=across, check_vma=False)(*shared, *inputs)
+    if len(fill) > rows:
+        found = jax.tree.map(lambda leaf: jax.lax.slice_in_dim(leaf, 0, rows, axis=axis), found)
+    return found
+
+
+def in_chunks(function: Callable[..., Any], inputs: tuple, sizes: Mapping[str, int], *, shared: tuple = ()) -> Any:
+    """Maps a function over the first axis of its inputs on all devices, on each so many at a time as suit it.
+
+    Args:
+      function: `(*shared, *inputs)`, of one item; it is vmapped.
+      inputs: pytrees whose leaves are all [count, ...].
+      sizes: largest number of items side by side on a device, for `cpu` and `other` devices.
+      shared: pytrees that are the same for all items.
+
+    Returns:
+      What the function returns, [count, ...].
+    """
+    axes = (*[None] * len(shared), *[0] * len(inputs))
+    several, most = jax.vmap(function, axes), sizes["cpu" if jax.default_backend() == "cpu" else "other"]
+    kept = len(shared)
+
+    def in_turn(*arguments):
+        shared, inputs = arguments[:kept], arguments[kept:]
+        count = len(jax.tree.leaves(inputs)[0])
+        if count <= most:
+            return several(*shared, *inputs)
+        # Chunks of equal size need one compilation; the last one is filled up with repetitions.
+        chunks = -(-count // most)
+        size = -(-count // chunks)
+        fill = jnp.arange(chunks * size) % count
+        inputs = jax.tree.map(lambda x: x[fill].reshape(chunks, size, *x.shape[1:]), inputs)
+        stacked = jax.lax.map(lambda item: several(*shared, *item), inputs)
+        return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:count], stacked)
+
+    return spread(in_turn, inputs, shared=shared)
+
+
+def share(batch: Any, *, axis: int = 0) -> Any:
+    """Has every device compute on its share of a batch, a pytree whose leaves have the batch along `axis`.
+
+    Numbers stay the same but for rounding: means over the batch are means over all shares. A batch that devices cannot
+    share evenly is left as it is.
+    """
+    devices = count()
+    if devices == 1 or any(leaf.shape[axis] % devices for leaf in jax.tree.leaves(batch)):
+        return batch
+    return jax.lax.with_sharding_constraint(batch, PartitionSpec(*[None] * axis, AXIS))
+
+
+def gather(values: Any) -> Any:
+    """Puts a pytree on every device, whole: what was simulated in shares, before batches are drawn from it."""
+    return values if count() == 1 else jax.lax.with_sharding_constraint(values, PartitionSpec())
+
+
+def on_all(program: Callable[..., Any]) -> Callable[..., Any]:
+    """Lets a compiled program use all devices, unless a mesh is in scope already.
+
+    The mesh is in scope while the program runs, not longer: models of MJX lie on one device, and JAX would refuse
+    whatever is computed with them outside a program.
+    """
+
+    @wraps(program)
+    def call(*args, **kwargs):
+        if len(jax.devices()) == 1 or not jax.sharding.get_abstract_mesh().empty:
+            return program(*args, **kwargs)
+        here = mesh()
+        whole = NamedSharding(here, PartitionSpec())
+        # Arrays come from one device or, where an earlier call made them, from all: JAX would compile for each.
+        put = lambda leaf: jax.device_put(leaf, whole) if isinstance(leaf, jax.Array) else leaf  # noqa: E731
+        args, kwargs = jax.tree.map(put, (args, kwargs))
+        with jax.set_mesh(here):
+            return program(*args, **kwargs)
+
+    return call

@@ -1,0 +1,53 @@
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from jaxtune import devices
+
+TESTS = Path(__file__).parents[1]
+PATH = os.pathsep.join(map(str, (TESTS.parent, TESTS, TESTS / "jaxtune" / "discovery")))
+
+
+@pytest.fixture(scope="module")
+def found():
+    """What `across.py` computed: by function, numbers without a mesh, on two devices and on four."""
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", str(Path(__file__).with_name("across.py"))],
+        env={**os.environ, "PYTHONPATH": PATH},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+# A regression inverts a matrix, which magnifies the rounding of sums that are taken in another order.
+@pytest.mark.parametrize(
+    ("function", "rounding"),
+    [("episodes", 1e-5), ("update", 1e-5), ("lanes", 1e-5), ("pairs", 1e-5), ("tunings", 1e-3)],
+)
+def test_the_number_of_devices_changes_no_number(found, function, rounding):
+    alone, *shared = np.array(found[function], float)
+    assert len(shared) == 2
+    assert np.isfinite(alone).any() and np.ptp(alone[np.isfinite(alone)]) > 0
+    for numbers in shared:
+        np.testing.assert_allclose(numbers, alone, rtol=rounding, atol=rounding)
+
+
+def test_without_a_mesh_there_is_one_device():
+    assert devices.count() == 1
+    with jax.set_mesh(jax.make_mesh((1,), ("other",))):
+        assert devices.count() == 1
+
+
+@pytest.mark.parametrize("count", [0, 1000])
+def test_a_mesh_has_as_many_devices_as_there_are(count):
+    with pytest.raises(ValueError, match=f"devices: got {count}, expected 1 to"):
+        devices.mesh(count)
