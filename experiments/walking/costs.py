@@ -208,7 +208,9 @@ def _compiled(program: Callable) -> Callable:
 
 def _seconds(program: Callable, inputs: tuple) -> tuple[float, float]:
     """Seconds to trace and compile a program, and the fewest in which it runs."""
-    whole = devices.on_all(lambda *args: jax.jit(program).lower(*args).compile())
+    # A function of its own: JAX keeps what it compiled for another.
+    fresh = jax.jit(lambda *args: program(*args))
+    whole = devices.on_all(lambda *args: fresh.lower(*args).compile())
     begin = time.monotonic()
     compiled = whole(*inputs)
     moments, run = [time.monotonic()], devices.on_all(compiled)
