@@ -40,7 +40,6 @@ FIELDS = ("novelty", "threshold", "p_value")
 """Numbers of a gate call that `alarm` keeps."""
 
 _SIDE_BY_SIDE, _STEPS = 64, 200  # robots and steps of `rig`
-_MOST = 8  # CPU devices
 _LINE_SEARCHES = 6  # of MJX's solver, the fewest with which dry friction comes out right
 
 _HEADINGS = {"rings": "rejects"}  # of the table; the key in JSON stays
@@ -65,11 +64,11 @@ class Args:
     preset: str = "cpu"
     """Size of the run: smoke (seconds, to see that it works), cpu (two cores) or gpu (one GPU)."""
     policy: str = "walk"
-    """Policy of targets and alarm: walk (ships with the package), or a folder of experiments.train."""
+    """Policy that walks: walk (ships with the package), or a folder of experiments.train."""
     seeds: int = 10
-    """Number of gate calls for each target of alarm, with a random seed each."""
+    """Number of gate calls for each target of alarm, and of tunings of estimates, with a random seed each."""
     radius: float = 0.2
-    """Radius (half width) of the distribution in alarm, in log space: 0.2 spans 0.82 to 1.22 times nominal."""
+    """Radius (half width) of the distribution in alarm and estimates, in log space: 0.2 spans 0.82 to 1.22."""
 
 
 def speed(args: Args) -> dict:
@@ -305,9 +304,10 @@ MEASURES = {
 
 def main(args: Args) -> None:
     """Measures one thing, prints a table, and writes it as JSON with the time and the memory that it took."""
-    alone = args.what == "rig"
-    flags = checkpoint.for_simulation() if alone else preset(args.preset).xla_flags
-    checkpoint.set_up_compiler(flags, most=1 if alone else _MOST)
+    if args.what == "rig":
+        checkpoint.set_up_compiler(checkpoint.for_simulation(), most=1)
+    else:
+        checkpoint.set_up_compiler(preset(args.preset).xla_flags)
     begin = time.monotonic()
     rows = MEASURES[args.what](args)
     table = Table(title=args.what)

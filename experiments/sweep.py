@@ -23,7 +23,7 @@ from experiments.common import checkpoint, plots
 from experiments.common.cli import bars, console, run
 from experiments.common.config import Preset, named_values, preset
 from experiments.walking.cases import Case, check_positive, checked_case, errors
-from experiments.walking.comparison import UPDATES, with_update
+from experiments.walking.comparison import UPDATES
 from experiments.walking.learner import Learner, Policy
 from experiments.walking.policies import default_policy, starting_policy
 from experiments.walking.robots import Kind, kind
@@ -132,7 +132,7 @@ def lane(args: Args, learner: Learner, truth: Mapping[str, float], policy: Polic
       the mean return and the falls of the last policy in the target.
     """
     target, sizes = MjxTarget(robot=learner.robot, params=truth), learner.preset
-    machine = with_update(learner.tuner(target), args.update)
+    machine = UPDATES[args.update](learner.tuner(target))
     if args.fixed_policy:
         machine = dataclasses.replace(machine, train_policy=tuner.keep)
     dist = learner.dist(parameters.nominal(learner.entries), 1.0)  # each lane sets a radius of its own

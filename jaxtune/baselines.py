@@ -40,14 +40,19 @@ def open_gate(
     return GateInfo(novelty=usable, threshold=jnp.zeros(()), p_value=nothing, uncovered=nothing, elbo=nothing)
 
 
+def voting(tuner: Tuner) -> Tuner:
+    """Gives a tuner the paper's update, whose steps are meant for one measured set each."""
+    config = dataclasses.replace(tuner.config, refinements=0)
+    return dataclasses.replace(tuner, config=config, update=vote_update)
+
+
 def spm(tuner: Tuner) -> Tuner:
     """Makes the paper's ungated baseline from a tuner.
 
     The result keeps the tuner's settings and its functions for training, simulating and measuring. It replaces the gate
     by `open_gate` and the update by `vote_update`, so a comparison shows what gate and posterior add.
     """
-    config = dataclasses.replace(tuner.config, refinements=0)
-    return dataclasses.replace(tuner, config=config, verify=open_gate, update=vote_update)
+    return dataclasses.replace(voting(tuner), verify=open_gate)
 
 
 @dataclass(frozen=True, kw_only=True)

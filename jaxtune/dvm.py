@@ -220,6 +220,5 @@ def _evaluate(config, variables, scaler, window):
 
 
 def _distances(a: Float[Array, "n latent"], b: Float[Array, "m latent"]) -> Float[Array, "n m"]:
-    """Computes all Euclidean distances, from |a|^2 + |b|^2 - 2 a b, which needs no array [n, m, latent]."""
-    square = jnp.sum(a**2, axis=-1)[:, None] + jnp.sum(b**2, axis=-1) - 2.0 * a @ b.T
-    return jnp.sqrt(jnp.maximum(square, 0.0))
+    """Computes all Euclidean distances."""
+    return jnp.sqrt(windows.square_distances(a, b))

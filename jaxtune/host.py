@@ -25,7 +25,7 @@ import numpy as np
 
 from jaxtune.checks import check_measured, check_set
 from jaxtune.rules import TunerConfig, Update, Verify, calibrated_gate, posterior_update
-from jaxtune.tuner import Info, Measure, TrainPolicy, Tuner, TunerState, broken, keep, make_info
+from jaxtune.tuner import Info, Measure, TrainPolicy, Tuner, TunerState, counted, keep, make_info
 from jaxtune.types import Trajectory, Verdict
 
 HostSimulate = Callable[[jax.Array, Any, dict[str, np.ndarray]], Trajectory]
@@ -91,16 +91,13 @@ class HostTuner:
             key_collect, key_verify, key_update = jax.random.split(jax.random.fold_in(key, carry["rounds"]), 3)
             collected = self._tuner.collect(key_collect, state.policy, carry["dist"])
             check_measured(measured, collected.trajectory, self.config)
+            carry = counted(carry, collected)
             if carry["verdict"] == Verdict.WIDEN:
                 gate = self._verify(key_verify, collected, measured, state.knobs)
-                carry = self._decide(carry, collected, gate, state.knobs)
-            else:
-                carry = carry | {"not_finite": carry["not_finite"] + broken(collected)}
+                carry = self._decide(carry, gate, state.knobs)
             if carry["verdict"] == Verdict.ACCEPT:
                 updated = self._update(key_update, collected, measured, carry["dist"], state.knobs)
                 carry = self._refine(carry, *updated)
-            else:
-                carry = carry | {"rounds": carry["rounds"] + 1}
         return state.replace(dist=carry["dist"]), make_info(carry, measured)
 
     @cached_property

@@ -24,7 +24,6 @@ from jaxtune import devices, windows
 from jaxtune import dist as dists
 from jaxtune.types import Coords, ParamDist, Trajectory
 
-_FAR = 10.0  # standard deviations; a moment that hardly varied in training must not drown all others later
 _BREADTHS = (2.0, 4.0, 8.0, 16.0)  # widths of the kernel, in median squared distances: the larger, the more linear
 # Least and largest lambda, in units of K's largest eigenvalue; less would magnify the rounding of single precision.
 _PENALTIES = (3e-6, 0.3)
@@ -66,14 +65,13 @@ def train(config: RegressionConfig, trajectory: Trajectory, coords: Coords, dist
       coords: true coordinates of every episode, [episodes] by name.
       dist: the distribution that they were drawn from.
     """
-    trajectory, coords = devices.gather((trajectory, coords))
     steps = windows.fit_scaler(trajectory)
-    moments, count = devices.gather(_read(config, steps, trajectory))
+    coords, moments, count = devices.gather((coords, *_read(config, steps, trajectory)))
     # An episode that ended within its first window says nothing: it has no weight, here and below.
     known = (count > 0).astype(moments.dtype)
     scaler = windows.scaler(moments, known[:, None] / jnp.maximum(known.sum(), 1.0))
     read = known[:, None] * _standardised(scaler, moments)
-    distance = _distances(read, read)
+    distance = windows.square_distances(read, read)
     truth = dists.normalise(dist, coords)
     share = known / jnp.maximum(known.sum(), 1.0)
     mean = share @ truth
@@ -127,7 +125,7 @@ def estimate(config: RegressionConfig, model: Regression, trajectory: Trajectory
     """
     moments, count = _read(config, model.steps, trajectory)
     read = _standardised(model.moments, moments)
-    answers = model.mean + jnp.exp(-_distances(read, model.read) / model.width) @ model.weights
+    answers = model.mean + jnp.exp(-windows.square_distances(read, model.read) / model.width) @ model.weights
     share = count / jnp.maximum(count.sum(), 1)
     found = jnp.where(count.sum() > 0, share @ answers, (model.low + model.high) / 2)
     return jnp.clip(found, model.low, model.high)
@@ -147,10 +145,4 @@ def _read(config, steps, trajectory) -> tuple[Float[Array, "episodes moments"], 
 
 def _standardised(scaler: windows.Scaler, moments: Float[Array, "n moments"]) -> Float[Array, "n moments"]:
     # Distances must not grow with the number of moments.
-    return jnp.clip(scaler(moments), -_FAR, _FAR) / jnp.sqrt(moments.shape[-1])
-
-
-def _distances(a: Float[Array, "n moments"], b: Float[Array, "m moments"]) -> Float[Array, "n m"]:
-    """Computes all squared distances."""
-    square = jnp.sum(a**2, axis=-1)[:, None] + jnp.sum(b**2, axis=-1) - 2.0 * a @ b.T
-    return jnp.maximum(square, 0.0)
+    return scaler.clipped(moments) / jnp.sqrt(moments.shape[-1])

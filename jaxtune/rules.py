@@ -13,8 +13,8 @@ Departures from the paper:
 - Its vote can only raise a parameter; here it has a sign.
 - Both models are trained anew for every distribution, never continued.
 - `posterior_update` is not in the paper. It gives an estimate and intervals at once, so it may replace several tunings.
-  It estimates by regression, since a sweep of guesses through the search-parameter model had twice the error on the
-  same episodes of a walking robot, and took a hundred times as long (`experiments.bench estimates`).
+  It estimates by regression, since a sweep of guesses through the search-parameter model had nearly twice the error
+  on the same episodes of a walking robot, and took thirty times as long (`experiments.bench estimates`).
 """
 
 from collections.abc import Callable

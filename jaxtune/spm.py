@@ -34,7 +34,6 @@ from jaxtune import dist as dists
 from jaxtune.types import Coords, ParamDist, Trajectory
 
 _SCALED = 2048  # windows from which mean and standard deviation of the moments are computed
-_FAR = 10.0  # standard deviations; a moment that hardly varied in training must not drown all others later
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,7 +109,7 @@ class SPM:
 
 def _read(steps: windows.Scaler, moments: windows.Scaler, window: Float[Array, "batch time channels"]):
     """Computes the network's input: the standardised moments of each window, clipped."""
-    return jnp.clip(moments(windows.moments(steps(window))), -_FAR, _FAR)
+    return moments.clipped(windows.moments(steps(window)))
 
 
 def train(

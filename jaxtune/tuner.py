@@ -148,9 +148,10 @@ class Info:
     not_finite: jax.Array  # number of episodes, simulated or measured, whose simulation broke
 
 
-def broken(collected: Collected) -> jax.Array:
-    """Counts simulated episodes in which the simulation broke."""
-    return collected.trajectory.not_finite.sum() + collected.held_out.not_finite.sum()
+def counted(carry: dict, collected: Collected) -> dict:
+    """Counts a round of a tuning's loop, and its simulated episodes in which the simulation broke."""
+    broken = collected.trajectory.not_finite.sum() + collected.held_out.not_finite.sum()
+    return carry | {"rounds": carry["rounds"] + 1, "not_finite": carry["not_finite"] + broken}
 
 
 def make_info(carry: dict, measured: Trajectory) -> Info:
@@ -262,23 +263,21 @@ class Tuner:
             # Every round simulates new robots and trains its models anew, because the distribution has changed.
             key_collect, key_verify, key_update = jax.random.split(jax.random.fold_in(key, carry["rounds"]), 3)
             collected = self.collect(key_collect, state.policy, carry["dist"])
+            carry = counted(carry, collected)
             # Branches, so that (unless vmapped) no model is trained that is not needed.
             carry = jax.lax.cond(
                 carry["verdict"] == Verdict.WIDEN,
                 lambda: self.decide(
-                    carry,
-                    collected,
-                    self.verify(key_verify, self.config, collected, measured, state.knobs),
-                    state.knobs,
+                    carry, self.verify(key_verify, self.config, collected, measured, state.knobs), state.knobs
                 ),
-                lambda: carry | {"not_finite": carry["not_finite"] + broken(collected)},
+                lambda: carry,
             )
             return jax.lax.cond(
                 carry["verdict"] == Verdict.ACCEPT,
                 lambda: self.refine(
                     carry, *self.update(key_update, self.config, collected, measured, carry["dist"], state.knobs)
                 ),
-                lambda: carry | {"rounds": carry["rounds"] + 1},
+                lambda: carry,
             )
 
         carry = jax.lax.while_loop(lambda carry: carry["left"] > 0, body, self.before(state.dist))
@@ -300,12 +299,11 @@ class Tuner:
             **no_gate_log(self.config),
         }
 
-    def decide(self, carry: dict, collected: Collected, gate: GateInfo, knobs: Knobs) -> dict:
+    def decide(self, carry: dict, gate: GateInfo, knobs: Knobs) -> dict:
         """Takes the verdict of one gate call, and widens the distribution if that is it.
 
         Args:
           carry: from `before`, or from the call before.
-          collected: the simulated episodes that the gate compared.
           gate: what it found.
           knobs: for the widening factor.
 
@@ -330,7 +328,6 @@ class Tuner:
             "verdicts": carry["verdicts"].at[calls].set(verdict),
             "radius": carry["radius"].at[calls].set(dists.ravel(dist.radius).max()),
             "gate": jax.tree.map(lambda log, value: log.at[calls].set(value), carry["gate"], gate),
-            "not_finite": carry["not_finite"] + broken(collected),
         }
 
     def refine(self, carry: dict, moved: ParamDist, update: UpdateInfo) -> dict:
@@ -352,7 +349,6 @@ class Tuner:
         changed = (dists.ravel(moved.radius) < _CHANGED * radius) | (jnp.abs(update.step) > 1.0 - _CHANGED)
         whole = (dists.ravel(moved.centre) - dists.ravel(carry["tested"].centre)) / tested
         return carry | {
-            "rounds": carry["rounds"] + 1,
             "left": jnp.where(changed.any(), carry["left"] - 1, 0),
             "dist": moved,
             "update": update.replace(step=whole, interval=update.interval * radius / tested, identifiable=known),

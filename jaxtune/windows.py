@@ -15,6 +15,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxtune.types import Trajectory
 
+_FAR = 10.0  # standard deviations
+
 MIN_STD = 1e-3
 """Smallest standard deviation by which a channel is divided: one that is smaller in training counts as constant."""
 
@@ -97,6 +99,10 @@ class Scaler:
         """Standardises values channel by channel: `(windows - mean) / std`, of any leading shape."""
         return (windows - self.mean) / self.std
 
+    def clipped(self, values: Float[Array, "... channels"]) -> Float[Array, "... channels"]:
+        """Standardises values, and clips them at ten deviations: one that hardly varied must not drown all others."""
+        return jnp.clip(self(values), -_FAR, _FAR)
+
 
 def scaler(values: Float[Array, "... channels"], weight: Float[Array, "... 1"] | None = None) -> Scaler:
     """Fits a scaler to values, over all axes but the last.
@@ -135,3 +141,9 @@ def moments(window: Float[Array, "batch time channels"]) -> Float[Array, "batch 
     at_once = jnp.einsum("bti,btj->bij", centred, centred)[:, *upper] / time
     ahead = jnp.einsum("bti,btj->bij", step, centred[:, :-1]).reshape(batch, -1) / time
     return jnp.concatenate([mean, step.std(axis=1), jnp.diff(step, axis=1).std(axis=1), at_once, ahead], axis=-1)
+
+
+def square_distances(a: Float[Array, "n moments"], b: Float[Array, "m moments"]) -> Float[Array, "n m"]:
+    """Computes all squared distances, from |a|^2 + |b|^2 - 2 a b, which needs no array [n, m, moments]."""
+    square = jnp.sum(a**2, axis=-1)[:, None] + jnp.sum(b**2, axis=-1) - 2.0 * a @ b.T
+    return jnp.maximum(square, 0.0)

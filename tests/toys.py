@@ -138,3 +138,16 @@ def collect(key: jax.Array, dist: ParamDist, config: TunerConfig = TUNER) -> Col
         held_out=jax.tree.map(lambda leaf: leaf.reshape(*shape, *leaf.shape[1:]), held_out),
         held_out_coords=truths,
     )
+
+
+def simulated(centre: Mapping, count: int):
+    """Episodes of robots drawn around a centre, their coordinates, and what they were drawn from."""
+    dist = uniform(centre)
+    coords = dists.sample(jax.random.key(0), dist, count)
+    return Slider().simulate(jax.random.key(1), policy(), coords), coords, dist
+
+
+def measured(centre: Mapping, episodes: int = 3, **radii) -> Trajectory:
+    """A set of a slider that is so many radii off the centre."""
+    truth = {name: value + 0.4 * radii.get(name, 0.0) for name, value in centre.items()}
+    return Slider().measure(truth, episodes)(jax.random.key(3), policy())

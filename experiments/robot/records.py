@@ -95,7 +95,7 @@ class Tuning:
     identifiable: dict[str, bool]
     """Whether the log narrows a parameter down."""
     update_loss: float | None
-    """Final loss of the search-parameter model."""
+    """How badly the update's model fits (`jaxtune.rules.UpdateInfo.loss`)."""
     measured_falls: int
     """Number of falls in the part of the walks that was compared."""
     not_finite: int

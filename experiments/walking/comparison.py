@@ -1,7 +1,7 @@
 """Compares the tuning methods of the paper's section IV-B: sets them up, summarises their runs, prints tables."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,7 +10,7 @@ from rich.table import Table
 
 from envs.targets.protocol import Target
 from experiments.walking.learner import Learner, Policy
-from jaxtune import baselines, tuner
+from jaxtune import baselines
 from jaxtune.baselines import Untuned
 from jaxtune.mjx import parameters
 from jaxtune.tuner import Tuner
@@ -20,8 +20,8 @@ METHODS = ("ours", "spm", "dr", "oracle")
 """`ours` (gate and posterior update), `spm` (the paper's update without the gate), `dr` (wide domain randomisation,
 never tuned) and `oracle` (trained with the target's own parameters)."""
 
-UPDATES = {"posterior": tuner.posterior_update, "vote": tuner.vote_update}
-"""How `ours` moves the distribution, by the name that `--update` takes."""
+UPDATES: dict[str, Callable[[Tuner], Tuner]] = {"posterior": lambda machine: machine, "vote": baselines.voting}
+"""What makes a tuner move the distribution in a way, by the name that `--update` takes."""
 
 
 @dataclass(frozen=True)
@@ -36,12 +36,6 @@ class Contender:
     dist: ParamDist
     sets: int
     """Measured sets that the method uses up in a tuning: one, or zero if it is never tuned."""
-
-
-def with_update(machine: tuner.Tuner, update: str) -> tuner.Tuner:
-    """Gives a tuner one of `UPDATES`; the paper's makes one step for every measured set."""
-    config = machine.config if update == "posterior" else replace(machine.config, refinements=0)
-    return replace(machine, config=config, update=UPDATES[update])
 
 
 def contenders(
@@ -72,7 +66,7 @@ def contenders(
         hidden={name: jnp.full_like(value, target.params[name]) for name, value in policy.hidden.items()}
     )
     return {
-        "ours": Contender(with_update(machine, update), policy, start, 1),
+        "ours": Contender(UPDATES[update](machine), policy, start, 1),
         "spm": Contender(baselines.spm(machine), policy, start, 1),
         "dr": Contender(untuned, wide, learner.dist(nominal, dr_radius), 0),
         "oracle": Contender(untuned, knowing, learner.dist(truth, learner.preset.policy_radius), 0),

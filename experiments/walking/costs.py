@@ -5,6 +5,7 @@
 
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -46,7 +47,6 @@ def profile(sizes: Preset, policy: str) -> dict[str, dict]:
     key = jax.random.PRNGKey(0)
     target = MjxTarget(robot=learner.robot, params=parameters.nominal(learner.entries))
     keys = jax.random.split(key, sizes.ppo.num_envs)
-
     rate = _physics_rate(learner, start)
 
     def sets(score):
@@ -65,32 +65,32 @@ def profile(sizes: Preset, policy: str) -> dict[str, dict]:
     train_dvm = lambda data: dvm.train(key, config.dvm, data.trajectory)[0]  # noqa: E731
     regress = lambda data: regression.train(config.regression, data.trajectory, data.sampled_coords, dist)  # noqa: E731
     gate, model = (_compiled(program)(collected) for program in (train_dvm, regress))
+    # Calls in a tuning, control steps of a call, program and inputs.
     parts = {
-        "measured episodes": (1, lambda one: episodes(one, config.set_episodes, steps), (start,)),
-        "simulated episodes": (1, lambda one: machine.collect(key, one, dist), (start,)),
-        "verification model": (1, train_dvm, (collected,)),
-        "its scores": (1, sets(lambda *args: dvm.novelty(config.dvm, *args)), (gate, collected, measured)),
-        "regression": (1, regress, (collected,)),
-        "its estimates": (
+        "measured episodes": (
             1,
-            sets(lambda *args: regression.estimate(config.regression, *args)),
-            (model, collected, measured),
+            config.set_episodes * steps,
+            lambda one: episodes(one, config.set_episodes, steps),
+            (start,),
         ),
-        "policy: rollouts": (sizes.epochs, learner.collect, (keys, start)),
-        "policy: whole updates": (sizes.epochs, lambda one: learner.train(key, one, dist, 1), (start,)),
-        "evaluation": (1, lambda one: episodes(one, sizes.evaluation_episodes, learner.longest), (start,)),
-    }
-    simulated = {
-        "measured episodes": (config.set_episodes, steps),
-        "simulated episodes": (count, steps),
-        "policy: rollouts": (sizes.ppo.num_envs, sizes.ppo.unroll_steps),
-        "evaluation": (sizes.evaluation_episodes, learner.longest),
+        "simulated episodes": (1, count * steps, lambda one: machine.collect(key, one, dist), (start,)),
+        "verification model": (1, None, train_dvm, (collected,)),
+        "its scores": (1, None, sets(partial(dvm.novelty, config.dvm)), (gate, collected, measured)),
+        "regression": (1, None, regress, (collected,)),
+        "its estimates": (1, None, sets(partial(regression.estimate, config.regression)), (model, collected, measured)),
+        "policy: rollouts": (sizes.epochs, sizes.ppo.steps_per_update, learner.collect, (keys, start)),
+        "policy: whole updates": (sizes.epochs, None, lambda one: learner.train(key, one, dist, 1), (start,)),
+        "evaluation": (
+            1,
+            sizes.evaluation_episodes * learner.longest,
+            lambda one: episodes(one, sizes.evaluation_episodes, learner.longest),
+            (start,),
+        ),
     }
     rows = {}
-    for name, (calls, program, inputs) in parts.items():
+    for name, (calls, simulated, program, inputs) in parts.items():
         compile_s, run_s = _seconds(program, inputs)
-        many, long = simulated.get(name, (np.nan, np.nan))
-        limit = many * long / rate
+        limit = np.nan if simulated is None else simulated / rate
         rows[name] = {"calls": calls, "compile_s": compile_s, "run_s": run_s, "limit_s": limit}
     learning = rows.pop("policy: whole updates")
     learning["run_s"] -= rows["policy: rollouts"]["run_s"]
@@ -163,8 +163,8 @@ def estimates(sizes: Preset, policy: str, radius: float, seeds: int) -> dict[str
         config.regression, data.trajectory, data.sampled_coords, dist
     )
     methods = {
-        "search-parameter model": (fit_spm, lambda *args: spm.estimate(config.spm, *args)),
-        "regression": (regress, lambda *args: regression.estimate(config.regression, *args)),
+        "search-parameter model": (fit_spm, partial(spm.estimate, config.spm)),
+        "regression": (regress, partial(regression.estimate, config.regression)),
     }
     collect = _compiled(lambda key: machine.collect(key, start, dist))
     found = {name: ([], []) for name in methods}

@@ -20,7 +20,6 @@ GUIDES = Path(tuner.__file__).parent / "guides"
 SMALL = TunerConfig(
     episodes=160,
     held_out_sets=19,
-    spm=replace(toys.SPM, window=50, train_steps=400),
     dvm=replace(toys.DVM, train_steps=100),
 )
 

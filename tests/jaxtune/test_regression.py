@@ -1,3 +1,5 @@
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -5,7 +7,7 @@ import pytest
 import toys
 
 from jaxtune import dist as dists
-from jaxtune import regression, windows
+from jaxtune import regression
 from jaxtune.regression import RegressionConfig
 
 CONFIG = RegressionConfig(stride=5)
@@ -13,14 +15,14 @@ CONFIG = RegressionConfig(stride=5)
 CENTRE = {"colour": 0.0, "friction": 0.1, "mass": -0.1}
 COLOUR, FRICTION, MASS = range(3)
 
+measured = functools.partial(toys.measured, CENTRE)
+
 fit = jax.jit(regression.train, static_argnums=0)
 
 
 @pytest.fixture(scope="module")
 def simulated():
-    dist = toys.uniform(CENTRE)
-    coords = dists.sample(jax.random.key(0), dist, 256)
-    return toys.Slider().simulate(jax.random.key(1), toys.policy(), coords), coords, dist
+    return toys.simulated(CENTRE, 256)
 
 
 @pytest.fixture(scope="module")
@@ -31,12 +33,6 @@ def model(simulated):
 @pytest.fixture(scope="module")
 def estimate(model):
     return jax.jit(lambda measured: regression.estimate(CONFIG, model, measured))
-
-
-def measured(episodes=3, **radii):
-    """A set of a slider this many radii off the centre."""
-    truth = {name: value + 0.4 * radii.get(name, 0.0) for name, value in CENTRE.items()}
-    return toys.Slider().measure(truth, episodes)(jax.random.key(3), toys.policy())
 
 
 def test_robots_that_it_has_not_seen_are_found(estimate):
@@ -118,18 +114,5 @@ def test_longer_episodes_count_for_more(estimate):
     heavy, light = measured(1, mass=0.6), measured(1, mass=-0.6)
     both = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), heavy, light)
     length = both.alive.shape[1]
-    cut = both.replace(alive=both.alive & (jnp.arange(length) < jnp.array([[length], [windows_at_least(CONFIG)]])))
+    cut = both.replace(alive=both.alive & (jnp.arange(length) < jnp.array([[length], [CONFIG.window + CONFIG.stride]])))
     assert estimate(cut)[MASS] > estimate(both)[MASS] + 0.2
-
-
-def windows_at_least(config):
-    return config.window + config.stride
-
-
-def test_moments_are_those_of_numpy():
-    window = np.random.default_rng(0).normal(size=(2, 50, 3)).astype(np.float32)
-    found = np.asarray(windows.moments(jnp.asarray(window)))
-    centred = window[0] - window[0].mean(axis=0)
-    np.testing.assert_allclose(found[0, :3], window[0].mean(axis=0), atol=1e-6)
-    np.testing.assert_allclose(found[0, 3:6], np.diff(window[0], axis=0).std(axis=0), rtol=1e-5)
-    np.testing.assert_allclose(found[0, 9:15], (centred.T @ centred / 50)[np.triu_indices(3)], atol=1e-5)

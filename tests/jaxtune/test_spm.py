@@ -1,3 +1,5 @@
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,12 +15,12 @@ CONFIG = toys.SPM
 CENTRE = {"colour": 0.0, "friction": 0.1, "mass": -0.1}
 COLOUR, FRICTION, MASS = range(3)
 
+measured = functools.partial(toys.measured, CENTRE)
+
 
 @pytest.fixture(scope="module")
 def simulated():
-    dist = toys.uniform(CENTRE)
-    coords = dists.sample(jax.random.key(0), dist, 512)
-    return toys.Slider().simulate(jax.random.key(1), toys.policy(), coords), coords, dist
+    return toys.simulated(CENTRE, 512)
 
 
 @pytest.fixture(scope="module")
@@ -44,12 +46,6 @@ def logits(model):
 @pytest.fixture(scope="module")
 def vote(model):
     return jax.jit(lambda measured: spm.vote(CONFIG, model, measured))
-
-
-def measured(**radii):
-    """A set of a slider this many radii off the centre."""
-    truth = {name: value + 0.4 * radii.get(name, 0.0) for name, value in CENTRE.items()}
-    return toys.Slider().measure(truth, 3)(jax.random.key(3), toys.policy())
 
 
 @pytest.mark.parametrize(("name", "index"), [("friction", FRICTION), ("mass", MASS)])

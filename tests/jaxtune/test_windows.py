@@ -121,3 +121,12 @@ def test_scaler_ignores_what_a_broken_simulation_left_behind():
     expected, scaler = windows.fit_scaler(trajectory), windows.fit_scaler(broken)
     np.testing.assert_allclose(scaler.mean, expected.mean, rtol=1e-6)
     np.testing.assert_allclose(scaler.std, expected.std, rtol=1e-6)
+
+
+def test_moments_are_those_of_numpy():
+    window = np.random.default_rng(0).normal(size=(2, 50, 3)).astype(np.float32)
+    found = np.asarray(windows.moments(jnp.asarray(window)))
+    centred = window[0] - window[0].mean(axis=0)
+    np.testing.assert_allclose(found[0, :3], window[0].mean(axis=0), atol=1e-6)
+    np.testing.assert_allclose(found[0, 3:6], np.diff(window[0], axis=0).std(axis=0), rtol=1e-5)
+    np.testing.assert_allclose(found[0, 9:15], (centred.T @ centred / 50)[np.triu_indices(3)], atol=1e-5)
