@@ -186,10 +186,11 @@ class Runner:
     def _check_walked(self, info: tuner.Info) -> None:
         verdict = info.verdicts[int(info.calls) - 1] if info.calls else Verdict.ACCEPT
         # Further tunings would measure the same falls, since nothing was learnt from these.
-        if verdict == Verdict.NOT_FINITE and info.measured_falls == self._learner.preset.tuner.set_episodes:
+        nothing = verdict in (Verdict.NOT_FINITE, Verdict.NOT_COMPARABLE)
+        if nothing and info.measured_falls == self._learner.preset.tuner.set_episodes:
             raise ValueError(
-                f"target: every measured episode fell or broke within {self._learner.preset.tuner.dvm.window} steps, "
-                "expected at least one that lasts longer: start from a policy that can stand there"
+                f"target: every measured episode fell or broke, and too few, here or in simulation, lasted for the "
+                f"{self._learner.preset.tuner.dvm.window} steps of a window: start from a policy that can stand there"
             )
 
     def _describe(self, dist: ParamDist) -> dict:

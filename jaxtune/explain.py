@@ -7,9 +7,10 @@ from jaxtune.types import Verdict
 
 MEANING = {
     Verdict.ACCEPT: "The simulator covers what was measured, so its parameters were updated.",
-    Verdict.UNEXPLAINED: "What was measured is not covered, and widening came no closer: the model lacks physics.",
+    Verdict.UNEXPLAINED: "No parameters explain what was measured (at 1 %): the model lacks physics.",
     Verdict.RADIUS_EXHAUSTED: "What was measured is not covered, and the distribution may grow no wider.",
     Verdict.NOT_FINITE: "No score could be computed.",
+    Verdict.NOT_COMPARABLE: "There is too little to compare.",
 }
 """What the verdict that ended a tuning means."""
 ADVICE = {
@@ -17,10 +18,19 @@ ADVICE = {
     Verdict.UNEXPLAINED: "Add parameters that may be wrong, such as a delay or friction, or look for the missing "
     "effect with jaxtune.discovery. Do not trust the parameters.",
     Verdict.RADIUS_EXHAUSTED: "Check the bounds and the measured episodes. If both are right, a parameter is missing.",
-    Verdict.NOT_FINITE: "Look for episodes that end before their first window, for numbers that are not finite, and "
-    "for observations that never change.",
+    Verdict.NOT_FINITE: "Look for numbers that are not finite, and for simulated observations that never change.",
+    Verdict.NOT_COMPARABLE: "Measure episodes in which the robot moves, that differ from each other and last for a "
+    "window at least. Simulated ones must last as long; a level of 0.95 needs 19 held-out sets that do.",
 }
 """What to do next."""
+
+
+_EXCESS = {
+    "cover": "shapes that the verification model does not know",
+    "lost": "how long the robot stays up",
+    "misfit": "motion that no parameters of the table explain",
+    "beyond": "parameters beyond the distribution",
+}
 
 
 def explain(info) -> str:
@@ -38,6 +48,10 @@ def explain(info) -> str:
         f"{verdict.name.lower()} after {int(info.calls)} gate call(s): {MEANING[verdict]}",
         f"  novelty {float(info.gate.novelty[last]):.3f}, threshold {float(info.gate.threshold[last]):.3f}",
     ]
+    excess = {what: float(info.gate[name][last]) for name, what in _EXCESS.items()}
+    if verdict != Verdict.ACCEPT and np.isfinite([*excess.values()]).any():
+        most = max((what for what in excess if np.isfinite(excess[what])), key=excess.__getitem__)
+        lines.append(f"  most unlike the simulated sets: {most} ({excess[most]:.1f}; 1 is usual for one set in ten)")
     if verdict == Verdict.ACCEPT:
         moved = dists.move(info.dist, info.update.step).centre
         interval = np.asarray(dists.ravel(info.dist.radius) * info.update.interval)

@@ -97,7 +97,7 @@ class HostTuner:
                 carry = self._decide(carry, gate, state.knobs)
             if carry["verdict"] == Verdict.ACCEPT:
                 updated = self._update(key_update, collected, measured, carry["dist"], state.knobs)
-                carry = self._refine(carry, *updated)
+                carry = self._refine(carry, *updated, state.knobs)
         return state.replace(dist=carry["dist"]), make_info(carry, measured)
 
     @cached_property

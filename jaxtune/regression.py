@@ -27,6 +27,7 @@ from jaxtune.types import Coords, ParamDist, Trajectory
 _BREADTHS = (2.0, 4.0, 8.0, 16.0)  # widths of the kernel, in median squared distances: the larger, the more linear
 # Least and largest lambda, in units of K's largest eigenvalue; less would magnify the rounding of single precision.
 _PENALTIES = (3e-6, 0.3)
+_CONSTANT = 1e-2  # largest standardised value of a moment that does not vary: rounding
 _NOTHING = 1e-6  # an eigenvalue where all episodes are alike
 _EPISODES = {"cpu": 4, "other": 256}  # read side by side on a device
 
@@ -47,7 +48,10 @@ class Regression:
 
     steps: windows.Scaler  # scales the channels of each step
     moments: windows.Scaler  # scales the moments of each episode
-    read: jax.Array  # [episodes, moments] of D_q, standardised
+    varies: jax.Array  # [moments] 1 where a moment varies over D_q, else 0
+    read: jax.Array  # [episodes, moments] of D_q, standardised; zero for an episode without a window
+    known: jax.Array  # [episodes] 1 where an episode of D_q has a window, else 0
+    truth: jax.Array  # [episodes, coords] of D_q, in radii
     weights: jax.Array  # a, [episodes, coords]
     mean: jax.Array  # b, [coords]
     width: jax.Array  # of the kernel, in squared distance
@@ -71,6 +75,10 @@ def train(config: RegressionConfig, trajectory: Trajectory, coords: Coords, dist
     known = (count > 0).astype(moments.dtype)
     scaler = windows.scaler(moments, known[:, None] / jnp.maximum(known.sum(), 1.0))
     read = known[:, None] * _standardised(scaler, moments)
+    # What never varies, such as an action that follows the clock alone, says nothing of the parameters, but changes if
+    # an episode ends early.
+    varies = (jnp.abs(read).max(axis=0) > _CONSTANT / jnp.sqrt(read.shape[1])).astype(read.dtype)
+    read = read * varies
     distance = windows.square_distances(read, read)
     truth = dists.normalise(dist, coords)
     share = known / jnp.maximum(known.sum(), 1.0)
@@ -108,7 +116,10 @@ def train(config: RegressionConfig, trajectory: Trajectory, coords: Coords, dist
     return Regression(
         steps=steps,
         moments=scaler,
+        varies=varies,
         read=read,
+        known=known,
+        truth=truth,
         weights=weights[best],
         mean=mean - answers[best],
         width=widths[best],
@@ -123,12 +134,24 @@ def estimate(config: RegressionConfig, model: Regression, trajectory: Trajectory
 
     An estimate stays inside the box. A set without a valid window is answered with the middle of the box.
     """
+    answer, _, _ = answers(config, model, trajectory)
+    return jnp.clip(answer, model.low, model.high)
+
+
+def answers(
+    config: RegressionConfig, model: Regression, trajectory: Trajectory
+) -> tuple[Float[Array, " coords"], Float[Array, " moments"], Float[Array, ""]]:
+    """Reads a set of episodes [episodes, time].
+
+    Returns:
+      Its coordinates in radii, which may lie beyond the box; its standardised moments, averaged over episodes with
+      their windows as weights; and the number of its valid windows. A set without any gets the middle of the box.
+    """
     moments, count = _read(config, model.steps, trajectory)
-    read = _standardised(model.moments, moments)
-    answers = model.mean + jnp.exp(-windows.square_distances(read, model.read) / model.width) @ model.weights
+    read = model.varies * _standardised(model.moments, moments)
+    each = model.mean + jnp.exp(-windows.square_distances(read, model.read) / model.width) @ model.weights
     share = count / jnp.maximum(count.sum(), 1)
-    found = jnp.where(count.sum() > 0, share @ answers, (model.low + model.high) / 2)
-    return jnp.clip(found, model.low, model.high)
+    return jnp.where(count.sum() > 0, share @ each, (model.low + model.high) / 2), share @ read, count.sum()
 
 
 def _read(config, steps, trajectory) -> tuple[Float[Array, "episodes moments"], Float[Array, " episodes"]]:

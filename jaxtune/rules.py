@@ -10,6 +10,8 @@ Departures from the paper:
 
 - Its threshold sigma' is set by hand. Here held-out simulated sets calibrate it, so the gate is a conformal test with a
   known rate of false alarms. Sets are scored by mean ranks, not by the mean of Eq. 2.
+- Its verification model alone decides. Here falls count as well, and so do the regression's answer and the response
+  surface (`jaxtune.surface`). One radius outside the box, the verification model alone finds hardly anything.
 - Its vote can only raise a parameter; here it has a sign.
 - Both models are trained anew for every distribution, never continued.
 - `posterior_update` is not in the paper. It gives an estimate and intervals at once, so it may replace several tunings.
@@ -17,6 +19,7 @@ Departures from the paper:
   on the same episodes of a walking robot, and took thirty times as long (`experiments.bench estimates`).
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
@@ -25,7 +28,7 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from jaxtune import devices, dvm, regression, spm
+from jaxtune import devices, dvm, regression, spm, surface
 from jaxtune import dist as dists
 from jaxtune.dvm import DVMConfig
 from jaxtune.regression import RegressionConfig
@@ -36,6 +39,9 @@ from jaxtune.types import ParamDist, Trajectory
 # is below 1 because both are quantiles over a few dozen sets and differ by chance.
 _IDENTIFIABLE = 0.9
 _LEAST_ERROR = 1e-4  # radii; without noise a regression may be exact
+# Least distance of median and 0.9-quantile of each statistic, where all simulated sets are alike.
+_LEAST_SPREAD = {"cover": 0.02, "lost": 0.1, "misfit": 0.05, "beyond": 0.1}
+_SAME = 1e-6  # of an observation's size: it does not change
 SETS = {"cpu": 1, "other": 64}
 """Held-out sets that are scored side by side on a device (`devices.in_chunks`)."""
 
@@ -52,17 +58,12 @@ class TunerConfig:
     """Simulated episodes in D_q, the set that both models are trained on. Each has coordinates of its own."""
     set_episodes: int = 5
     """Episodes in a measured set, and in every held-out set that it is compared with."""
-    held_out_sets: int = 39
+    held_out_sets: int = 99
     """Simulated sets that calibrate the gate's threshold and the update's interval. Each set is one robot, with
-    coordinates of its own. With 39 sets, p-values are multiples of 1/40."""
+    coordinates of its own. With 99 sets, p-values are multiples of 1/100. A level of 0.95 needs 19 sets at least, and
+    the verdict `unexplained` needs 99."""
     max_widenings: int = 6
     """Largest number of widenings within one tuning; the gate is called at most once more than that."""
-    patience: int = 3
-    """Gate calls in a row without progress after which the verdict is `unexplained`."""
-    least_fall: float = 0.01
-    """Smallest novelty decrease that counts as progress, measured from the last call that made some. The novelty is a
-    mean rank between 0 and 1. The value was chosen, not calibrated: the novelty of a first call varies by 0.01 to 0.04
-    between seeds (`experiments.bench alarm`)."""
     refinements: int = 3
     """Times that an accepted set is read again, in the distribution that the update narrowed. Use 0 with `vote_update`,
     whose steps are meant for one set each."""
@@ -93,7 +94,7 @@ class Knobs:
     step_size: jax.Array  # the paper's alpha: radii that `vote_update` moves per unit of vote
     widen_factor: jax.Array  # the paper's c: factor on the radius after a failed check
     level: jax.Array  # quantile of the held-out sets' novelty that is the threshold
-    threshold: jax.Array  # the paper's sigma': a fixed mean rank instead of that quantile; nan where there is none
+    threshold: jax.Array  # the paper's sigma': a fixed mean rank of windows instead; nan where there is none
 
 
 def knobs(
@@ -106,7 +107,7 @@ def knobs(
       widen_factor: what every radius is multiplied by after a failed check.
       level: share of covered sets that the gate lets pass. At 0.95 it rejects a set that came from the distribution
         with a probability of at most 0.05.
-      threshold: a fixed novelty, as a mean rank in (0, 1), that replaces the calibrated threshold. The paper sets its
+      threshold: a fixed mean rank of windows, in (0, 1). The verification model alone then decides. The paper sets its
         threshold by hand like this.
 
     Raises:
@@ -137,26 +138,33 @@ class Collected:
     sampled_coords: dict  # true coordinates of the episodes of D_q, [episodes] by name
     held_out: Trajectory  # [sets, set_episodes, time]
     held_out_coords: dict  # true coordinates of the held-out sets, [sets] by name
+    dist: ParamDist  # what all coordinates were drawn from
 
 
 @chex.dataclass(frozen=True)
 class GateInfo:
     """What one call of the gate found, scalars each.
 
-    The tuner decides by `novelty` and `threshold` alone: the set is covered where novelty <= threshold, and a value
-    that is not finite ends the tuning. The rest is for plots and reports; a gate that does not compute it answers nan.
+    The tuner decides by `novelty`, `threshold` and `comparable`: the set is covered where novelty <= threshold, and a
+    value that is not finite ends the tuning. A p-value of at most 0.01 decides whether a set that fills the bounds is
+    `unexplained`. The rest is for plots and reports; a gate that does not compute it leaves it out.
     """
 
-    novelty: jax.Array  # mean rank of the measured windows among those of all sets, in (0, 1]; 1/2 where they are alike
+    novelty: jax.Array  # how unlike the simulated sets the measured one is: the largest of the four excesses below
     threshold: jax.Array  # largest novelty of a covered set
-    p_value: jax.Array  # (1 + #{held-out sets at least as novel}) / (held-out sets + 1)
-    uncovered: jax.Array  # share of the measured windows that have no simulated neighbour within reach
-    elbo: jax.Array  # evidence lower bound that the verification model reached in training, nats per window
+    p_value: jax.Array = math.nan  # (1 + #{held-out sets at least as novel}) / (held-out sets + 1)
+    comparable: jax.Array = True  # False where there is too little to compare, see `calibrated_gate`
+    cover: jax.Array = math.nan  # excess of the measured windows' novelty under the verification model
+    lost: jax.Array = math.nan  # excess of the difference in the share of steps that are alive
+    misfit: jax.Array = math.nan  # excess of what no coordinates explain
+    beyond: jax.Array = math.nan  # excess of the estimate's distance from inside the box
+    uncovered: jax.Array = math.nan  # share of the measured windows that have no simulated neighbour within reach
+    elbo: jax.Array = math.nan  # evidence lower bound that the verification model reached, nats per window
 
 
 @chex.dataclass(frozen=True)
 class UpdateInfo:
-    """What one update did, [coords] each in the order of `dist.names`, but for `loss`.
+    """What one update did, [coords] each in the order of `dist.names`, but for the scalars at the end.
 
     Step and interval are in radii of the distribution before the update. For an identifiable coordinate the new
     estimate is `centre + radius * step`, give or take `radius * interval`. For any other one `step` is zero, and
@@ -167,6 +175,8 @@ class UpdateInfo:
     interval: jax.Array  # half width of the interval around the new centre; nan where the rule gives none
     identifiable: jax.Array  # False where the measured set says no more than the distribution did
     loss: jax.Array  # scalar: `vote_update`'s logistic loss in nats, `posterior_update`'s error of episodes left out
+    p_value: jax.Array = math.nan  # scalar: as the gate's, of misfit and beyond alone
+    p_misfit: jax.Array = math.nan  # scalar: of misfit alone
 
 
 Verify = Callable[[jax.Array, TunerConfig, Collected, Trajectory, Knobs], GateInfo]
@@ -178,52 +188,127 @@ Update = Callable[[jax.Array, TunerConfig, Collected, Trajectory, ParamDist, Kno
 def calibrated_gate(
     key: jax.Array, config: TunerConfig, collected: Collected, measured: Trajectory, knobs: Knobs
 ) -> GateInfo:
-    """Tests whether simulated episodes cover a measured set: the default gate.
+    """Tests whether a measured set is like simulated ones: the default gate.
 
-    It trains a verification model on D_q and computes the novelty of every window (Eq. 2 with its sign mended, see
-    `dvm.novelty`), for the measured set and for each held-out set. With W the valid windows of all these sets,
+    Four statistics are computed of the measured set and of every held-out set alike:
 
-        rank(x)    = #{w in W: novelty(w) <= novelty(x)} / #W
-        score(set) = mean of rank(x) over the valid windows of the set
-        p          = (1 + #{held-out sets: score >= score(measured)}) / (held_out_sets + 1)
-        threshold  = the ceil((held_out_sets + 1) level)-th smallest score of the held-out sets.
+        cover   mean rank of its windows' novelty (Eq. 2 with its sign mended, see `dvm.novelty`) among the windows of
+                all sets, each of which weighs the same; a window without a neighbour ranks highest
+        lost    |share of its steps that are alive - mean share of D_q|
+        misfit  logarithm of how far it lies from what robots of its estimate show (`surface.misfit`)
+        beyond  largest distance of its estimate from the inside of the box, in errors of the regression
 
-    A measured set drawn like the held-out ones exceeds the threshold with probability at most `1 - level`. The test is
-    calibrated per set, since the windows of one episode depend on each other. Ranks replace nats because the novelty of
-    single windows is heavy-tailed: one held-out fall raises a mean in nats so far that a measured set which is a little
-    novel everywhere would pass. A window without a neighbour ranks highest.
+    They are made comparable by quantiles over all sets, and the largest counts. `p` and `threshold` are conformal:
+
+        excess    = (statistic - median) / (0.9-quantile - median)
+        novelty   = largest of the four excesses
+        p         = (1 + #{held-out sets: novelty >= novelty(measured)}) / (held_out_sets + 1)
+        threshold = the ceil((held_out_sets + 1) level)-th smallest novelty of the held-out sets.
+
+    A measured set drawn like the held-out ones exceeds the threshold with probability at most `1 - level`, since all
+    sets are treated alike. The test is calibrated per set, because windows and episodes of one robot depend on each
+    other. A set of which no window is known has `lost` alone.
+
+    The set is not comparable if it has no valid window, if its observations never change, if its episodes are copies of
+    each other though simulated ones differ, or if fewer held-out sets have a window than the level needs
+    (level / (1 - level), which is 19 at 0.95).
 
     Args:
       key: random key, for training the verification model.
       config: sizes.
       collected: D_q and held-out sets of the distribution that is tested.
       measured: the measured set, [set_episodes, time].
-      knobs: `level`, or a fixed `threshold`.
+      knobs: `level`, or a fixed `threshold` of the mean rank alone.
 
     Returns:
-      Score (`novelty`), threshold and p-value. The score is nan where the set has no valid window or holds a living
-      step that is not finite, and where no simulated observation ever changes.
+      What was found. The novelty is nan where the set holds a living step that is not finite, and where no simulated
+      observation ever changes.
     """
     model, elbo = dvm.train(key, config.dvm, collected.trajectory)
-    held_out = devices.in_chunks(partial(dvm.novelty, config.dvm), (collected.held_out,), SETS, shared=(model,))
-    scored = dvm.novelty(config.dvm, model, measured)
-    novelty, valid, covered = jax.tree.map(lambda sets, one: jnp.concatenate([sets, one[None]]), held_out, scored)
-    novelty = jnp.where(covered, novelty, jnp.inf)
-    # Invalid windows sort to the end of the pool as infinite. A window without a neighbour is infinite too and would
-    # count them, so its rank is capped at 1 below.
-    pool = jnp.sort(jnp.where(valid, novelty, jnp.inf), axis=None)
-    rank = jnp.searchsorted(pool, novelty, side="right") / valid.sum()
-    rank = jnp.where(jnp.isnan(novelty), jnp.nan, jnp.minimum(rank, 1.0))
-    score = jnp.sum(jnp.where(valid, rank, 0.0), axis=-1) / valid.sum(axis=-1)
-    # A held-out set that fell before its first window ended has no score; it counts as the most novel.
-    calibration, value = jnp.nan_to_num(score[:-1], nan=1.0), score[-1]
+    both = lambda every, one: jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), every, one)  # noqa: E731
+    scored = partial(dvm.novelty, config.dvm)
+    held_out = devices.in_chunks(scored, (collected.held_out,), SETS, shared=(model,))
+    novelty, valid, covered = both(held_out, scored(model, measured))
+    sane = jnp.isfinite(jnp.where(valid, novelty, 0.0)).all(axis=-1)
+    cover = _mean_ranks(jnp.where(covered, novelty, jnp.inf), valid)
+    alive = both(collected.held_out.alive, measured.alive).mean(axis=(1, 2))
+    statistics = {"cover": cover, "lost": jnp.abs(alive - collected.trajectory.alive.mean())}
+    _, _, found = _examined(config, collected, measured)
+    excess = {name: _excess(name, values) for name, values in (statistics | found).items()}
+    fixed = ~jnp.isnan(knobs.threshold)
+    every = jnp.where(fixed, cover, jnp.nanmax(jnp.stack([*excess.values()]), axis=0))
+    calibration, value = every[:-1], jnp.where(sane[-1], every[-1], jnp.nan)
+    usable, needed = valid.any(axis=-1), knobs.level / (1.0 - knobs.level)
+    enough = fixed | (usable[:-1].sum() >= jnp.floor(needed + 0.5))
     return GateInfo(
         novelty=value,
-        threshold=jnp.where(jnp.isnan(knobs.threshold), _conformal_quantile(calibration, knobs.level), knobs.threshold),
-        p_value=(1 + jnp.sum(calibration >= value)) / (config.held_out_sets + 1),
+        threshold=jnp.where(fixed, knobs.threshold, _conformal_quantile(calibration, knobs.level)),
+        p_value=_p_value(every),
+        comparable=usable[-1] & enough & _moves(measured) & ~_copied(measured, collected),
         uncovered=jnp.sum(valid[-1] & ~covered[-1]) / jnp.maximum(valid[-1].sum(), 1),
         elbo=elbo,
+        **{name: values[-1] for name, values in excess.items()},
     )
+
+
+def _mean_ranks(novelty: jax.Array, valid: jax.Array) -> jax.Array:
+    """The mean rank [sets] of each set's valid windows [sets, windows] among all, every set weighing the same."""
+    share = valid / jnp.maximum(valid.sum(axis=-1, keepdims=True), 1)
+    pool = jnp.where(valid, novelty, jnp.inf).reshape(-1)
+    order = jnp.argsort(pool)
+    weight = jnp.cumsum(share.reshape(-1)[order]) / jnp.maximum(valid.any(axis=-1).sum(), 1)
+    rank = weight[jnp.searchsorted(pool[order], jnp.nan_to_num(novelty, posinf=jnp.inf), side="right") - 1]
+    return jnp.where(valid.any(axis=-1), jnp.sum(share * jnp.where(valid, rank, 0.0), axis=-1), jnp.nan)
+
+
+def _examined(
+    config: TunerConfig, collected: Collected, measured: Trajectory
+) -> tuple[regression.Regression, jax.Array, dict[str, jax.Array]]:
+    """Estimates all sets by regression, and computes how well they fit.
+
+    Returns:
+      The regression; estimates [sets + 1, coords] in radii, which may lie beyond the box; and `misfit` and `beyond`
+      [sets + 1] by name, nan for a set without a valid window. The measured set is the last.
+    """
+    model = regression.train(config.regression, collected.trajectory, collected.sampled_coords, collected.dist)
+    ways = surface.train(model)
+    scale = jnp.maximum(model.error, _LEAST_ERROR)
+
+    def one(model, ways, scale, episodes):
+        answer, moments, windows = regression.answers(config.regression, model, episodes)
+        off = surface.misfit(ways, moments, jnp.clip(answer, model.low, model.high))
+        beyond = (jnp.maximum(model.low - answer, answer - model.high) / scale).max()
+        known = windows > 0
+        return answer, jnp.where(known, jnp.log(jnp.maximum(off, 1e-9)), jnp.nan), jnp.where(known, beyond, jnp.nan)
+
+    held_out = devices.in_chunks(one, (collected.held_out,), SETS, shared=(model, ways, scale))
+    every = jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), held_out, one(model, ways, scale, measured))
+    answers, misfit, beyond = every
+    return model, answers, {"misfit": misfit, "beyond": beyond}
+
+
+def _excess(name: str, values: jax.Array) -> jax.Array:
+    """A statistic [sets] in units of what simulated sets scatter; nan for a set that has none."""
+    median, high = jnp.nanquantile(values, 0.5), jnp.nanquantile(values, 0.9)
+    return (values - median) / jnp.maximum(high - median, _LEAST_SPREAD[name])
+
+
+def _p_value(scores: jax.Array) -> jax.Array:
+    """The conformal p-value of the last score among all [sets + 1]; a set without a score is not novel."""
+    return (1 + jnp.sum(scores[:-1] >= scores[-1])) / len(scores)
+
+
+def _moves(episodes: Trajectory) -> jax.Array:
+    """Tells whether any observation changes within the living steps of an episode."""
+    first = episodes.obs[:, :1]
+    changes = jnp.abs(episodes.obs - first) > _SAME * (1.0 + jnp.abs(first))
+    return (changes & episodes.alive[..., None]).any()
+
+
+def _copied(measured: Trajectory, collected: Collected) -> jax.Array:
+    """Tells whether measured episodes are copies of one, where simulated episodes of one robot differ."""
+    same = lambda obs: (obs == obs[:1]).all()  # noqa: E731
+    return (len(measured.obs) > 1) & same(measured.obs) & ~jax.vmap(same)(collected.held_out.obs).any()
 
 
 def _conformal_quantile(values: jax.Array, level: jax.Array | float) -> jax.Array:
@@ -288,19 +373,19 @@ def posterior_update(
       dist: the distribution that the episodes were drawn from.
       knobs: not used.
     """
-    model = regression.train(config.regression, collected.trajectory, collected.sampled_coords, dist)
-    estimate = partial(regression.estimate, config.regression)
-    held_out = devices.in_chunks(estimate, (collected.held_out,), SETS, shared=(model,))
+    model, answers, found = _examined(config, collected, measured)
+    low, high = dists.normalised_box(dist)
+    estimates = jnp.clip(answers, low, high)
+    held_out, estimate = estimates[:-1], estimates[-1]
     # The errors on robots with known coordinates stand for the error on the measured one.
     truth = dists.normalise(dist, collected.held_out_coords)
-    low, high = dists.normalised_box(dist)
     error = jnp.abs(held_out - truth)
     # What scales the errors must not come from the sets that calibrate them.
     scale = jnp.maximum(model.error, _LEAST_ERROR)
     interval = scale * _conformal_quantile((error / scale).max(axis=-1), config.coverage)
     ignorant = _conformal_quantile(jnp.abs((low + high) / 2 - truth), config.coverage)
     identifiable = _conformal_quantile(error, config.coverage) < _IDENTIFIABLE * ignorant
-    step = jnp.where(identifiable, estimate(model, measured), 0.0)
+    step = jnp.where(identifiable, estimate, 0.0)
     moved = dists.move(dist, step)
     radius = dists.ravel(dist.radius)
     narrowed = jnp.clip(radius * interval, jnp.minimum(config.min_radius, radius), radius)
@@ -309,7 +394,15 @@ def posterior_update(
     inside = (((step - interval >= low) & (step + interval <= high)) | ~identifiable).all()
     radius = jnp.where(identifiable & inside, narrowed, radius)
     moved = moved.replace(radius=dists.unravel(dists.names(dist), radius))
-    return moved, UpdateInfo(step=step, interval=interval, identifiable=identifiable, loss=model.error.mean())
+    excess = {name: _excess(name, values) for name, values in found.items()}
+    return moved, UpdateInfo(
+        step=step,
+        interval=interval,
+        identifiable=identifiable,
+        loss=model.error.mean(),
+        p_value=_p_value(jnp.fmax(excess["misfit"], excess["beyond"])),
+        p_misfit=_p_value(excess["misfit"]),
+    )
 
 
 def no_gate_log(config: TunerConfig) -> dict:
@@ -319,7 +412,8 @@ def no_gate_log(config: TunerConfig) -> dict:
     tuning needs.
     """
     log = jnp.full(config.max_widenings + 1, jnp.nan)
-    gate = GateInfo(novelty=log, threshold=log, p_value=log, uncovered=log, elbo=log)
+    gate = GateInfo(novelty=log, threshold=log)
+    gate = jax.tree.map(lambda _: log, gate).replace(comparable=jnp.ones(log.shape, bool))
     return {"verdicts": jnp.full(log.shape, -1), "radius": log, "gate": gate}
 
 
@@ -330,4 +424,6 @@ def no_update(dist: ParamDist) -> UpdateInfo:
     """
     zeros = jnp.zeros(len(dist.centre))
     unknown = jnp.full_like(zeros, jnp.nan)
-    return UpdateInfo(step=zeros, interval=unknown, identifiable=jnp.zeros_like(zeros, bool), loss=jnp.asarray(jnp.nan))
+    nan = jnp.asarray(jnp.nan)
+    none = jnp.zeros_like(zeros, bool)
+    return UpdateInfo(step=zeros, interval=unknown, identifiable=none, loss=nan, p_value=nan, p_misfit=nan)

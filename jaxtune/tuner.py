@@ -14,6 +14,7 @@ ones, and trains a policy in it. One tuning is one `Tuner.step`:
       |     accept              dist <- update(D_q, held-out sets, measured set, dist), and again in the narrower dist
       |     unexplained         the centre stays where it is: the model lacks physics
       |     radius_exhausted    the centre stays: no wider distribution is allowed
+      |     not_comparable      the centre stays: too little was measured or simulated
       |     not_finite          the centre stays: there was nothing to score
       |
       train_policy(policy, dist)
@@ -23,14 +24,17 @@ ones, and trains a policy in it. One tuning is one `Tuner.step`:
 D_q holds the simulated episodes that gate and update learn from; the held-out sets imitate the measured set and
 calibrate both. Novelty says how unlike the simulated episodes the measured set is, and the threshold is the largest
 novelty that still counts as covered. The verdict is the first of these that holds:
-`not_finite` if novelty or threshold is not a finite number; `accept` if novelty <= threshold; `unexplained` after
-`patience` calls in a row without progress; `radius_exhausted` if the distribution fills its bounds or was widened
-`max_widenings` times; else `widen`. A radius that was widened stays so, unless the update narrows it.
+`not_finite` if novelty or threshold is not a finite number; `not_comparable` if the gate says so; `accept` if novelty
+<= threshold; `unexplained` if the distribution fills its bounds and p <= 0.01; `radius_exhausted` if it fills them or
+was widened `max_widenings` times; else `widen`. A radius that was widened stays so, unless the update narrows it.
 
 Departures from the paper, besides those of gate and update (`jaxtune.rules`):
 
 - An accepted set is read up to `refinements` times more, with episodes simulated in the distribution that the update
-  narrowed. In a narrower distribution estimates are more exact, and the robot need not walk for it.
+  narrowed. In a narrower distribution estimates are more exact, and the robot need not walk for it. If the set does
+  not fit there (`UpdateInfo.p_value` <= 1 - level), the radius before is taken back. If it does not whatever the
+  coordinates (`p_misfit` <= 0.01), the verdict becomes `unexplained`: in a wide distribution, parameters can absorb
+  what is missing.
 - A tuning ends with training the policy, where the paper's begins with it. The last tuning therefore leaves a policy
   that was trained in the last distribution.
 - The radius grows only after a failed check (in print it grows before each), is capped by the bounds, and the loop ends
@@ -110,6 +114,7 @@ __all__ = [
 ]
 
 _CHANGED = 0.9  # of a radius: what is narrowed less than that, or moved by less than the rest, is as it was
+_UNEXPLAINED = 0.01  # largest p-value; a conformal one needs 99 simulated sets to be so small
 
 Policy = Any
 """Any pytree that the user's functions take as a policy; the tuner only passes it on."""
@@ -275,7 +280,9 @@ class Tuner:
             return jax.lax.cond(
                 carry["verdict"] == Verdict.ACCEPT,
                 lambda: self.refine(
-                    carry, *self.update(key_update, self.config, collected, measured, carry["dist"], state.knobs)
+                    carry,
+                    *self.update(key_update, self.config, collected, measured, carry["dist"], state.knobs),
+                    state.knobs,
                 ),
                 lambda: carry,
             )
@@ -291,10 +298,9 @@ class Tuner:
             "calls": jnp.zeros((), int),
             "dist": dist,
             "tested": dist,
+            "wider": dist.radius,
             "update": no_update(dist),
             "verdict": jnp.asarray(Verdict.WIDEN, int),
-            "closest": jnp.asarray(jnp.inf, float),
-            "stalled": jnp.zeros((), int),
             "not_finite": jnp.zeros((), int),
             **no_gate_log(self.config),
         }
@@ -311,47 +317,60 @@ class Tuner:
           What the loop carries on; the loop ends where the verdict is neither `widen` nor `accept`.
         """
         calls, dist = carry["calls"], carry["dist"]
-        closer = gate.novelty < carry["closest"] - self.config.least_fall
-        stalled = jnp.where(closer, 0, carry["stalled"] + 1)
-        verdict = jnp.asarray(self._verdict(gate, dist, calls, stalled), int)
+        verdict = jnp.asarray(self._verdict(gate, dist, calls), int)
         goes_on = (verdict == Verdict.WIDEN) | (verdict == Verdict.ACCEPT)
         wider = dists.widen(dist, knobs.widen_factor)
         return carry | {
             "left": jnp.where(goes_on, carry["left"], 0),
             "calls": calls + 1,
             "tested": dist,
-            "dist": jax.tree.map(lambda new, old: jnp.where(verdict == Verdict.WIDEN, new, old), wider, dist),
+            "dist": _choose(verdict == Verdict.WIDEN, wider, dist),
             "verdict": verdict,
-            # Several small decreases may add up to one that counts as progress.
-            "closest": jnp.where(closer, gate.novelty, carry["closest"]),
-            "stalled": stalled,
             "verdicts": carry["verdicts"].at[calls].set(verdict),
             "radius": carry["radius"].at[calls].set(dists.ravel(dist.radius).max()),
             "gate": jax.tree.map(lambda log, value: log.at[calls].set(value), carry["gate"], gate),
         }
 
-    def refine(self, carry: dict, moved: ParamDist, update: UpdateInfo) -> dict:
+    def refine(self, carry: dict, moved: ParamDist, update: UpdateInfo, knobs: Knobs) -> dict:
         """Takes an update of an accepted set, and decides whether the set is read again, in the narrower distribution.
 
-        That needs no further measured episode. It ends after `TunerConfig.refinements`, or where the distribution
-        hardly changed.
+        That needs no further measured episode. It ends after `TunerConfig.refinements`, where the distribution hardly
+        changed, or where the set does not fit the distribution that the update before had narrowed.
 
         Args:
           carry: from `decide`, or from the refinement before.
           moved: what the update made of the distribution.
           update: what it did.
+          knobs: for the level.
 
         Returns:
           What the loop carries on. All updates of the set count as one, in radii of the distribution that was tested.
         """
-        before, tested = carry["dist"], dists.ravel(carry["tested"].radius)
-        radius, known = dists.ravel(before.radius), carry["update"].identifiable | update.identifiable
+        dist, tested, before = carry["dist"], carry["tested"], carry["update"]
+        # The gate has just tested the distribution of the first reading.
+        again = carry["left"] < 1 + self.config.refinements
+        misfits = again & (update.p_value <= 1.0 - knobs.level)
+        unexplained = again & (update.p_misfit <= _UNEXPLAINED)
+        radius, unit = dists.ravel(dist.radius), dists.ravel(tested.radius)
         changed = (dists.ravel(moved.radius) < _CHANGED * radius) | (jnp.abs(update.step) > 1.0 - _CHANGED)
-        whole = (dists.ravel(moved.centre) - dists.ravel(carry["tested"].centre)) / tested
+        update = update.replace(
+            step=(dists.ravel(moved.centre) - dists.ravel(tested.centre)) / unit,
+            interval=update.interval * radius / unit,
+            identifiable=before.identifiable | update.identifiable,
+        )
+        # Taken back: what the reading before found remains, within the radius that it was found in.
+        back = before.replace(
+            interval=dists.ravel(carry["wider"]) / unit, p_value=update.p_value, p_misfit=update.p_misfit
+        )
+        nothing = no_update(tested).replace(p_value=update.p_value, p_misfit=update.p_misfit)
+        verdict = jnp.where(unexplained, Verdict.UNEXPLAINED, carry["verdict"])
         return carry | {
-            "left": jnp.where(changed.any(), carry["left"] - 1, 0),
-            "dist": moved,
-            "update": update.replace(step=whole, interval=update.interval * radius / tested, identifiable=known),
+            "left": jnp.where(changed.any() & ~misfits & ~unexplained, carry["left"] - 1, 0),
+            "dist": _choose(unexplained, tested, _choose(misfits, dist.replace(radius=carry["wider"]), moved)),
+            "wider": dist.radius,
+            "update": _choose(unexplained, nothing, _choose(misfits, back, update)),
+            "verdict": verdict,
+            "verdicts": carry["verdicts"].at[carry["calls"] - 1].set(verdict),
         }
 
     def collect(self, key: jax.Array, policy: Policy, dist: ParamDist) -> Collected:
@@ -375,21 +394,34 @@ class Tuner:
                 lambda leaf: leaf[self.config.episodes :].reshape(sets, each, *leaf.shape[1:]), trajectory
             ),
             held_out_coords=held_out_coords,
+            dist=dist,
         )
 
-    def _verdict(self, gate: GateInfo, dist: ParamDist, calls: jax.Array, stalled: jax.Array) -> jax.Array:
+    def _verdict(self, gate: GateInfo, dist: ParamDist, calls: jax.Array) -> jax.Array:
         """Chooses the verdict of one gate call; the first condition that holds wins.
 
-        `calls` counts earlier calls of this tuning. `stalled` counts calls in a row without progress, with this one.
+        `calls` counts earlier calls of this tuning.
         """
-        exhausted = dists.at_bounds(dist) | (calls >= self.config.max_widenings)
+        full = dists.at_bounds(dist)
         return jnp.select(
             [
                 ~(jnp.isfinite(gate.novelty) & jnp.isfinite(gate.threshold)),
+                ~jnp.asarray(gate.comparable),
                 gate.novelty <= gate.threshold,
-                stalled >= self.config.patience,
-                exhausted,
+                full & (gate.p_value <= _UNEXPLAINED),
+                full | (calls >= self.config.max_widenings),
             ],
-            [Verdict.NOT_FINITE, Verdict.ACCEPT, Verdict.UNEXPLAINED, Verdict.RADIUS_EXHAUSTED],
+            [
+                Verdict.NOT_FINITE,
+                Verdict.NOT_COMPARABLE,
+                Verdict.ACCEPT,
+                Verdict.UNEXPLAINED,
+                Verdict.RADIUS_EXHAUSTED,
+            ],
             Verdict.WIDEN,
         )
+
+
+def _choose(condition: jax.Array, one: Any, other: Any) -> Any:
+    """One of two pytrees of the same structure."""
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), one, other)

@@ -160,7 +160,7 @@ class ParamDist:
 class Verdict(enum.IntEnum):
     """What the gate concludes about a measured set.
 
-    `WIDEN` keeps the tuning going; the other four end it. Only `ACCEPT` is followed by an update. `Info.verdicts` holds
+    `WIDEN` keeps the tuning going; the others end it. Only `ACCEPT` is followed by an update. `Info.verdicts` holds
     the verdicts of one tuning in order, with -1 for gate calls that were not made.
     """
 
@@ -169,12 +169,14 @@ class Verdict(enum.IntEnum):
     WIDEN = 1
     """The simulated episodes do not cover the measured ones, but a wider distribution may."""
     UNEXPLAINED = 2
-    """The measured set is not covered, and widening brought it no closer. The model lacks physics: use discovery."""
+    """No parameters explain the measured set, at an error rate of 1 %. The model lacks physics: use discovery."""
     RADIUS_EXHAUSTED = 3
     """The measured set is not covered, and the distribution fills its bounds or was widened as often as allowed."""
     NOT_FINITE = 4
-    """No score could be computed: no episode held a whole window, a number was not finite, or no simulated observation
-    ever changed."""
+    """No score could be computed: a number was not finite, or no simulated observation ever changed."""
+    NOT_COMPARABLE = 5
+    """There is too little to compare: no measured episode holds a whole window or moves, all are copies of one, or too
+    few simulated sets have a window."""
 
 
 Scale = Literal[

@@ -24,7 +24,7 @@ DVM = DVMConfig(
     neighbours=5, reach=0.95,
 )  # fmt: skip
 TUNER = TunerConfig(
-    episodes=512, set_episodes=3, held_out_sets=39, max_widenings=4, patience=2, coverage=0.9, min_radius=0.05,
+    episodes=512, set_episodes=3, held_out_sets=39, max_widenings=4, coverage=0.9, min_radius=0.05,
     spm=SPM, dvm=DVM,
 )  # fmt: skip
 
@@ -38,7 +38,7 @@ TINY_DVM = DVMConfig(
     neighbours=3, reach=0.95,
 )  # fmt: skip
 TINY = TunerConfig(
-    episodes=8, set_episodes=2, held_out_sets=4, max_widenings=2, patience=2, coverage=0.9, min_radius=0.05,
+    episodes=8, set_episodes=2, held_out_sets=19, max_widenings=2, coverage=0.9, min_radius=0.05,
     spm=TINY_SPM, dvm=TINY_DVM,
 )  # fmt: skip
 
@@ -137,6 +137,7 @@ def collect(key: jax.Array, dist: ParamDist, config: TunerConfig = TUNER) -> Col
         sampled_coords=coords,
         held_out=jax.tree.map(lambda leaf: leaf.reshape(*shape, *leaf.shape[1:]), held_out),
         held_out_coords=truths,
+        dist=dist,
     )
 
 

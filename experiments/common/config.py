@@ -96,7 +96,7 @@ class Preset:
 _TINY = TunerConfig(
     episodes=24,
     set_episodes=2,
-    held_out_sets=5,
+    held_out_sets=19,
     max_widenings=1,
     spm=SPMConfig(train_steps=20, batch=16, hidden=(32, 32, 32), head=8),
     dvm=DVMConfig(train_steps=20, batch=16, channels=8, references=64),

@@ -84,6 +84,13 @@ class Tuning:
     """Novelty above which the gate rejects, at every call."""
     p_value: tuple[float | None, ...]
     """Conformal p-value at every call; None for a method without a gate."""
+    comparable: tuple[bool, ...]
+    """Whether there was enough to compare, at every call."""
+    cover: tuple[float | None, ...]
+    """The four excesses of `jaxtune.rules.calibrated_gate` at every call; the largest is the novelty."""
+    lost: tuple[float | None, ...]
+    misfit: tuple[float | None, ...]
+    beyond: tuple[float | None, ...]
     uncovered: tuple[float | None, ...]
     """Share of measured windows without a simulated neighbour, at every call."""
     elbo: tuple[float | None, ...]

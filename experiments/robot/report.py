@@ -14,10 +14,12 @@ from experiments.robot.rounds import Terms
 
 VERDICTS = {
     "accept": "The simulator covers what was measured.",
-    "unexplained": "The simulator does not cover what was measured, and a wider distribution brings it no closer: "
-    "physics is missing in the model.",
+    "unexplained": "No parameters of the simulator explain what was measured, at an error rate of 1 %: physics is "
+    "missing in the model.",
     "radius_exhausted": "The simulator does not cover what was measured, and its distribution cannot grow any wider.",
-    "not_finite": "Nothing could be compared: walks were shorter than a window of 50 steps, or a value is not finite.",
+    "not_finite": "Nothing could be compared: a value is not finite.",
+    "not_comparable": "There is too little to compare: walks, measured or simulated, were shorter than a window of 50 "
+    "steps, or the robot did not move.",
     None: "This method does not check whether the simulator covers what was measured.",
 }
 """What each verdict of the gate means; None stands for a method without a gate."""
@@ -28,8 +30,9 @@ ADVICE = {
     "on the log: it names what is missing.",
     "radius_exhausted": "Check the bounds of the parameters and the log. If both are right, suspend the robot and run "
     "experiments.discover.",
-    "not_finite": "Start from a policy that stands longer: one that was trained in a wider distribution (--method dr), "
-    "or with the robot held by a rope.",
+    "not_finite": "Look for the value that is not finite: experiments.doctor names its signal.",
+    "not_comparable": "Start from a policy that stands longer: one that was trained in a wider distribution "
+    "(--method dr), or with the robot held by a rope.",
     None: "Use --method ours if you want to know.",
 }
 """What to do next, by verdict."""

@@ -2,7 +2,8 @@
 
 import pytest
 
-from experiments.discovery.scores import page, score, tally, wilson, wrong
+from experiments.common.rates import wilson
+from experiments.discovery.scores import page, score, tally, wrong
 
 
 def named(name, family="joint_friction", places=("elbow",), others=(), low=0.4, high=0.6):

@@ -26,7 +26,7 @@ SIM = sled.simulator()
 SIZES = tuner.TunerConfig(
     episodes=30,
     set_episodes=2,
-    held_out_sets=7,
+    held_out_sets=19,
     max_widenings=1,
     refinements=0,
     spm=SPMConfig(hidden=(16, 16, 16), head=8, train_steps=3, batch=16),

@@ -8,8 +8,17 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from experiments.common.plots.base import COLOURS, save, spread
+from experiments.common.rates import wilson
+from jaxtune.selftest import SelfTest
 
-_MARKS = {"accept": "o", "widen": "^", "unexplained": "X", "radius_exhausted": "s", "not_finite": "x"}
+_MARKS = {
+    "accept": "o",
+    "widen": "^",
+    "unexplained": "X",
+    "radius_exhausted": "s",
+    "not_finite": "x",
+    "not_comparable": "P",
+}
 
 
 def training(path: Path, curve: Sequence[dict], control_s: float, shown: Mapping[str, Mapping[str, str]]) -> None:
@@ -74,6 +83,35 @@ def recovery(path: Path, results: Mapping[str, Sequence[dict]]) -> None:
         axis.grid(alpha=0.3)
         axis.legend(fontsize=7)
     axes[0, 0].set_ylabel("error after, log")
+    save(figure, path)
+
+
+def power(path: Path, reports: Mapping[int, SelfTest], level: float) -> None:
+    """Draws how often the gate rejects in every case of a self-test, with 95 % Wilson intervals.
+
+    Args:
+      path: of the PNG.
+      reports: by number of measured episodes.
+      level: nominal rate of false alarms.
+    """
+    first = next(iter(reports.values()))
+    names = ["inside the distribution", *(f"{name}, one radius outside" for name in first.outside), *first.others]
+    figure, axis = plt.subplots(figsize=(8.0, 1.2 + 0.3 * len(names) * len(reports) ** 0.5), layout="constrained")
+    for column, (episodes, report) in enumerate(reports.items()):
+        rates = [report.alarms, *report.outside.values(), *report.others.values()]
+        shares = np.array([rate.share for rate in rates])
+        ends = np.array([wilson(rate.hits, rate.of) for rate in rates]).T
+        place = np.arange(len(names)) + 0.25 * (column - 0.5 * (len(reports) - 1))
+        bars = np.maximum(np.abs(ends - shares), 0.0)
+        axis.errorbar(shares, place, xerr=bars, fmt="o", ms=4, color=f"C{column}", label=f"{episodes} episodes")
+    axis.axvline(level, color="grey", ls="--", lw=0.8, label=f"false alarms, nominal {level:g}")
+    axis.axhline(0.5, color="lightgrey", lw=0.8)
+    axis.axhline(len(first.outside) + 0.5, color="lightgrey", lw=0.8)
+    axis.set(xlabel="share of robots that the gate rejects", xlim=(-0.02, 1.02))
+    axis.set_yticks(range(len(names)), names, fontsize=8)
+    axis.invert_yaxis()
+    axis.grid(alpha=0.3, axis="x")
+    axis.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
     save(figure, path)
 
 

@@ -1,0 +1,212 @@
+"""Tells before a robot walks what a tuning would find: `python -m experiments.selftest --robot ... --out DIR`.
+
+Simulated robots of known parameters are measured in the robot's place. The table says, for every parameter, how exact
+its estimate is and how often the gate notices that it lies outside the simulated range; the same for effects that no
+tuned parameter expresses.
+"""
+
+import fnmatch
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import jax
+from rich.progress import Progress
+from rich.table import Table
+
+from experiments.common import checkpoint, plots
+from experiments.common.cli import bars, console, run
+from experiments.common.config import preset
+from experiments.common.rates import wilson
+from experiments.walking.cases import check_positive
+from experiments.walking.learner import Learner
+from experiments.walking.policies import default_policy, starting_policy
+from experiments.walking.robots import Kind, kind
+from jaxtune import selftest, tuner
+from jaxtune.mjx import Entry, parameters
+from jaxtune.selftest import Rate, SelfTest
+
+_OTHER = 0.75  # of a multiplier that is not tuned, or of the way from nominal to an offset's bound
+
+
+@dataclass(frozen=True, kw_only=True)
+class Args:
+    """Tests on simulated robots what the tuner would find: false alarms, power, errors and coverage."""
+
+    out: Path = Path("runs/selftest")
+    """Folder of the results: selftest.json and power.png."""
+    robot: str = "biteno"
+    """Robot: biteno, go2, playground:NAME, or path/to/file.py:function."""
+    policy: str | None = None
+    """Policy that walks: walk (biteno's, ships with the package), scratch (trained first), or a folder of
+    experiments.train."""
+    parameters: str | None = None
+    """Parameters that are tuned, as for experiments.sim2sim."""
+    radius: float = 0.2
+    """Radius (half width) of the distribution that is tested, in log space."""
+    episodes: tuple[int, ...] = ()
+    """Measured episodes in a set; several numbers are tested in turn, which shows what more walks would bring. If none,
+    as many as the preset has."""
+    robots: int = 20
+    """Simulated robots of every case and gate."""
+    gates: int = 2
+    """Gates, each with episodes and models of its own."""
+    whole: int = 0
+    """Robots of every case with which a whole tuning is run as well; each takes as long as a tuning does."""
+    others: tuple[str, ...] = ()
+    """Differences that the gate should notice, as name=value in physical values: torque_scale=0.75, or '*_mass=2' for
+    all tuned masses at once. Several names are joined by commas. If none, every parameter of the robot that is not
+    tuned, one at a time."""
+    level: float = 0.95
+    """Share of sets that the gate should let pass."""
+    preset: str = "cpu"
+    """Size of the run: smoke (to see that it works), cpu (two cores) or gpu (one GPU)."""
+    seed: int = 0
+    """Of everything random."""
+
+
+def other_cases(robot: Kind, tuned: Mapping[str, Entry], options: Sequence[str]) -> dict[str, dict[str, float]]:
+    """Reads the differences that the gate should notice.
+
+    Args:
+      robot: its whole table names what can differ.
+      tuned: the part of the table that is tuned.
+      options: as `Args.others`.
+
+    Returns:
+      Physical values by parameter, by the name of the case.
+
+    Raises:
+      ValueError: an option is not of the form, or names no parameter, or a value is out of bounds.
+    """
+    if not options:
+        fields = {(field, target) for entry in tuned.values() for field in entry.fields for target in entry.targets}
+        return {
+            f"{name}={_different(entry):g}": {name: _different(entry)}
+            for name, entry in robot.entries.items()
+            # One that changes what is tuned already is no other effect.
+            if name not in tuned and not fields & {(f, t) for f in entry.fields for t in entry.targets}
+        }
+    cases = {}
+    for option in options:
+        values = {}
+        for item in option.split(","):
+            pattern, _, number = item.partition("=")
+            try:
+                value = float(number)
+            except ValueError:
+                raise ValueError(f"others: got '{item}', expected name=value") from None
+            # A pattern stands for tuned parameters: tied ones would be changed twice.
+            names = [pattern] if pattern in robot.entries else fnmatch.filter(tuned, pattern)
+            if not names:
+                raise ValueError(f"others: got '{pattern}', expected some of {', '.join(robot.entries)}")
+            values |= dict.fromkeys(names, value)
+        parameters.check_values(robot.entries, values)
+        cases[option] = values
+    return cases
+
+
+def _different(entry: Entry) -> float:
+    low, high = entry.bounds
+    if entry.log:
+        return max(_OTHER, low)
+    return _OTHER * (high if abs(high) >= abs(low) else low)
+
+
+def check(args: Args) -> tuple[Kind, dict[str, Entry], dict[str, dict[str, float]], tuple[int, ...]]:
+    """Checks the arguments before anything is compiled.
+
+    Returns:
+      The robot, the table that is tuned, the other cases, and the numbers of measured episodes.
+
+    Raises:
+      ValueError: names the field, the value and what is allowed.
+    """
+    sizes, robot = preset(args.preset), kind(args.robot)
+    entries = robot.chosen(args.parameters)
+    check_positive(radius=args.radius, robots=args.robots, gates=args.gates)
+    if args.whole < 0:
+        raise ValueError(f"whole: got {args.whole}, expected 0 or more")
+    numbers = args.episodes or (sizes.tuner.set_episodes,)
+    for number in numbers:
+        check_positive(episodes=number)
+    tuner.knobs(level=args.level)
+    return robot, entries, other_cases(robot, entries, args.others), numbers
+
+
+def tested(args: Args, robot: Kind, entries, others, episodes: int, progress: Progress) -> SelfTest:
+    """Runs the self-test with sets of so many episodes."""
+    sizes = preset(args.preset)
+    sizes = replace(sizes, tuner=replace(sizes.tuner, set_episodes=episodes))
+    hidden = {name: robot.entries[name] for values in others.values() for name in values if name not in entries}
+    learner = Learner(sizes, entries, hidden, kind=robot)
+    policy = starting_policy(args.policy or default_policy(robot), learner, args.out)
+    dist = learner.dist(parameters.nominal(entries), args.radius)
+    machine = learner.tuner()
+    state = machine.init(policy, dist, tuner.knobs(level=args.level))
+    table = {**entries, **hidden}
+    coords = {
+        name: {one: float(value) for one, value in parameters.to_coords(table, values).items()}
+        for name, values in others.items()
+    }
+    task = progress.add_task(f"{episodes} episodes", total=None)
+    return selftest.run(
+        jax.random.PRNGKey(args.seed),
+        machine,
+        state,
+        robots=args.robots,
+        gates=args.gates,
+        whole=args.whole,
+        others=coords,
+        done=lambda number, total: progress.update(task, completed=number, total=total),
+    )
+
+
+def show(reports: Mapping[int, SelfTest]) -> None:
+    """Prints a table for each number of episodes."""
+    for episodes, report in reports.items():
+        table = Table(title=f"{episodes} episodes in a set")
+        for column in ("", "identifiable", "median error", "half interval", "rejected (95 % interval)"):
+            table.add_column(column)
+        table.add_row("inside the distribution", "", "", "", _rate(report.alarms))
+        for name, known in report.identified.items():
+            outside = _rate(report.outside[name]) if name in report.outside else "bounds leave no room"
+            numbers = (f"{value:.3f}" for value in (report.error[name], report.interval[name]))
+            table.add_row(f"{name}, one radius outside", f"{known.share:.2f}", *numbers, outside)
+        for name, rate in report.others.items():
+            table.add_row(name, "", "", "", _rate(rate))
+        console.print(table)
+        console.print(f"all true values in their intervals: {_rate(report.covered)}", markup=False)
+        for name, ends in report.tuned.items():
+            console.print(
+                f"whole tunings, {name}: {ends}, truth in the box after {_rate(report.held[name])}", markup=False
+            )
+
+
+def _rate(rate: Rate) -> str:
+    low, high = wilson(rate.hits, rate.of)
+    return f"{rate.share:.2f} ({low:.2f} to {high:.2f})"
+
+
+def main(args: Args) -> None:
+    """Runs the self-test, prints tables, and writes `selftest.json` and a plot."""
+    robot, entries, others, numbers = check(args)
+    args.out.mkdir(parents=True, exist_ok=True)
+    checkpoint.set_up_compiler(preset(args.preset).xla_flags)
+    begin = time.monotonic()
+    with bars() as progress:
+        reports = {number: tested(args, robot, entries, others, number, progress) for number in numbers}
+    show(reports)
+    result = {
+        "args": args,
+        "episodes": {str(number): report for number, report in reports.items()},
+        "seconds": time.monotonic() - begin,
+        "versions": checkpoint.versions(),
+    }
+    checkpoint.write_json(args.out / "selftest.json", result)
+    plots.power(args.out / "power.png", reports, 1.0 - args.level)
+
+
+if __name__ == "__main__":
+    run(main, Args)

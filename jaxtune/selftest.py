@@ -1,0 +1,224 @@
+"""The self-test: what would a tuning tell of this robot, walked by this policy for so many episodes?
+
+Before a robot walks, simulated robots of known parameters are measured in its place:
+
+    report = selftest.run(jax.random.key(0), machine, state, others={"torque": {"torque_scale": -0.29}})
+    print(selftest.summary(report))
+
+It counts how often the gate rejects robots that the distribution could have drawn (false alarms), robots that lie
+outside it by one radius in one coordinate, and robots of which something else is different (power); how far estimates
+are off, and how often the intervals of all coordinates hold together (coverage). A parameter whose power is low is one
+that this walk does not show: walk differently, or for more episodes.
+"""
+
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from types import MappingProxyType
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxtune import devices
+from jaxtune import dist as dists
+from jaxtune.tuner import Tuner, TunerState
+from jaxtune.types import Coords, ParamDist, Verdict
+
+INSIDE = "inside the distribution"
+"""Case of the robots that the distribution could have drawn."""
+_OFF = 2.0  # radii from the centre: one outside
+
+
+@dataclass(frozen=True)
+class Rate:
+    """So many of so many."""
+
+    hits: int
+    of: int
+
+    @property
+    def share(self) -> float:
+        """As a number from 0 to 1; nan of none."""
+        return self.hits / self.of if self.of else float("nan")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SelfTest:
+    """What was counted. Robots of one gate share its models, so they are no independent draws."""
+
+    level: float
+    """Share of sets that the gate should let pass."""
+    gates: int
+    """Gates, each with episodes and models of its own."""
+    alarms: Rate
+    """Robots inside the distribution that were rejected."""
+    outside: dict[str, Rate]
+    """Robots rejected that lie outside by one radius, by the coordinate in which they do. A coordinate whose bounds
+    leave no room for that is left out."""
+    others: dict[str, Rate]
+    """Robots rejected of which something else is different, by name."""
+    identified: dict[str, Rate]
+    """Robots inside of which the first update called the coordinate identifiable."""
+    error: dict[str, float]
+    """Median |estimate - truth| of the first update in coordinates, where identifiable; nan where never."""
+    interval: dict[str, float]
+    """Median half width of its interval, likewise."""
+    covered: Rate
+    """Robots inside whose identifiable coordinates all lie in their intervals."""
+    tuned: dict[str, dict[str, int]]
+    """How whole tunings ended: counts of verdicts by case; empty where none was run."""
+    held: dict[str, Rate]
+    """Accepted whole tunings after which all true coordinates lie in the distribution, by case."""
+
+
+def run(
+    key: jax.Array,
+    tuner: Tuner,
+    state: TunerState,
+    *,
+    robots: int = 20,
+    gates: int = 1,
+    whole: int = 0,
+    others: Mapping[str, Coords] = MappingProxyType({}),
+    done: Callable[[int, int], None] = lambda number, total: None,
+) -> SelfTest:
+    """Runs a self-test. Gate and update are called once for each measured set; nothing is trained but their models.
+
+    Args:
+      key: random key.
+      tuner: whose `simulate`, gate and update are tested.
+      state: whose policy walks, and whose distribution is tested.
+      robots: simulated robots of every case and gate.
+      gates: calls of the gate, each with new episodes and models. Models differ by chance, so rates need several.
+      whole: robots of every case with which a whole tuning is run as well, widenings and refinements included.
+      others: cases by name, of coordinates that replace those drawn. `tuner.simulate` must know them; a coordinate that
+        is not in the distribution is 0, that is nominal, in all other cases.
+      done: called after every gate and tuning with their number so far and in all.
+
+    Raises:
+      ValueError: fewer than two robots, or no gate.
+    """
+    if robots < 2 or gates < 1:
+        raise ValueError(f"robots, gates: got {robots} and {gates}, expected at least 2 and 1")
+    cases = {INSIDE: {}} | _outside(state.dist) | {f"other {name}": dict(coords) for name, coords in others.items()}
+    programs = (_scorer(tuner, robots), tuner.tune, tuner.collect, partial(_measured, tuner))
+    score, tune, collect, measure = (devices.on_all(jax.jit(program)) for program in programs)
+    extra = sorted({name for coords in others.values() for name in coords} - set(dists.names(state.dist)))
+    key_gates, key_whole = jax.random.split(key)
+    total = gates + whole * (1 + len(others))
+    rejected, errors, intervals, known = {name: [] for name in cases}, [], [], []
+    for gate in range(gates):
+        keys = jax.random.split(jax.random.fold_in(key_gates, gate), 4)
+        drawn = [
+            _draw(jax.random.fold_in(keys[0], number), state.dist, robots, replaced, extra)
+            for number, replaced in enumerate(cases.values())
+        ]
+        sets = measure(keys[1], state, jax.tree.map(lambda *rows: jnp.concatenate(rows), *drawn))
+        collected = collect(keys[2], state.policy, state.dist)
+        found, update = jax.device_get(score(keys[3], collected, sets, state))
+        for number, name in enumerate(cases):
+            rejected[name].extend(found[number * robots : (number + 1) * robots].tolist())
+        truth = np.asarray(dists.normalise(state.dist, {name: drawn[0][name] for name in state.dist.centre}))
+        known.append(update.identifiable)
+        errors.append(np.abs(update.step - truth))
+        intervals.append(update.interval)
+        done(gate + 1, total)
+    tuned, held = {}, {}
+    for number, name in enumerate([INSIDE, *(f"other {name}" for name in others)] if whole else []):
+        ends, inside = [], []
+        for robot in range(whole):
+            keys = jax.random.split(jax.random.fold_in(jax.random.fold_in(key_whole, number), robot), 3)
+            coords = _draw(keys[0], state.dist, 1, cases[name], extra)
+            measured = jax.tree.map(lambda leaf: leaf[0], measure(keys[1], state, coords))
+            after, info = tune(keys[2], state, measured)
+            ends.append(Verdict(int(info.verdicts[int(info.calls) - 1])).name.lower())
+            if ends[-1] == "accept":
+                low, high = (dists.ravel(end) for end in dists.box(after.dist))
+                truth = dists.ravel({one: coords[one][0] for one in state.dist.centre})
+                inside.append(bool(((low <= truth) & (truth <= high)).all()))
+            done(gates + number * whole + robot + 1, total)
+        short = name.removeprefix("other ")
+        tuned[short], held[short] = dict(Counter(ends)), Rate(sum(inside), len(inside))
+    known, errors, intervals = (np.concatenate(values) for values in (known, errors, intervals))
+    unit, order = np.asarray(dists.ravel(state.dist.radius)), dists.names(state.dist)
+    rate = {name: Rate(int(np.sum(values)), len(values)) for name, values in rejected.items()}
+    where = lambda values: np.where(known, values, np.nan)  # noqa: E731
+    median = lambda values: [  # noqa: E731
+        float(np.nanmedian(column)) if np.isfinite(column).any() else float("nan") for column in where(values * unit).T
+    ]
+    return SelfTest(
+        level=float(state.knobs.level),
+        gates=gates,
+        alarms=rate[INSIDE],
+        outside={name: rate[name] for name in _outside(state.dist)},
+        others={name: rate[f"other {name}"] for name in others},
+        identified={name: Rate(int(column.sum()), len(column)) for name, column in zip(order, known.T, strict=True)},
+        error=dict(zip(order, median(errors), strict=True)),
+        interval=dict(zip(order, median(intervals), strict=True)),
+        covered=Rate(int(((errors <= intervals) | ~known).all(axis=1).sum()), len(known)),
+        tuned=tuned,
+        held=held,
+    )
+
+
+def summary(report: SelfTest) -> str:
+    """Says in words what a self-test found: lines of text."""
+    percent = lambda rate: f"{100 * rate.share:.0f} % of {rate.of}"  # noqa: E731
+    lines = [
+        f"false alarms: {percent(report.alarms)} (nominal {100 * (1 - report.level):.0f} %)",
+        f"all true values in their intervals: {percent(report.covered)}",
+    ]
+    for name, rate in report.outside.items():
+        found = report.identified[name]
+        told = f"estimated to {report.error[name]:.3f}" if found.share > 0.5 else "not identifiable"
+        lines.append(f"{name}: {told}; rejected one radius outside: {percent(rate)}")
+    lines += [f"{name}: rejected: {percent(rate)}" for name, rate in report.others.items()]
+    lines += [
+        f"whole tunings, {name}: " + ", ".join(f"{count} {verdict}" for verdict, count in sorted(ends.items()))
+        for name, ends in report.tuned.items()
+    ]
+    return "\n".join(lines)
+
+
+def _outside(dist: ParamDist) -> dict[str, dict[str, np.ndarray]]:
+    """Cases of robots one radius outside, by coordinate: the values that take turns."""
+    cases = {}
+    for name in dists.names(dist):
+        centre, radius = float(dist.centre[name]), float(dist.radius[name])
+        ends = np.array([centre - _OFF * radius, centre + _OFF * radius])
+        ends = ends[(ends >= float(dist.lower[name])) & (ends <= float(dist.upper[name]))]
+        if ends.size:
+            cases[name] = {name: ends}
+    return cases
+
+
+def _draw(key: jax.Array, dist: ParamDist, count: int, replaced: Mapping, extra: list[str]) -> dict[str, jax.Array]:
+    """Coordinates of the robots of a case, [count] by name."""
+    coords = dists.sample(key, dist, count) | {name: jnp.zeros(count) for name in extra}
+    for name, values in replaced.items():
+        coords[name] = jnp.resize(jnp.asarray(values, jnp.float32), count)
+    return coords
+
+
+def _measured(tuner: Tuner, key: jax.Array, state: TunerState, coords: Coords):
+    """A measured set of every robot, [robots, set_episodes, time]."""
+    each = tuner.config.set_episodes
+    episodes = tuner.simulate(key, state.policy, {name: jnp.repeat(value, each) for name, value in coords.items()})
+    return jax.tree.map(lambda leaf: leaf.reshape(-1, each, *leaf.shape[1:]), episodes)
+
+
+def _scorer(tuner: Tuner, robots: int) -> Callable:
+    """Makes the function that calls gate and update for many sets; their models are trained once for all."""
+
+    def score(key, collected, sets, state):
+        key_verify, key_update = jax.random.split(key)
+        gate = jax.vmap(lambda one: tuner.verify(key_verify, tuner.config, collected, one, state.knobs))(sets)
+        inside = jax.tree.map(lambda leaf: leaf[:robots], sets)
+        update = jax.vmap(
+            lambda one: tuner.update(key_update, tuner.config, collected, one, state.dist, state.knobs)[1]
+        )(inside)
+        return (gate.novelty > gate.threshold) & gate.comparable, update
+
+    return score
