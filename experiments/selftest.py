@@ -9,6 +9,7 @@ import fnmatch
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from math import isnan
 from pathlib import Path
 
 import jax
@@ -167,12 +168,13 @@ def show(reports: Mapping[int, SelfTest]) -> None:
     """Prints a table for each number of episodes."""
     for episodes, report in reports.items():
         table = Table(title=f"{episodes} episodes in a set")
-        for column in ("", "identifiable", "median error", "half interval", "rejected (95 % interval)"):
+        table.add_column("", no_wrap=True)
+        for column in ("identifiable", "median error", "half interval", "rejected (95 % interval)"):
             table.add_column(column)
         table.add_row("inside the distribution", "", "", "", _rate(report.alarms))
         for name, known in report.identified.items():
             outside = _rate(report.outside[name]) if name in report.outside else "bounds leave no room"
-            numbers = (f"{value:.3f}" for value in (report.error[name], report.interval[name]))
+            numbers = ("-" if isnan(value) else f"{value:.3f}" for value in (report.error[name], report.interval[name]))
             table.add_row(f"{name}, one radius outside", f"{known.share:.2f}", *numbers, outside)
         for name, rate in report.others.items():
             table.add_row(name, "", "", "", _rate(rate))

@@ -75,7 +75,7 @@ class Args:
     steps)."""
     step_size: float = 0.5
     """Step of the paper's update, in radii per unit of vote; for spm, and for ours with --update vote."""
-    widen_factor: float = 1.5
+    widen_factor: float = 2.0
     """The radius is multiplied by this every time the gate rejects."""
     level: float = 0.95
     """Quantile of the novelty of held-out simulated sets that is the gate's threshold; 1 - level is the rate of false

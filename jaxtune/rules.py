@@ -98,7 +98,7 @@ class Knobs:
 
 
 def knobs(
-    *, step_size: float = 0.5, widen_factor: float = 1.5, level: float = 0.95, threshold: float | None = None
+    *, step_size: float = 0.5, widen_factor: float = 2.0, level: float = 0.95, threshold: float | None = None
 ) -> Knobs:
     """Makes knobs from plain numbers, and checks them.
 
@@ -363,7 +363,7 @@ def posterior_update(
 
     The intervals hold together: all truths at once lie in them with probability `coverage`, if the measured set is a
     draw like the held-out ones. A coordinate that is not identifiable keeps centre and radius. Where the interval of
-    one that is reaches past the box, all keep their radii, and centres move.
+    one that is reaches past the box, and not merely past a bound, all keep their radii, and centres move.
 
     Args:
       key: not used.
@@ -391,7 +391,11 @@ def posterior_update(
     narrowed = jnp.clip(radius * interval, jnp.minimum(config.min_radius, radius), radius)
     # Held-out truths all lie in the box, so their errors say nothing of truths beyond it. One that is outside in one
     # coordinate may bend the estimates of all, and narrowing could exclude it for good.
-    inside = (((step - interval >= low) & (step + interval <= high)) | ~identifiable).all()
+    # No truth lies beyond a physical bound.
+    ends = (dists.normalise(dist, end) for end in (dist.lower, dist.upper))
+    below, above = (jnp.isclose(*pair, atol=1e-4) for pair in zip((low, high), ends, strict=True))
+    inside = ((step - interval >= low) | below) & ((step + interval <= high) | above)
+    inside = (inside | ~identifiable).all()
     radius = jnp.where(identifiable & inside, narrowed, radius)
     moved = moved.replace(radius=dists.unravel(dists.names(dist), radius))
     excess = {name: _excess(name, values) for name, values in found.items()}

@@ -40,7 +40,7 @@ def tuning(info: Info) -> dict:
 
     Returns:
       `verdicts`, `radius` and the gate's numbers as lists over its calls; the update's `step` and `interval` by
-      parameter, in radii, and whether the parameter was `identifiable`; the number of falls and of episodes with
+      parameter, in radii, and whether the parameter was `identifiable`; the p-values of its fit; the number of falls and of episodes with
       values that are not finite; and means of the training metrics.
     """
     calls = int(info.calls)
@@ -57,6 +57,8 @@ def tuning(info: Info) -> dict:
         **gate,
         **update,
         "update_loss": float(info.update.loss),
+        "fit_p_value": float(info.update.p_value),
+        "misfit_p_value": float(info.update.p_misfit),
         "measured_falls": int(info.measured_falls),
         "not_finite": int(info.not_finite),
         "training": {name: float(np.mean(value)) for name, value in info.train.items()},

@@ -103,6 +103,10 @@ class Tuning:
     """Whether the log narrows a parameter down."""
     update_loss: float | None
     """How badly the update's model fits (`jaxtune.rules.UpdateInfo.loss`)."""
+    fit_p_value: float | None
+    """Conformal p-value of misfit and reach in the distribution that was read last."""
+    misfit_p_value: float | None
+    """That of misfit alone; at most 0.01 where the verdict is `unexplained`."""
     measured_falls: int
     """Number of falls in the part of the walks that was compared."""
     not_finite: int

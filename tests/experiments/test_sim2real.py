@@ -120,7 +120,16 @@ def line(verdicts, measured, predicted, explained=0.5, cut_short=0, suspected=()
     calls["novelty"] = [None if verdict == "not_finite" else 0.3 for verdict in verdicts]
     calls["elbo"] = [-30.0] * len(verdicts)
     known = {"trunk_mass": True, "foot_friction": False}
-    by_name = {"step": {}, "interval": {}, "training": {}, "update_loss": 0.1, "measured_falls": 0, "not_finite": 0}
+    by_name = {
+        "step": {},
+        "interval": {},
+        "training": {},
+        "update_loss": 0.1,
+        "fit_p_value": 0.4,
+        "misfit_p_value": 0.5,
+        "measured_falls": 0,
+        "not_finite": 0,
+    }
     walks = {
         "fall_rate": measured,
         "episodes": 5,

@@ -100,7 +100,7 @@ def play():
     def run(*novelties, bound=1.2, p_value=0.0, lacking=0.0, **ends):
         score = blank.score.at[0, : len(novelties)].set(jnp.array(novelties))
         measured = blank.replace(score=score.at[1, :2].set(jnp.array([p_value, lacking])), **ends)
-        start = tuner.init(toys.policy(), toys.uniform(TWO, FIRST_RADIUS, bound), knobs())
+        start = tuner.init(toys.policy(), toys.uniform(TWO, FIRST_RADIUS, bound), knobs(widen_factor=1.5))
         state, info = tune(jax.random.key(1), start, measured)
         return start, state, info
 

@@ -1,0 +1,70 @@
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+import toys
+
+from jaxtune import selftest
+from jaxtune.selftest import INSIDE, Rate
+from jaxtune.tuner import Tuner, keep, knobs
+
+THREE = {"colour": 0.0, "friction": 0.0, "mass": 0.0}  # colour enters no equation of the slider
+CONFIG = dataclasses.replace(toys.TUNER, episodes=256, dvm=dataclasses.replace(toys.DVM, train_steps=60))
+
+
+def machine(config=CONFIG):
+    tuner = Tuner(config=config, train_policy=keep, simulate=toys.Slider().simulate)
+    return tuner, tuner.init(toys.policy(), toys.uniform(THREE, 0.2), knobs())
+
+
+@pytest.fixture(scope="module")
+def report():
+    tuner, state = machine()
+    others = {"push": {"wind": 0.6}, "heavy": {"mass": 0.9}}
+    calls = []
+    found = selftest.run(
+        jax.random.key(0), tuner, state, robots=12, gates=2, whole=2, others=others, done=lambda *now: calls.append(now)
+    )
+    assert calls == [(number, 8) for number in range(1, 9)]
+    return found
+
+
+def test_robots_inside_pass_and_robots_outside_do_not(report):
+    assert report.alarms.of == 24
+    assert report.alarms.share < 0.2
+    for name in ("friction", "mass"):
+        assert report.outside[name].share > 0.7
+        assert report.identified[name] == Rate(24, 24)
+        assert report.error[name] < report.interval[name] < 0.2
+    for rate in report.others.values():
+        assert rate.share > 0.9
+    assert report.covered.share > 0.7
+
+
+def test_what_the_robot_does_not_show_is_said(report):
+    assert report.identified["colour"].share < 0.3
+    assert report.outside["colour"].share < 0.3
+    assert "colour: not identifiable" in selftest.summary(report)
+
+
+def test_whole_tunings_say_how_they_end(report):
+    assert sum(report.tuned[INSIDE].values()) == 2
+    assert report.tuned[INSIDE] == {"accept": 2}
+    # A mass beyond the first box is found by widening; no parameter stands in for a push.
+    assert report.tuned["heavy"] == {"accept": 2}
+    assert report.held["heavy"].of == 2
+    assert "accept" not in report.tuned["push"]
+
+
+def test_a_bound_that_leaves_no_room_outside_is_left_out():
+    cases = selftest._outside(toys.uniform({"friction": 0.1, "mass": 0.0}, 0.2, 0.45))
+    np.testing.assert_allclose(cases["mass"]["mass"], [-0.4, 0.4], rtol=1e-6)
+    np.testing.assert_allclose(cases["friction"]["friction"], [-0.3], rtol=1e-6)
+    assert selftest._outside(toys.uniform({"mass": 0.0}, 0.2, 0.3)) == {}
+
+
+@pytest.mark.parametrize(("robots", "gates"), [(1, 1), (2, 0)])
+def test_a_test_of_nothing_is_refused(robots, gates):
+    with pytest.raises(ValueError, match=f"robots, gates: got {robots} and {gates}, expected at least 2 and 1"):
+        selftest.run(jax.random.key(0), *machine(), robots=robots, gates=gates)
