@@ -1,4 +1,4 @@
-"""Measures speeds, and how often the gate rejects: `python -m experiments.bench speed`, or another of `Args.what`.
+"""Measures speeds: `python -m experiments.bench speed`, or another of `Args.what`.
 
 Speeds depend on the machine and on what else it does, so compare only ratios within one run. No test asserts them.
 """
@@ -32,33 +32,24 @@ from experiments.walking.learner import Learner
 from experiments.walking.policies import starting_policy
 from experiments.walking.robots import BITENO
 from experiments.walking.targets import TARGETS
-from jaxtune import dist as dists
 from jaxtune import tuner
 from jaxtune.mjx import parameters
 
-FIELDS = ("novelty", "threshold", "p_value")
-"""Numbers of a gate call that `alarm` keeps."""
-
 _SIDE_BY_SIDE, _STEPS = 64, 200  # robots and steps of `rig`
 _LINE_SEARCHES = 6  # of MJX's solver, the fewest with which dry friction comes out right
-
-_HEADINGS = {"rings": "rejects"}  # of the table; the key in JSON stays
 
 
 @dataclass(frozen=True, kw_only=True)
 class Args:
     """Measures one thing, prints it as a table and writes it as JSON."""
 
-    what: tyro.conf.Positional[
-        Literal["speed", "devices", "profile", "estimates", "targets", "rig", "logs", "alarm", "tuner"]
-    ]
+    what: tyro.conf.Positional[Literal["speed", "devices", "profile", "estimates", "targets", "rig", "logs", "tuner"]]
     """speed: training steps per second, with exact and fast physics. devices: steps per second of episodes and of
     training on one device, two, four and so on. profile: where the time of a tuning goes. estimates: errors of the
     regression and of the search-parameter model on the same episodes. targets: simulation steps per second of every
     engine that is installed. rig: simulation steps per second of suspended robots, with the step of MJX
-    and with that of discovery. logs: seconds to read ten minutes of 40 columns at 1 kHz. alarm: how often the gate
-    rejects in its first call, over many seeds. tuner: seconds to compile and to run a tuning, and four runs side by
-    side, of the CheetahRun of MuJoCo Playground."""
+    and with that of discovery. logs: seconds to read ten minutes of 40 columns at 1 kHz. tuner: seconds to
+    compile and to run a tuning, and four runs side by side, of the CheetahRun of MuJoCo Playground."""
     out: Path = Path("runs/bench")
     """Folder of the results, a JSON file for each measurement."""
     preset: str = "cpu"
@@ -66,9 +57,9 @@ class Args:
     policy: str = "walk"
     """Policy that walks: walk (ships with the package), or a folder of experiments.train."""
     seeds: int = 10
-    """Number of gate calls for each target of alarm, and of tunings of estimates, with a random seed each."""
+    """Number of tunings of estimates, with a random seed each."""
     radius: float = 0.2
-    """Radius (half width) of the distribution in alarm and estimates, in log space: 0.2 spans 0.82 to 1.22."""
+    """Radius (half width) of the distribution in estimates, in log space: 0.2 spans 0.82 to 1.22."""
 
 
 def speed(args: Args) -> dict:
@@ -194,59 +185,6 @@ def logs(args: Args) -> dict:
     return found
 
 
-def alarm(args: Args) -> dict:
-    """Counts how often the first call of the gate rejects, over many seeds.
-
-    Two targets lie outside the distribution, where the gate should reject: the share of rejections is its power. Two
-    lie inside, at the centre and at a random place: there the share is the rate of false alarms.
-
-    Returns:
-      By target: the number of rejections `rings`, `of` how many calls, and the gate's numbers in every call.
-    """
-    sizes = preset(args.preset)
-    learner = Learner(sizes, BITENO.chosen("legs6"))
-    policy = starting_policy(args.policy, learner)
-    dist = learner.dist(parameters.nominal(learner.entries), args.radius)
-    machine = learner.tuner(None)
-
-    def masses(multiplier: float) -> dict:
-        truth = {name: multiplier if name.endswith("_mass") else 1.0 for name in learner.entries}
-        return parameters.to_coords(learner.entries, truth)
-
-    # A target with 1 / start times the nominal masses, as in `experiments.walking.cases`.
-    fixed = {"masses, start 0.5X": 2.0, "masses, start 1.5X": 2.0 / 3.0, "centre of the radius": 1.0}
-    names = [*fixed, "drawn within the radius"]
-
-    @jax.jit
-    def call(key):
-        key_collect, key_verify, key_measure, key_draw = jax.random.split(key, 4)
-        drawn = jax.tree.map(lambda x: x[0], dists.sample(key_draw, dist, 1))
-        targets = jax.tree.map(lambda *x: jnp.stack(x), *map(masses, fixed.values()), drawn)
-        each = sizes.tuner.set_episodes
-        measured = learner.simulate(key_measure, policy, jax.tree.map(lambda x: jnp.repeat(x, each), targets))
-        sets = jax.tree.map(lambda x: x.reshape(-1, each, *x.shape[1:]), measured)
-        collected = machine.collect(key_collect, policy, dist)
-        # The verification model is trained once, since only the score depends on the measured set.
-        gate = jax.vmap(lambda one: tuner.calibrated_gate(key_verify, sizes.tuner, collected, one, tuner.knobs()))
-        return gate(sets)
-
-    calls = []
-    for seed in range(args.seeds):
-        calls.append(jax.device_get(call(jax.random.PRNGKey(seed))))
-        console.print(
-            f"seed {seed}: " + ", ".join(f"p {p:.3f} {name}" for p, name in zip(calls[-1].p_value, names, strict=True))
-        )
-    novelty, threshold, p_value = (np.stack([gate[field] for gate in calls], -1) for field in FIELDS)
-    return {
-        name: {
-            "rings": int((novelty[row] > threshold[row]).sum()),
-            "of": args.seeds,
-            **{field: values[row] for field, values in zip(FIELDS, (novelty, threshold, p_value), strict=True)},
-        }
-        for row, name in enumerate(names)
-    }
-
-
 def tuner_programs(args: Args) -> dict:
     """Measures compiling and running of `Tuner.tune`, and of `Tuner.run` vmapped over four seeds.
 
@@ -297,7 +235,6 @@ MEASURES = {
     "targets": targets,
     "rig": rig,
     "logs": logs,
-    "alarm": alarm,
     "tuner": tuner_programs,
 }
 
@@ -312,7 +249,7 @@ def main(args: Args) -> None:
     rows = MEASURES[args.what](args)
     table = Table(title=args.what)
     for column in ("", *next(iter(rows.values()))):
-        table.add_column(_HEADINGS.get(column, column))
+        table.add_column(column)
     for name, row in rows.items():
         table.add_row(name, *(np.array2string(np.asarray(value), precision=2) for value in row.values()))
     console.print(table)

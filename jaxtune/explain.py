@@ -25,6 +25,7 @@ ADVICE = {
 """What to do next."""
 
 
+_MISFIT = 0.05  # largest p-value that is worth a word
 _EXCESS = {
     "cover": "shapes that the verification model does not know",
     "lost": "how long the robot stays up",
@@ -53,6 +54,9 @@ def explain(info) -> str:
         most = max((what for what in excess if np.isfinite(excess[what])), key=excess.__getitem__)
         lines.append(f"  most unlike the simulated sets: {most} ({excess[most]:.1f}; 1 is usual for one set in ten)")
     if verdict == Verdict.ACCEPT:
+        fit = float(info.update.p_value)
+        if fit <= _MISFIT:
+            lines.append(f"  fits badly in a narrower distribution (p {fit:.2f}), so the radius stays wide")
         moved = dists.move(info.dist, info.update.step).centre
         interval = np.asarray(dists.ravel(info.dist.radius) * info.update.interval)
         for column, name in enumerate(dists.names(info.dist)):

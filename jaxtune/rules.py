@@ -28,7 +28,7 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from jaxtune import devices, dvm, regression, spm, surface
+from jaxtune import devices, dvm, regression, spm, surface, windows
 from jaxtune import dist as dists
 from jaxtune.dvm import DVMConfig
 from jaxtune.regression import RegressionConfig
@@ -275,16 +275,44 @@ def _examined(
     scale = jnp.maximum(model.error, _LEAST_ERROR)
 
     def one(model, ways, scale, episodes):
-        answer, moments, windows = regression.answers(config.regression, model, episodes)
+        answer, moments, count = regression.answers(config.regression, model, episodes)
         off = surface.misfit(ways, moments, jnp.clip(answer, model.low, model.high))
         beyond = (jnp.maximum(model.low - answer, answer - model.high) / scale).max()
-        known = windows > 0
+        known = count > 0
         return answer, jnp.where(known, jnp.log(jnp.maximum(off, 1e-9)), jnp.nan), jnp.where(known, beyond, jnp.nan)
 
     held_out = devices.in_chunks(one, (collected.held_out,), SETS, shared=(model, ways, scale))
     every = jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), held_out, one(model, ways, scale, measured))
     answers, misfit, beyond = every
     return model, answers, {"misfit": misfit, "beyond": beyond}
+
+
+def misfits(config: TunerConfig, collected: Collected, measured: Trajectory) -> jax.Array:
+    """Says which observations and actions no coordinates explain.
+
+    Args:
+      config: sizes.
+      collected: D_q and held-out sets of one distribution.
+      measured: the measured set, [set_episodes, time].
+
+    Returns:
+      [obs + act] for every channel the rms of what the response surface leaves of the moments that involve it, as a
+      multiple of the median over the held-out sets: 1 is usual.
+    """
+    model = regression.train(config.regression, collected.trajectory, collected.sampled_coords, collected.dist)
+    ways = surface.train(model)
+    involved = windows.involved(measured.obs.shape[-1] + measured.action.shape[-1]) * model.varies
+    scatter = jnp.sqrt(jnp.mean(ways.residual**2, axis=0))
+    weight = jnp.where(model.varies > 0, 1.0 / jnp.maximum(scatter, _LEAST_ERROR), 0.0)
+
+    def one(model, ways, involved, weight, episodes):
+        answer, moments, _ = regression.answers(config.regression, model, episodes)
+        rest = weight * surface.unexplained(ways, moments, jnp.clip(answer, model.low, model.high))
+        return jnp.sqrt(involved @ rest**2 / jnp.maximum(involved.sum(axis=1), 1.0))
+
+    shared = model, ways, involved, weight
+    usual = jnp.median(devices.in_chunks(one, (collected.held_out,), SETS, shared=shared), axis=0)
+    return one(*shared, measured) / jnp.maximum(usual, _LEAST_ERROR)
 
 
 def _excess(name: str, values: jax.Array) -> jax.Array:

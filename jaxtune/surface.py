@@ -57,10 +57,17 @@ def misfit(surface: Surface, moments: Float[Array, " moments"], coords: Float[Ar
       moments: of the set, as `regression.answers` returns them.
       coords: in radii, such as the set's estimate.
     """
-    rest = moments - (_terms(coords[None], len(surface.residual)) @ surface.coefficients)[0]
+    rest = unexplained(surface, moments, coords)
     # (R'R / n + lambda I)^-1 by the matrix inversion lemma: R has fewer rows than columns.
     along = surface.residual @ rest
     return (rest @ rest - along @ surface.inverse @ along) / surface.penalty
+
+
+def unexplained(
+    surface: Surface, moments: Float[Array, " moments"], coords: Float[Array, " coords"]
+) -> Float[Array, " moments"]:
+    """Subtracts from a set's moments what robots of these coordinates show; arguments are those of `misfit`."""
+    return moments - (_terms(coords[None], len(surface.residual)) @ surface.coefficients)[0]
 
 
 def _terms(coords: Float[Array, "n coords"], episodes: int) -> Float[Array, "n terms"]:

@@ -89,6 +89,7 @@ from jaxtune.rules import (
     Verify,
     calibrated_gate,
     knobs,
+    misfits,
     no_gate_log,
     no_update,
     posterior_update,
@@ -396,6 +397,16 @@ class Tuner:
             held_out_coords=held_out_coords,
             dist=dist,
         )
+
+    def misfits(self, key: jax.Array, state: TunerState, measured: Trajectory) -> jax.Array:
+        """Says which observations and actions no parameters explain (`rules.misfits`), after a set was rejected.
+
+        It simulates anew, in the state's distribution.
+
+        Returns:
+          [obs + act] multiples of what is usual.
+        """
+        return misfits(self.config, self.collect(key, state.policy, state.dist), measured)
 
     def _verdict(self, gate: GateInfo, dist: ParamDist, calls: jax.Array) -> jax.Array:
         """Chooses the verdict of one gate call; the first condition that holds wins.

@@ -143,6 +143,14 @@ def moments(window: Float[Array, "batch time channels"]) -> Float[Array, "batch 
     return jnp.concatenate([mean, step.std(axis=1), jnp.diff(step, axis=1).std(axis=1), at_once, ahead], axis=-1)
 
 
+def involved(channels: int) -> Float[Array, "channels moments"]:
+    """Marks with 1 which moments involve a channel, in the order of `moments`; a covariance involves two."""
+    one = jnp.eye(channels)
+    first, second = jnp.triu_indices(channels)
+    ahead = jnp.maximum(one[:, :, None], one[:, None, :]).reshape(channels, -1)
+    return jnp.concatenate([one, one, one, jnp.maximum(one[:, first], one[:, second]), ahead], axis=1)
+
+
 def square_distances(a: Float[Array, "n moments"], b: Float[Array, "m moments"]) -> Float[Array, "n m"]:
     """Computes all squared distances, from |a|^2 + |b|^2 - 2 a b, which needs no array [n, m, moments]."""
     square = jnp.sum(a**2, axis=-1)[:, None] + jnp.sum(b**2, axis=-1) - 2.0 * a @ b.T

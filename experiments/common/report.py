@@ -40,8 +40,8 @@ def tuning(info: Info) -> dict:
 
     Returns:
       `verdicts`, `radius` and the gate's numbers as lists over its calls; the update's `step` and `interval` by
-      parameter, in radii, and whether the parameter was `identifiable`; the p-values of its fit; the number of falls and of episodes with
-      values that are not finite; and means of the training metrics.
+      parameter, in radii, and whether the parameter was `identifiable`; the p-values of the update's fit; the number of
+      falls and of episodes with values that are not finite; and means of the training metrics.
     """
     calls = int(info.calls)
     order = dists.names(info.dist)

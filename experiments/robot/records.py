@@ -117,6 +117,8 @@ class Tuning:
     """Every parameter before and after."""
     compared_s: float
     """How many seconds of every walk were compared, from its start."""
+    misfits: dict[str, float]
+    """Signals that no parameters explain, the worst first, as multiples of what is usual; none after `accept`."""
     explained: Prediction
     """Prediction for the policy that walked, in the tuned simulator; it should agree with the measurement."""
 

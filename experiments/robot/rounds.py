@@ -37,6 +37,7 @@ from experiments.walking.learner import Learner, Policy
 from experiments.walking.policies import policy_config
 from jaxtune import baselines, devices, tuner
 from jaxtune.tuner import Tuner, TunerState
+from jaxtune.types import Trajectory, Verdict
 
 
 @dataclass(frozen=True)
@@ -59,6 +60,7 @@ STRATEGIES = {
 }
 """Strategies by the name that `--method` takes."""
 
+_WORST = 5  # signals that are listed where no parameters explain a log
 _KEYS = 7  # keeps the random keys of rounds different from others that begin with the same seed
 
 
@@ -78,6 +80,7 @@ class Programs:
         self.train = devices.on_all(jax.jit(learner.tuner().train))
         self.predict = devices.on_all(jax.jit(learner.predict, static_argnums=(3, 4)))
         self.actions = jax.jit(learner.actions)
+        self.misfits = devices.on_all(jax.jit(learner.tuner().misfits))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -167,7 +170,8 @@ class Rounds:
         return self._out / f"round_{index:03d}"
 
     def _key(self, index: int, use: int) -> jax.Array:
-        # `use` is 0 for the prediction, 1 for tuning, 2 for training, 3 for the prediction in the tuned simulator.
+        # `use` is 0 for the prediction, 1 for tuning, 2 for training, 3 for the prediction in the tuned simulator,
+        # 4 for what misfits there.
         key = jax.random.fold_in(jax.random.PRNGKey(self._terms.seed), _KEYS)
         return jax.random.fold_in(jax.random.fold_in(key, index), use)
 
@@ -244,9 +248,19 @@ class Rounds:
             moved={name: Moved(**ends) for name, ends in moved.items()},
             compared_s=preset.episode_steps * self._kind.control_s,
             explained=self._predict(self._key(index, 3), tuned),
+            misfits=self._misfits(index, repeating.replace(dist=tuned.dist), start.trajectory, info),
         )
         # Written last, because a round with this file counts as learnt.
         write_json(place / "tuning.json", tuning)
+
+    def _misfits(self, index: int, state: TunerState, measured: Trajectory, info: tuner.Info) -> dict[str, float]:
+        """The signals that no parameters explain, the worst first; none after a set that was accepted."""
+        if info.calls == 0 or info.verdicts[int(info.calls) - 1] == Verdict.ACCEPT:
+            return {}
+        found = self._programs.misfits(self._key(index, 4), state, measured)
+        names = self._learner.channels()
+        order = sorted(range(len(names)), key=lambda channel: -float(found[channel]))
+        return {names[channel]: float(found[channel]) for channel in order[:_WORST]}
 
 
 def _read(kind: type, path: Path):

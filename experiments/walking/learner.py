@@ -244,6 +244,12 @@ class Learner:
             measure=target and (lambda key, policy: target.episodes(key, self.act(policy), count, steps)),
         )
 
+    def channels(self) -> list[str]:
+        """Names every observation and action, in the order of a window's channels."""
+        meta = self.kind.meta(self.preset, self.robot)
+        parts = [(part["name"], part["size"]) for part in meta["observation"]] + [("action", self.robot.action_size)]
+        return [name if size == 1 else f"{name}[{column}]" for name, size in parts for column in range(size)]
+
     def step(self, machine: Tuner | Untuned, play: Callable[..., Trajectory]) -> Callable:
         """Makes a tuner's step out of parts that are compiled separately.
 

@@ -110,20 +110,24 @@ def test_a_log_that_never_rests_is_refused(tmp_path, monkeypatch):
     assert len(looks) == 66
 
 
+EXCESSES = ("cover", "lost", "misfit", "beyond")
+
+
 def line(verdicts, measured, predicted, explained=0.5, cut_short=0, suspected=()):
     """A round as `summary.json` has it, read back."""
     numbers = {"return": 4.0, "power_w": 12.0}
     moved = {"trunk_mass": {"before": 0.5, "after": 0.9, "low": 0.8, "high": 1.0}}
     moved["foot_friction"] = {"before": 1.0, "after": 1.0, "low": None, "high": None}
-    calls = {name: [0.3] * len(verdicts) for name in ("radius", "threshold", "p_value", "uncovered")}
+    calls = {name: [0.3] * len(verdicts) for name in ("radius", "threshold", "p_value", "uncovered", *EXCESSES)}
     # What could not be computed is null.
     calls["novelty"] = [None if verdict == "not_finite" else 0.3 for verdict in verdicts]
-    calls["elbo"] = [-30.0] * len(verdicts)
+    calls |= {"elbo": [-30.0] * len(verdicts), "comparable": [True] * len(verdicts)}
     known = {"trunk_mass": True, "foot_friction": False}
     by_name = {
         "step": {},
         "interval": {},
         "training": {},
+        "misfits": {} if verdicts and verdicts[-1] == "accept" else {"gyro[1]": 4.2},
         "update_loss": 0.1,
         "fit_p_value": 0.4,
         "misfit_p_value": 0.5,
@@ -179,7 +183,7 @@ def test_records_are_read_back_as_they_were_written():
 
 def test_what_simulation_does_not_cover_is_expected_again():
     assert falls(["widen", "accept"], 0.6, 0.1) == 0.1
-    for verdict in ("unexplained", "radius_exhausted", "not_finite"):
+    for verdict in ("unexplained", "radius_exhausted", "not_finite", "not_comparable"):
         assert falls(["widen", verdict], 0.8, 0.1) == 0.8
         # Where simulation is worse than what was measured, it is believed.
         assert falls(["widen", verdict], 0.2, 0.9) == 0.9
@@ -228,7 +232,7 @@ def test_the_page_says_what_matters_and_runs_nothing_of_the_log(tmp_path):
     assert "may walk again" in text
     assert "So far it has walked 10 times,\nand 4 of these walks ended in a fall" in text
     assert "end too early" not in text
-    report.write(page, [line(["not_finite"], 1.0, 0.1, cut_short=3)], TERMS)
+    report.write(page, [line(["not_comparable"], 1.0, 0.1, cut_short=3)], TERMS)
     text = page.read_text()
     assert "a policy that stands longer" in text
     assert "records of 3 walks end too early" in text

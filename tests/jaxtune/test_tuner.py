@@ -419,6 +419,20 @@ def test_what_no_parameters_explain_is_a_misfit(gate):
     assert np.all(another.misfit > 3.0)
 
 
+@pytest.mark.parametrize("channel", [0, 1])
+def test_the_signal_that_no_parameters_explain_is_said(channel):
+    tuner = Tuner(config=toys.TUNER, train_policy=toys.train_policy, simulate=SLIDER.simulate)
+    misfits = jax.jit(tuner.misfits)
+    state = start(tuner)
+    sets = SLIDER.measure({"friction": 0.1, "mass": -0.1}, 3)(jax.random.key(1), toys.policy())
+    usual = misfits(jax.random.key(0), state, sets)
+    # A sensor that is off by a fifth of what it reads at most.
+    wrong = misfits(jax.random.key(0), state, sets.replace(obs=sets.obs.at[..., channel].add(0.1)))
+    assert np.all(usual < 2.5)
+    assert np.argmax(wrong) == channel
+    assert wrong[channel] > 2.0 * usual[channel]
+
+
 def test_a_set_far_from_everything_is_novel(gate):
     sets = stacked({})
     far = gate(sets.replace(obs=1e3 * sets.obs))

@@ -130,3 +130,12 @@ def test_moments_are_those_of_numpy():
     np.testing.assert_allclose(found[0, :3], window[0].mean(axis=0), atol=1e-6)
     np.testing.assert_allclose(found[0, 3:6], np.diff(window[0], axis=0).std(axis=0), rtol=1e-5)
     np.testing.assert_allclose(found[0, 9:15], (centred.T @ centred / 50)[np.triu_indices(3)], atol=1e-5)
+
+
+def test_moments_that_involve_a_channel_are_those_that_change_with_it():
+    noise = jax.random.normal(jax.random.key(0), (2, 60, 3))
+    before = windows.moments(noise)
+    marked = np.asarray(windows.involved(3), bool)
+    for channel in range(3):
+        changed = windows.moments(noise.at[:, :, channel].multiply(1.5)) != before
+        np.testing.assert_array_equal(changed.any(axis=0), marked[channel])
