@@ -181,13 +181,12 @@ def show(reports: Mapping[int, SelfTest]) -> None:
         console.print(table)
         console.print(f"all true values in their intervals: {_rate(report.covered)}", markup=False)
         for name, ends in report.tuned.items():
-            console.print(
-                f"whole tunings, {name}: {ends}, truth in the box after {_rate(report.held[name])}", markup=False
-            )
+            held = f"truth in the distribution after: {_rate(report.held[name])}"
+            console.print(f"whole tunings, {name}: {ends}; {held}", markup=False)
 
 
 def _rate(rate: Rate) -> str:
-    low, high = wilson(rate.hits, rate.of)
+    low, high = wilson(rate.share * rate.independent, rate.independent)
     return f"{rate.share:.2f} ({low:.2f} to {high:.2f})"
 
 

@@ -33,15 +33,31 @@ _OFF = 2.0  # radii from the centre: one outside
 
 @dataclass(frozen=True)
 class Rate:
-    """So many of so many."""
+    """So many of so many.
+
+    Attributes:
+      hits: how many.
+      of: of how many.
+      by_gate: hits of every gate, each of as many robots; empty where they are not counted by gate.
+    """
 
     hits: int
     of: int
+    by_gate: tuple[int, ...] = ()
 
     @property
     def share(self) -> float:
         """As a number from 0 to 1; nan of none."""
         return self.hits / self.of if self.of else float("nan")
+
+    @property
+    def independent(self) -> float:
+        """How many independent robots say as much: fewer than there are if gates differ by more than chance."""
+        if len(self.by_gate) < 2 or self.hits in (0, self.of):
+            return float(self.of)
+        each = self.of / len(self.by_gate)
+        chance = self.share * (1.0 - self.share) / each
+        return self.of * min(1.0, chance / float(np.var(np.array(self.by_gate) / each, ddof=1)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,7 +159,10 @@ def run(
         tuned[short], held[short] = dict(Counter(ends)), Rate(sum(inside), len(inside))
     known, errors, intervals = (np.concatenate(values) for values in (known, errors, intervals))
     unit, order = np.asarray(dists.ravel(state.dist.radius)), dists.names(state.dist)
-    rate = {name: Rate(int(np.sum(values)), len(values)) for name, values in rejected.items()}
+    counted = lambda values: Rate(  # noqa: E731
+        int(np.sum(values)), len(values), tuple(int(np.sum(part)) for part in np.split(np.asarray(values), gates))
+    )
+    rate = {name: counted(values) for name, values in rejected.items()}
     where = lambda values: np.where(known, values, np.nan)  # noqa: E731
     median = lambda values: [  # noqa: E731
         float(np.nanmedian(column)) if np.isfinite(column).any() else float("nan") for column in where(values * unit).T
@@ -154,10 +173,10 @@ def run(
         alarms=rate[INSIDE],
         outside={name: rate[name] for name in _outside(state.dist)},
         others={name: rate[f"other {name}"] for name in others},
-        identified={name: Rate(int(column.sum()), len(column)) for name, column in zip(order, known.T, strict=True)},
+        identified={name: counted(column) for name, column in zip(order, known.T, strict=True)},
         error=dict(zip(order, median(errors), strict=True)),
         interval=dict(zip(order, median(intervals), strict=True)),
-        covered=Rate(int(((errors <= intervals) | ~known).all(axis=1).sum()), len(known)),
+        covered=counted(((errors <= intervals) | ~known).all(axis=1)),
         tuned=tuned,
         held=held,
     )

@@ -3,7 +3,7 @@
 import numpy as np
 
 
-def wilson(hits: int, count: int, z: float = 1.96) -> tuple[float, float]:
+def wilson(hits: float, count: float, z: float = 1.96) -> tuple[float, float]:
     """Returns the 95 % score interval of a rate (Wilson, 1927), which stays within [0, 1] and works at 0 and 1.
 
     Args:

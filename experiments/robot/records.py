@@ -79,7 +79,7 @@ class Tuning:
     radius: tuple[float, ...]
     """Largest radius of any parameter at every call, in coordinates."""
     novelty: tuple[float | None, ...]
-    """Score of the measured set at every call: a mean rank, about 0.5 if simulation covers it, near 1 if not."""
+    """How unlike simulated sets the measured one is at every call: 0 for the median of them, 1 for one in ten."""
     threshold: tuple[float | None, ...]
     """Novelty above which the gate rejects, at every call."""
     p_value: tuple[float | None, ...]

@@ -35,7 +35,7 @@ def test_robots_inside_pass_and_robots_outside_do_not(report):
     assert report.alarms.share < 0.2
     for name in ("friction", "mass"):
         assert report.outside[name].share > 0.7
-        assert report.identified[name] == Rate(24, 24)
+        assert report.identified[name] == Rate(24, 24, (12, 12))
         assert report.error[name] < report.interval[name] < 0.2
     for rate in report.others.values():
         assert rate.share > 0.9
@@ -55,6 +55,15 @@ def test_whole_tunings_say_how_they_end(report):
     assert report.tuned["heavy"] == {"accept": 2}
     assert report.held["heavy"].of == 2
     assert "accept" not in report.tuned["push"]
+
+
+def test_gates_that_differ_count_for_fewer_robots():
+    assert Rate(20, 40).independent == 40
+    # As chance has it, or less.
+    assert Rate(20, 40, (10, 10)).independent == 40
+    # Each gate rejects all of its robots or none, so four gates are four draws at most.
+    assert Rate(40, 80, (20, 0, 20, 0)).independent < 4
+    assert Rate(0, 40, (0, 0)).independent == 40
 
 
 def test_a_bound_that_leaves_no_room_outside_is_left_out():

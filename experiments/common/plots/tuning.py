@@ -100,7 +100,7 @@ def power(path: Path, reports: Mapping[int, SelfTest], level: float) -> None:
     for column, (episodes, report) in enumerate(reports.items()):
         rates = [report.alarms, *report.outside.values(), *report.others.values()]
         shares = np.array([rate.share for rate in rates])
-        ends = np.array([wilson(rate.hits, rate.of) for rate in rates]).T
+        ends = np.array([wilson(rate.share * rate.independent, rate.independent) for rate in rates]).T
         place = np.arange(len(names)) + 0.25 * (column - 0.5 * (len(reports) - 1))
         bars = np.maximum(np.abs(ends - shares), 0.0)
         axis.errorbar(shares, place, xerr=bars, fmt="o", ms=4, color=f"C{column}", label=f"{episodes} episodes")
@@ -274,7 +274,9 @@ def _gate(path: Path, results: dict[str, list[dict]]) -> None:
     below.plot([], [], color="tab:red", lw=0.8, label="threshold")
     above.set(ylabel="largest radius, log space", ylim=(0, None))
     above.legend(fontsize=8)
-    below.set(xlabel="tunings (fractions: gate calls within one)", ylabel="novelty, mean rank", ylim=(0, 1.05))
+    below.set(xlabel="tunings (fractions: gate calls within one)", ylabel="novelty")
+    # The median of simulated sets is 0, and a misfit may be a hundred.
+    below.set_yscale("symlog", linthresh=2.0)
     below.legend(fontsize=8)
     for axis in (above, below):
         axis.grid(alpha=0.3)

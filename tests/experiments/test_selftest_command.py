@@ -1,0 +1,93 @@
+import re
+
+import pytest
+from rich.console import Console
+
+from experiments import selftest
+from experiments.common import plots
+from experiments.walking.robots import BITENO
+from jaxtune.selftest import Rate, SelfTest
+
+LEGS = BITENO.chosen("legs6")
+
+
+def test_other_cases_are_all_parameters_that_nobody_tunes():
+    cases = selftest.other_cases(BITENO, LEGS, ())
+    assert cases["torque_scale=0.75"] == {"torque_scale": 0.75}
+    # Three quarters of the way to the bound of 10 ms.
+    assert cases["action_delay_s=0.0075"] == {"action_delay_s": 0.0075}
+    named = {name for values in cases.values() for name in values}
+    assert not named & set(LEGS)
+    # Tied masses change what is tuned already.
+    assert "thigh_mass" not in named
+    assert "trunk_mass" in named
+
+
+def test_other_cases_may_be_given_and_a_pattern_stands_for_tuned_parameters():
+    cases = selftest.other_cases(BITENO, LEGS, ("*_thigh_mass=2,foot_friction=0.5", "torque_scale=0.9"))
+    assert cases == {
+        "*_thigh_mass=2,foot_friction=0.5": {"left_thigh_mass": 2.0, "right_thigh_mass": 2.0, "foot_friction": 0.5},
+        "torque_scale=0.9": {"torque_scale": 0.9},
+    }
+
+
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        ("torque_scale", "others: got 'torque_scale', expected name=value"),
+        ("torque=0.5", "others: got 'torque', expected some of foot_friction"),
+        ("*_wheel=0.5", r"others: got '\*_wheel', expected some of foot_friction"),
+        ("torque_scale=5", "parameter 'torque_scale': got 5.0, expected 0.3 to 2"),
+    ],
+)
+def test_a_case_that_cannot_be_is_named(option, message):
+    with pytest.raises(ValueError, match=message):
+        selftest.other_cases(BITENO, LEGS, (option,))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"robots": 0}, "robots: got 0"),
+        ({"gates": -1}, "gates: got -1"),
+        ({"whole": -1}, "whole: got -1, expected 0 or more"),
+        ({"episodes": (5, 0)}, "episodes: got 0"),
+        ({"level": 1.5}, "level: got 1.5"),
+        ({"radius": 0.0}, "radius: got 0.0"),
+    ],
+    ids=str,
+)
+def test_options_are_checked_before_anything_runs(options, message):
+    with pytest.raises(ValueError, match=message):
+        selftest.check(selftest.Args(**options))
+
+
+REPORT = SelfTest(
+    level=0.95,
+    gates=2,
+    alarms=Rate(2, 40),
+    outside={"mass": Rate(38, 40)},
+    others={"torque_scale=0.75": Rate(40, 40)},
+    identified={"colour": Rate(1, 40), "mass": Rate(40, 40)},
+    error={"colour": float("nan"), "mass": 0.02},
+    interval={"colour": float("nan"), "mass": 0.07},
+    covered=Rate(36, 40),
+    tuned={"inside the distribution": {"accept": 3}},
+    held={"inside the distribution": Rate(3, 3)},
+)
+
+
+def test_tables_say_what_was_counted(monkeypatch):
+    console = Console(record=True, width=160)
+    monkeypatch.setattr(selftest, "console", console)
+    selftest.show({5: REPORT})
+    text = console.export_text()
+    assert re.search(r"mass, one radius outside +│ 1.00 +│ 0.020 +│ 0.070 +│ 0.95 \(0.83 to 0.99\)", text)
+    assert re.search(r"colour, one radius outside +│ 0.0\d +│ - +│ - +│ bounds leave no room", text)
+    assert "all true values in their intervals: 0.90" in text
+    assert "whole tunings, inside the distribution: {'accept': 3}" in text
+
+
+def test_the_plot_has_a_row_for_every_case(tmp_path):
+    plots.power(tmp_path / "power.png", {5: REPORT, 10: REPORT}, 0.05)
+    assert (tmp_path / "power.png").stat().st_size > 5000
