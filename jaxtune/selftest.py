@@ -57,7 +57,7 @@ class Rate:
             return float(self.of)
         each = self.of / len(self.by_gate)
         chance = self.share * (1.0 - self.share) / each
-        return self.of * min(1.0, chance / float(np.var(np.array(self.by_gate) / each, ddof=1)))
+        return self.of * chance / max(chance, float(np.var(np.array(self.by_gate) / each, ddof=1)))
 
 
 @dataclass(frozen=True, kw_only=True)
