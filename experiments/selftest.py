@@ -28,6 +28,7 @@ from jaxtune import selftest, tuner
 from jaxtune.mjx import Entry, parameters
 from jaxtune.selftest import Rate, SelfTest
 
+_ENOUGH = 0.8  # power that a parameter should have
 _OTHER = 0.75  # of a multiplier that is not tuned, or of the way from nominal to an offset's bound
 
 
@@ -183,6 +184,24 @@ def show(reports: Mapping[int, SelfTest]) -> None:
         for name, ends in report.tuned.items():
             held = f"truth in the distribution after: {_rate(report.held[name])}"
             console.print(f"whole tunings, {name}: {ends}; {held}", markup=False)
+    for line in lacking(reports):
+        console.print(line, markup=False, highlight=False)
+
+
+def lacking(reports: Mapping[int, SelfTest]) -> list[str]:
+    """Says which parameters this walk does not show well enough, and whether more episodes are known to help."""
+    lines = []
+    for name in next(iter(reports.values())).outside:
+        enough = [number for number, report in reports.items() if report.outside[name].share >= _ENOUGH]
+        tested = ", ".join(map(str, reports))
+        if not enough:
+            lines.append(
+                f"{name}: outside by one radius, it is noticed in less than {_ENOUGH:.0%} with {tested} episodes; "
+                "more episodes (--episodes), or a policy that moves differently, may show it"
+            )
+        elif min(enough) > min(reports):
+            lines.append(f"{name}: {min(enough)} episodes show it in {_ENOUGH:.0%} and more")
+    return lines
 
 
 def _rate(rate: Rate) -> str:
@@ -200,7 +219,7 @@ def main(args: Args) -> None:
         reports = {number: tested(args, robot, entries, others, number, progress) for number in numbers}
     show(reports)
     result = {
-        "args": args,
+        "args": {name: value for name, value in vars(args).items() if name != "out"},
         "episodes": {str(number): report for number, report in reports.items()},
         "seconds": time.monotonic() - begin,
         "versions": checkpoint.versions(),

@@ -1,4 +1,5 @@
 import re
+from dataclasses import replace
 
 import pytest
 from rich.console import Console
@@ -91,3 +92,12 @@ def test_tables_say_what_was_counted(monkeypatch):
 def test_the_plot_has_a_row_for_every_case(tmp_path):
     plots.power(tmp_path / "power.png", {5: REPORT, 10: REPORT}, 0.05)
     assert (tmp_path / "power.png").stat().st_size > 5000
+
+
+def test_parameters_that_the_walk_does_not_show_are_named_with_what_helps():
+    weak = replace(REPORT, outside={"mass": Rate(20, 40), "friction": Rate(10, 40)})
+    more = replace(REPORT, outside={"mass": Rate(36, 40), "friction": Rate(30, 40)})
+    mass, friction = selftest.lacking({5: weak, 10: more})
+    assert mass == "mass: 10 episodes show it in 80% and more"
+    assert "friction: outside by one radius, it is noticed in less than 80% with 5, 10 episodes" in friction
+    assert selftest.lacking({5: REPORT}) == []
