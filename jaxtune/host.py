@@ -17,14 +17,14 @@ A distribution that changes compiles nothing anew.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import jax
 import numpy as np
 
 from jaxtune.checks import check_measured, check_set
-from jaxtune.rules import TunerConfig, Update, Verify, calibrated_gate, posterior_update
+from jaxtune.rules import TunerConfig, Update, Verify, calibrated_gate, misfits, posterior_update
 from jaxtune.tuner import Info, Measure, TrainPolicy, Tuner, TunerState, counted, keep, make_info
 from jaxtune.types import Trajectory, Verdict
 
@@ -100,6 +100,10 @@ class HostTuner:
                 carry = self._refine(carry, *updated, state.knobs)
         return state.replace(dist=carry["dist"]), make_info(carry, measured)
 
+    def misfits(self, key: jax.Array, state: TunerState, measured: Trajectory) -> jax.Array:
+        """Says which observations and actions no parameters explain, as `Tuner.misfits` does."""
+        return self._misfits(self._tuner.collect(key, state.policy, state.dist), measured)
+
     @cached_property
     def _tuner(self) -> Tuner:
         def simulate(key, policy, coords):
@@ -114,6 +118,10 @@ class HostTuner:
     @cached_property
     def _update(self):
         return jax.jit(lambda key, *args: self.update(key, self.config, *args))
+
+    @cached_property
+    def _misfits(self):
+        return jax.jit(partial(misfits, self.config))
 
     @cached_property
     def _refine(self):

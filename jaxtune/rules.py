@@ -322,8 +322,9 @@ def _excess(name: str, values: jax.Array) -> jax.Array:
 
 
 def _p_value(scores: jax.Array) -> jax.Array:
-    """The conformal p-value of the last score among all [sets + 1]; a set without a score is not novel."""
-    return (1 + jnp.sum(scores[:-1] >= scores[-1])) / len(scores)
+    """The conformal p-value of the last score among all [sets + 1]; nan where it is."""
+    p_value = (1 + jnp.sum(scores[:-1] >= scores[-1])) / len(scores)
+    return jnp.where(jnp.isnan(scores[-1]), jnp.nan, p_value)
 
 
 def _moves(episodes: Trajectory) -> jax.Array:

@@ -68,6 +68,15 @@ def test_a_distribution_that_changes_compiles_nothing_anew(tuners):
     assert traced == ["gate", "update"]
 
 
+def test_misfits_are_those_of_the_traced_tuner(tuners):
+    _, host, _ = tuners
+    measured = SLIDER.measure(TWO, 2)(jax.random.key(0), toys.policy())
+    traced = Tuner(config=SIZES, train_policy=keep, simulate=SLIDER.simulate)
+    expected = jax.jit(traced.misfits)(jax.random.key(1), state(), measured)
+    assert expected.shape == (3,)
+    np.testing.assert_allclose(host.misfits(jax.random.key(1), state(), measured), expected, rtol=1e-2)
+
+
 def test_a_measured_set_of_another_length_is_refused(tuners):
     _, host, _ = tuners
     measured = toys.Slider(steps=55).measure(TWO, 2)(jax.random.key(0), toys.policy())
