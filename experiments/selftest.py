@@ -28,6 +28,7 @@ from jaxtune import selftest, tuner
 from jaxtune.mjx import Entry, parameters
 from jaxtune.selftest import Rate, SelfTest
 
+_NO_ROOM = "bounds leave no room"
 _ENOUGH = 0.8  # power that a parameter should have
 _OTHER = 0.75  # of a multiplier that is not tuned, or of the way from nominal to an offset's bound
 
@@ -170,15 +171,16 @@ def show(reports: Mapping[int, SelfTest]) -> None:
     for episodes, report in reports.items():
         table = Table(title=f"{episodes} episodes in a set")
         table.add_column("", no_wrap=True)
-        for column in ("identifiable", "median error", "half interval", "rejected (95 % interval)"):
+        for column in ("identifiable", "median error", "half interval", "rejected (95 % interval)", "or then inside"):
             table.add_column(column)
-        table.add_row("inside the distribution", "", "", "", _rate(report.alarms))
+        table.add_row("inside the distribution", "", "", "", _rate(report.alarms), "")
         for name, known in report.identified.items():
-            outside = _rate(report.outside[name]) if name in report.outside else "bounds leave no room"
+            room = name in report.outside
+            outside = [_rate(report.outside[name]), f"{report.noticed[name].share:.2f}"] if room else [_NO_ROOM, ""]
             numbers = ("-" if isnan(value) else f"{value:.3f}" for value in (report.error[name], report.interval[name]))
-            table.add_row(f"{name}, one radius outside", f"{known.share:.2f}", *numbers, outside)
+            table.add_row(f"{name}, one radius outside", f"{known.share:.2f}", *numbers, *outside)
         for name, rate in report.others.items():
-            table.add_row(name, "", "", "", _rate(rate))
+            table.add_row(name, "", "", "", _rate(rate), "")
         console.print(table)
         console.print(f"all true values in their intervals: {_rate(report.covered)}", markup=False)
         for name, ends in report.tuned.items():

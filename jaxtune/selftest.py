@@ -73,6 +73,8 @@ class SelfTest:
     outside: dict[str, Rate]
     """Robots rejected that lie outside by one radius, by the coordinate in which they do. A coordinate whose bounds
     leave no room for that is left out."""
+    noticed: dict[str, Rate]
+    """The same robots rejected, or, where accepted, inside the distribution after the first update."""
     others: dict[str, Rate]
     """Robots rejected of which something else is different, by name."""
     identified: dict[str, Rate]
@@ -124,7 +126,8 @@ def run(
     extra = sorted({name for coords in others.values() for name in coords} - set(dists.names(state.dist)))
     key_gates, key_whole = jax.random.split(key)
     total = gates + whole * (1 + len(others))
-    rejected, errors, intervals, known = {name: [] for name in cases}, [], [], []
+    rejected, noticed = {name: [] for name in cases}, {name: [] for name in cases}
+    errors, intervals, known = [], [], []
     for gate in range(gates):
         keys = jax.random.split(jax.random.fold_in(key_gates, gate), 4)
         drawn = [
@@ -133,9 +136,12 @@ def run(
         ]
         sets = measure(keys[1], state, jax.tree.map(lambda *rows: jnp.concatenate(rows), *drawn))
         collected = collect(keys[2], state.policy, state.dist)
-        found, update = jax.device_get(score(keys[3], collected, sets, state))
-        for number, name in enumerate(cases):
-            rejected[name].extend(found[number * robots : (number + 1) * robots].tolist())
+        found, update, moved = jax.device_get(score(keys[3], collected, sets, state))
+        for number, (name, coords) in enumerate(zip(cases, drawn, strict=True)):
+            these = slice(number * robots, (number + 1) * robots)
+            after = jax.tree.map(lambda leaf, these=these: leaf[these], moved)
+            rejected[name].extend(found[these].tolist())
+            noticed[name].extend((found[these] | _inside(after, coords)).tolist())
         truth = np.asarray(dists.normalise(state.dist, {name: drawn[0][name] for name in state.dist.centre}))
         known.append(update.identifiable)
         errors.append(np.abs(update.step - truth))
@@ -151,9 +157,7 @@ def run(
             after, info = tune(keys[2], state, measured)
             ends.append(Verdict(int(info.verdicts[int(info.calls) - 1])).name.lower())
             if ends[-1] == "accept":
-                low, high = (dists.ravel(end) for end in dists.box(after.dist))
-                truth = dists.ravel({one: coords[one][0] for one in state.dist.centre})
-                inside.append(bool(((low <= truth) & (truth <= high)).all()))
+                inside.append(bool(_inside(after.dist, coords).all()))
             done(gates + number * whole + robot + 1, total)
         short = name.removeprefix("other ")
         tuned[short], held[short] = dict(Counter(ends)), Rate(sum(inside), len(inside))
@@ -172,6 +176,7 @@ def run(
         gates=gates,
         alarms=rate[INSIDE],
         outside={name: rate[name] for name in _outside(state.dist)},
+        noticed={name: counted(noticed[name]) for name in _outside(state.dist)},
         others={name: rate[f"other {name}"] for name in others},
         identified={name: counted(column) for name, column in zip(order, known.T, strict=True)},
         error=dict(zip(order, median(errors), strict=True)),
@@ -192,7 +197,8 @@ def summary(report: SelfTest) -> str:
     for name, rate in report.outside.items():
         found = report.identified[name]
         told = f"estimated to {report.error[name]:.3f}" if found.share > 0.5 else "not identifiable"
-        lines.append(f"{name}: {told}; rejected one radius outside: {percent(rate)}")
+        held = percent(report.noticed[name])
+        lines.append(f"{name}: {told}; rejected one radius outside: {percent(rate)}, or then inside: {held}")
     lines += [f"{name}: rejected: {percent(rate)}" for name, rate in report.others.items()]
     lines += [
         f"whole tunings, {name}: " + ", ".join(f"{count} {verdict}" for verdict, count in sorted(ends.items()))
@@ -211,6 +217,13 @@ def _outside(dist: ParamDist) -> dict[str, dict[str, np.ndarray]]:
         if ends.size:
             cases[name] = {name: ends}
     return cases
+
+
+def _inside(dist: ParamDist, coords: Coords) -> np.ndarray:
+    """Tells which robots, coordinates [robots] by name, lie in a distribution, or each in one of its own."""
+    low, high = (dists.ravel(end) for end in dists.box(dist))
+    truth = dists.ravel({name: coords[name] for name in dist.centre})
+    return np.asarray(((low <= truth) & (truth <= high)).all(axis=-1))
 
 
 def _draw(key: jax.Array, dist: ParamDist, count: int, replaced: Mapping, extra: list[str]) -> dict[str, jax.Array]:
@@ -234,10 +247,10 @@ def _scorer(tuner: Tuner, robots: int) -> Callable:
     def score(key, collected, sets, state):
         key_verify, key_update = jax.random.split(key)
         gate = jax.vmap(lambda one: tuner.verify(key_verify, tuner.config, collected, one, state.knobs))(sets)
-        inside = jax.tree.map(lambda leaf: leaf[:robots], sets)
-        update = jax.vmap(
-            lambda one: tuner.update(key_update, tuner.config, collected, one, state.dist, state.knobs)[1]
-        )(inside)
-        return (gate.novelty > gate.threshold) & gate.comparable, update
+        moved, update = jax.vmap(
+            lambda one: tuner.update(key_update, tuner.config, collected, one, state.dist, state.knobs)
+        )(sets)
+        inside = jax.tree.map(lambda leaf: leaf[:robots], update)
+        return (gate.novelty > gate.threshold) & gate.comparable, inside, moved
 
     return score

@@ -68,6 +68,7 @@ REPORT = SelfTest(
     gates=2,
     alarms=Rate(2, 40),
     outside={"mass": Rate(38, 40)},
+    noticed={"mass": Rate(39, 40)},
     others={"torque_scale=0.75": Rate(40, 40)},
     identified={"colour": Rate(1, 40), "mass": Rate(40, 40)},
     error={"colour": float("nan"), "mass": 0.02},
@@ -83,7 +84,7 @@ def test_tables_say_what_was_counted(monkeypatch):
     monkeypatch.setattr(selftest, "console", console)
     selftest.show({5: REPORT})
     text = console.export_text()
-    assert re.search(r"mass, one radius outside +│ 1.00 +│ 0.020 +│ 0.070 +│ 0.95 \(0.83 to 0.99\)", text)
+    assert re.search(r"mass, one radius outside +│ 1.00 +│ 0.020 +│ 0.070 +│ 0.95 \(0.83 to 0.99\) +│ 0.97", text)
     assert re.search(r"colour, one radius outside +│ 0.0\d +│ - +│ - +│ bounds leave no room", text)
     assert "all true values in their intervals: 0.90" in text
     assert "whole tunings, inside the distribution: {'accept': 3}" in text

@@ -35,6 +35,7 @@ def test_robots_inside_pass_and_robots_outside_do_not(report):
     assert report.alarms.share < 0.2
     for name in ("friction", "mass"):
         assert report.outside[name].share > 0.7
+        assert report.outside[name].hits <= report.noticed[name].hits
         assert report.identified[name] == Rate(24, 24, (12, 12))
         assert report.error[name] < report.interval[name] < 0.2
     for rate in report.others.values():
