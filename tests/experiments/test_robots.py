@@ -155,7 +155,8 @@ def test_a_lane_of_a_sweep_is_a_run_of_its_own(trained, swept):
     for index, row in enumerate(rows):
         _, info, value, _ = single(row)
         for ours, theirs in zip(jax.tree.leaves(infos), jax.tree.leaves(info), strict=True):
-            np.testing.assert_allclose(ours[index, 0], theirs[0], rtol=1e-5, atol=1e-5)
+            # A regression inverts a matrix in single precision, which rounds differently side by side (3e-5 seen).
+            np.testing.assert_allclose(ours[index, 0], theirs[0], rtol=1e-5, atol=1e-4)
         # Rounding may grow, but hardly over two short tunings.
         np.testing.assert_allclose(returns[index], value, atol=0.05)
     np.testing.assert_allclose(infos.radius[:, 0, 0], [0.2, 0.3], rtol=1e-6)
