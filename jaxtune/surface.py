@@ -32,6 +32,7 @@ class Surface:
     residual: jax.Array  # R, [episodes, moments]
     inverse: jax.Array  # (n lambda I + R R')^-1, [episodes, episodes]
     penalty: jax.Array  # lambda
+    count: jax.Array  # n
 
 
 def train(model: Regression) -> Surface:
@@ -46,7 +47,7 @@ def train(model: Regression) -> Surface:
     inner = residual @ residual.T
     penalty = jnp.maximum(_SHRINKAGE * jnp.trace(inner) / count**2, _LEAST)
     inverse = jnp.linalg.inv(inner + count * penalty * jnp.eye(len(inner)))
-    return Surface(coefficients=coefficients, residual=residual, inverse=inverse, penalty=penalty)
+    return Surface(coefficients=coefficients, residual=residual, inverse=inverse, penalty=penalty, count=count)
 
 
 def misfit(surface: Surface, moments: Float[Array, " moments"], coords: Float[Array, " coords"]) -> Float[Array, ""]:
@@ -58,9 +59,11 @@ def misfit(surface: Surface, moments: Float[Array, " moments"], coords: Float[Ar
       coords: in radii, such as the set's estimate.
     """
     rest = unexplained(surface, moments, coords)
-    # (R'R / n + lambda I)^-1 by the matrix inversion lemma: R has fewer rows than columns.
-    along = surface.residual @ rest
-    return (rest @ rest - along @ surface.inverse @ along) / surface.penalty
+    # By the matrix inversion lemma, since R has fewer rows than columns, and as the minimum over a of
+    # |r - a R|^2 / lambda + n |a|^2: a sum of squares, in which rounding of the inverse hardly shows.
+    a = surface.inverse @ (surface.residual @ rest)
+    rest = rest - a @ surface.residual
+    return rest @ rest / surface.penalty + surface.count * (a @ a)
 
 
 def unexplained(
