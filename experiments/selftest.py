@@ -19,7 +19,7 @@ from rich.table import Table
 from experiments.common import checkpoint, plots
 from experiments.common.cli import bars, console, run
 from experiments.common.config import preset
-from experiments.common.rates import wilson
+from experiments.common.rates import interval
 from experiments.walking.cases import check_positive
 from experiments.walking.learner import Learner
 from experiments.walking.policies import default_policy, starting_policy
@@ -207,7 +207,7 @@ def lacking(reports: Mapping[int, SelfTest]) -> list[str]:
 
 
 def _rate(rate: Rate) -> str:
-    low, high = wilson(rate.share * rate.independent, rate.independent)
+    low, high = interval(rate)
     return f"{rate.share:.2f} ({low:.2f} to {high:.2f})"
 
 

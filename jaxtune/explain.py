@@ -7,7 +7,7 @@ from jaxtune.types import Verdict
 
 MEANING = {
     Verdict.ACCEPT: "The simulator covers what was measured, so its parameters were updated.",
-    Verdict.UNEXPLAINED: "No parameters explain what was measured (at 1 %): the model lacks physics.",
+    Verdict.UNEXPLAINED: "No parameters explain what was measured (tested at 1 %): the model lacks physics.",
     Verdict.RADIUS_EXHAUSTED: "What was measured is not covered, and the distribution may grow no wider.",
     Verdict.NOT_FINITE: "No score could be computed.",
     Verdict.NOT_COMPARABLE: "There is too little to compare.",
@@ -56,7 +56,7 @@ def explain(info) -> str:
     if verdict == Verdict.ACCEPT:
         fit = float(info.update.p_value)
         if fit <= _MISFIT:
-            lines.append(f"  fits badly in a narrower distribution (p {fit:.2f}), so the radius stays wide")
+            lines.append(f"  fits badly in the distribution that was read last (p {fit:.2f})")
         moved = dists.move(info.dist, info.update.step).centre
         interval = np.asarray(dists.ravel(info.dist.radius) * info.update.interval)
         for column, name in enumerate(dists.names(info.dist)):

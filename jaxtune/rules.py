@@ -225,13 +225,10 @@ def calibrated_gate(
       observation ever changes.
     """
     model, elbo = dvm.train(key, config.dvm, collected.trajectory)
-    both = lambda every, one: jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), every, one)  # noqa: E731
-    scored = partial(dvm.novelty, config.dvm)
-    held_out = devices.in_chunks(scored, (collected.held_out,), SETS, shared=(model,))
-    novelty, valid, covered = both(held_out, scored(model, measured))
+    novelty, valid, covered = _of_all_sets(partial(dvm.novelty, config.dvm), (model,), collected, measured)
     sane = jnp.isfinite(jnp.where(valid, novelty, 0.0)).all(axis=-1)
     cover = _mean_ranks(jnp.where(covered, novelty, jnp.inf), valid)
-    alive = both(collected.held_out.alive, measured.alive).mean(axis=(1, 2))
+    alive = jnp.concatenate([collected.held_out.alive, measured.alive[None]]).mean(axis=(1, 2))
     statistics = {"cover": cover, "lost": jnp.abs(alive - collected.trajectory.alive.mean())}
     _, _, found = _examined(config, collected, measured)
     excess = {name: _excess(name, values) for name, values in (statistics | found).items()}
@@ -249,6 +246,18 @@ def calibrated_gate(
         elbo=elbo,
         **{name: values[-1] for name, values in excess.items()},
     )
+
+
+def _of_all_sets(function: Callable, shared: tuple, collected: Collected, measured: Trajectory):
+    """What a function `(*shared, set)` returns for every held-out set and, last, for the measured one."""
+    held_out = devices.in_chunks(function, (collected.held_out,), SETS, shared=shared)
+    return jax.tree.map(lambda sets, one: jnp.concatenate([sets, one[None]]), held_out, function(*shared, measured))
+
+
+def _fit(config: TunerConfig, collected: Collected) -> tuple[regression.Regression, surface.Surface]:
+    """Fits the regression to D_q, and the way back."""
+    model = regression.train(config.regression, collected.trajectory, collected.sampled_coords, collected.dist)
+    return model, surface.train(model)
 
 
 def _mean_ranks(novelty: jax.Array, valid: jax.Array) -> jax.Array:
@@ -270,8 +279,7 @@ def _examined(
       The regression; estimates [sets + 1, coords] in radii, which may lie beyond the box; and `misfit` and `beyond`
       [sets + 1] by name, nan for a set without a valid window. The measured set is the last.
     """
-    model = regression.train(config.regression, collected.trajectory, collected.sampled_coords, collected.dist)
-    ways = surface.train(model)
+    model, ways = _fit(config, collected)
     scale = jnp.maximum(model.error, _LEAST_ERROR)
 
     def one(model, ways, scale, episodes):
@@ -281,9 +289,7 @@ def _examined(
         known = count > 0
         return answer, jnp.where(known, jnp.log(jnp.maximum(off, 1e-9)), jnp.nan), jnp.where(known, beyond, jnp.nan)
 
-    held_out = devices.in_chunks(one, (collected.held_out,), SETS, shared=(model, ways, scale))
-    every = jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), held_out, one(model, ways, scale, measured))
-    answers, misfit, beyond = every
+    answers, misfit, beyond = _of_all_sets(one, (model, ways, scale), collected, measured)
     return model, answers, {"misfit": misfit, "beyond": beyond}
 
 
@@ -299,8 +305,7 @@ def misfits(config: TunerConfig, collected: Collected, measured: Trajectory) -> 
       [obs + act] for every channel the rms of what the response surface leaves of the moments that involve it, as a
       multiple of the median over the held-out sets: 1 is usual.
     """
-    model = regression.train(config.regression, collected.trajectory, collected.sampled_coords, collected.dist)
-    ways = surface.train(model)
+    model, ways = _fit(config, collected)
     involved = windows.involved(measured.obs.shape[-1] + measured.action.shape[-1]) * model.varies
     scatter = jnp.sqrt(jnp.mean(ways.residual**2, axis=0))
     weight = jnp.where(model.varies > 0, 1.0 / jnp.maximum(scatter, _LEAST_ERROR), 0.0)
@@ -310,9 +315,8 @@ def misfits(config: TunerConfig, collected: Collected, measured: Trajectory) -> 
         rest = weight * surface.unexplained(ways, moments, jnp.clip(answer, model.low, model.high))
         return jnp.sqrt(involved @ rest**2 / jnp.maximum(involved.sum(axis=1), 1.0))
 
-    shared = model, ways, involved, weight
-    usual = jnp.median(devices.in_chunks(one, (collected.held_out,), SETS, shared=shared), axis=0)
-    return one(*shared, measured) / jnp.maximum(usual, _LEAST_ERROR)
+    every = _of_all_sets(one, (model, ways, involved, weight), collected, measured)
+    return every[-1] / jnp.maximum(jnp.median(every[:-1], axis=0), _LEAST_ERROR)
 
 
 def _excess(name: str, values: jax.Array) -> jax.Array:

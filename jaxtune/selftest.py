@@ -12,7 +12,7 @@ that this walk does not show: walk differently, or for more episodes.
 """
 
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from types import MappingProxyType
@@ -120,71 +120,115 @@ def run(
     """
     if robots < 2 or gates < 1:
         raise ValueError(f"robots, gates: got {robots} and {gates}, expected at least 2 and 1")
-    cases = {INSIDE: {}} | _outside(state.dist) | {f"other {name}": dict(coords) for name, coords in others.items()}
-    programs = (_scorer(tuner, robots), tuner.tune, tuner.collect, partial(_measured, tuner))
-    score, tune, collect, measure = (devices.on_all(jax.jit(program)) for program in programs)
+    outside = _outside(state.dist)
+    others = {name: dict(coords) for name, coords in others.items()}
     extra = sorted({name for coords in others.values() for name in coords} - set(dists.names(state.dist)))
     key_gates, key_whole = jax.random.split(key)
     total = gates + whole * (1 + len(others))
-    rejected, noticed = {name: [] for name in cases}, {name: [] for name in cases}
-    errors, intervals, known = [], [], []
-    for gate in range(gates):
-        keys = jax.random.split(jax.random.fold_in(key_gates, gate), 4)
-        drawn = [
-            _draw(jax.random.fold_in(keys[0], number), state.dist, robots, replaced, extra)
-            for number, replaced in enumerate(cases.values())
-        ]
-        sets = measure(keys[1], state, jax.tree.map(lambda *rows: jnp.concatenate(rows), *drawn))
-        collected = collect(keys[2], state.policy, state.dist)
-        found, update, moved = jax.device_get(score(keys[3], collected, sets, state))
-        for number, (name, coords) in enumerate(zip(cases, drawn, strict=True)):
-            these = slice(number * robots, (number + 1) * robots)
-            after = jax.tree.map(lambda leaf, these=these: leaf[these], moved)
-            rejected[name].extend(found[these].tolist())
-            noticed[name].extend((found[these] | _inside(after, coords)).tolist())
-        truth = np.asarray(dists.normalise(state.dist, {name: drawn[0][name] for name in state.dist.centre}))
-        known.append(update.identifiable)
-        errors.append(np.abs(update.step - truth))
-        intervals.append(update.interval)
-        done(gate + 1, total)
-    tuned, held = {}, {}
-    for number, name in enumerate([INSIDE, *(f"other {name}" for name in others)] if whole else []):
-        ends, inside = [], []
-        for robot in range(whole):
-            keys = jax.random.split(jax.random.fold_in(jax.random.fold_in(key_whole, number), robot), 3)
-            coords = _draw(keys[0], state.dist, 1, cases[name], extra)
-            measured = jax.tree.map(lambda leaf: leaf[0], measure(keys[1], state, coords))
-            after, info = tune(keys[2], state, measured)
-            ends.append(Verdict(int(info.verdicts[int(info.calls) - 1])).name.lower())
-            if ends[-1] == "accept":
-                inside.append(bool(_inside(after.dist, coords).all()))
-            done(gates + number * whole + robot + 1, total)
-        short = name.removeprefix("other ")
-        tuned[short], held[short] = dict(Counter(ends)), Rate(sum(inside), len(inside))
-    known, errors, intervals = (np.concatenate(values) for values in (known, errors, intervals))
-    unit, order = np.asarray(dists.ravel(state.dist.radius)), dists.names(state.dist)
-    counted = lambda values: Rate(  # noqa: E731
-        int(np.sum(values)), len(values), tuple(int(np.sum(part)) for part in np.split(np.asarray(values), gates))
+    cases = [{}, *outside.values(), *others.values()]
+    calls = _call(key_gates, tuner, state, cases, extra, robots, gates, lambda number: done(number, total))
+    rejected, noticed = (
+        [_count(column) for column in np.moveaxis(calls[name], 1, 0)] for name in ("rejected", "noticed")
     )
-    rate = {name: counted(values) for name, values in rejected.items()}
-    where = lambda values: np.where(known, values, np.nan)  # noqa: E731
-    median = lambda values: [  # noqa: E731
-        float(np.nanmedian(column)) if np.isfinite(column).any() else float("nan") for column in where(values * unit).T
-    ]
+    ends = len(outside) + 1
+    whole_cases = {INSIDE: {}} | others if whole else {}
+    tuned, held = _tune(key_whole, tuner, state, whole_cases, extra, whole, lambda number: done(gates + number, total))
+    known, errors, intervals = (calls[name] for name in ("identifiable", "errors", "intervals"))
+    unit, order = np.asarray(dists.ravel(state.dist.radius)), dists.names(state.dist)
+    columns = lambda values: dict(zip(order, np.moveaxis(values, -1, 0), strict=True))  # noqa: E731
+    median = lambda values: {  # noqa: E731
+        name: float(np.median(column[told])) if (told := columns(known)[name]).any() else float("nan")
+        for name, column in columns(values * unit).items()
+    }
     return SelfTest(
         level=float(state.knobs.level),
         gates=gates,
-        alarms=rate[INSIDE],
-        outside={name: rate[name] for name in _outside(state.dist)},
-        noticed={name: counted(noticed[name]) for name in _outside(state.dist)},
-        others={name: rate[f"other {name}"] for name in others},
-        identified={name: counted(column) for name, column in zip(order, known.T, strict=True)},
-        error=dict(zip(order, median(errors), strict=True)),
-        interval=dict(zip(order, median(intervals), strict=True)),
-        covered=counted(((errors <= intervals) | ~known).all(axis=1)),
+        alarms=rejected[0],
+        outside=dict(zip(outside, rejected[1:ends], strict=True)),
+        noticed=dict(zip(outside, noticed[1:ends], strict=True)),
+        others=dict(zip(others, rejected[ends:], strict=True)),
+        identified={name: _count(column) for name, column in columns(known).items()},
+        error=median(errors),
+        interval=median(intervals),
+        covered=_count(((errors <= intervals) | ~known).all(axis=-1)),
         tuned=tuned,
         held=held,
     )
+
+
+def _call(
+    key: jax.Array,
+    tuner: Tuner,
+    state: TunerState,
+    cases: Sequence[Mapping],
+    extra: list[str],
+    robots: int,
+    gates: int,
+    done: Callable[[int], None],
+) -> dict[str, np.ndarray]:
+    """Calls gate and update for the robots of every case, the first of which is the one inside the distribution.
+
+    Returns:
+      `rejected` and `noticed` [gates, cases, robots]; of the robots inside, `identifiable`, and `errors` and
+      `intervals` in radii, [gates, robots, coords].
+    """
+    programs = (_scorer(tuner, robots), tuner.collect, partial(_measured, tuner))
+    score, collect, measure = (devices.on_all(jax.jit(program)) for program in programs)
+    calls = []
+    for gate in range(gates):
+        keys = jax.random.split(jax.random.fold_in(key, gate), 4)
+        drawn = [
+            _draw(jax.random.fold_in(keys[0], number), state.dist, robots, replaced, extra)
+            for number, replaced in enumerate(cases)
+        ]
+        coords = jax.tree.map(lambda *rows: jnp.concatenate(rows), *drawn)
+        sets, collected = measure(keys[1], state, coords), collect(keys[2], state.policy, state.dist)
+        rejected, update, moved = jax.device_get(score(keys[3], collected, sets, state))
+        truth = np.asarray(dists.normalise(state.dist, {name: drawn[0][name] for name in state.dist.centre}))
+        calls.append(
+            {
+                "rejected": rejected.reshape(-1, robots),
+                "noticed": (rejected | _inside(moved, coords)).reshape(-1, robots),
+                "identifiable": update.identifiable,
+                "errors": np.abs(update.step - truth),
+                "intervals": update.interval,
+            }
+        )
+        done(gate + 1)
+    return jax.tree.map(lambda *values: np.stack(values), *calls)
+
+
+def _tune(
+    key: jax.Array,
+    tuner: Tuner,
+    state: TunerState,
+    cases: Mapping[str, Mapping],
+    extra: list[str],
+    robots: int,
+    done: Callable[[int], None],
+) -> tuple[dict[str, dict[str, int]], dict[str, Rate]]:
+    """Runs whole tunings: counts of verdicts, and accepted ones that hold the truth, by case."""
+    measure, tune = (devices.on_all(jax.jit(program)) for program in (partial(_measured, tuner), tuner.tune))
+    tuned, held = {}, {}
+    for number, (name, replaced) in enumerate(cases.items()):
+        ends, inside = Counter(), []
+        for robot in range(robots):
+            keys = jax.random.split(jax.random.fold_in(jax.random.fold_in(key, number), robot), 3)
+            coords = _draw(keys[0], state.dist, 1, replaced, extra)
+            measured = jax.tree.map(lambda leaf: leaf[0], measure(keys[1], state, coords))
+            after, info = tune(keys[2], state, measured)
+            verdict = Verdict(int(info.verdicts[int(info.calls) - 1]))
+            ends[verdict.name.lower()] += 1
+            if verdict == Verdict.ACCEPT:
+                inside.append(bool(_inside(after.dist, coords).all()))
+            done(number * robots + robot + 1)
+        tuned[name], held[name] = dict(ends), Rate(sum(inside), len(inside))
+    return tuned, held
+
+
+def _count(values: np.ndarray) -> Rate:
+    """Counts what is true of the robots of every gate, [gates, robots]."""
+    return Rate(int(values.sum()), values.size, tuple(int(hits) for hits in values.sum(axis=1)))
 
 
 def summary(report: SelfTest) -> str:

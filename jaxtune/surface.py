@@ -20,7 +20,8 @@ from jaxtune.regression import Regression
 
 _EPISODES_EACH = 4  # for every coefficient; with fewer, the polynomial has a lower degree
 _RIDGE = 1e-5  # of the number of episodes; it only keeps the solution finite
-_SHRINKAGE = 0.1
+_SHRINKAGE = 0.1  # lambda, in mean eigenvalues
+_LEAST_FREE = 0.1  # of an episode's residual, where the polynomial follows that episode closely
 _LEAST = 1e-6  # lambda where all episodes are as predicted
 
 
@@ -43,7 +44,7 @@ def train(model: Regression) -> Surface:
     gram = jnp.linalg.inv(terms.T @ terms + _RIDGE * count * jnp.eye(terms.shape[1]))
     coefficients = gram @ (terms.T @ model.read)
     own = jnp.einsum("ei,ij,ej->e", terms, gram, terms)[:, None]
-    residual = known * (model.read - terms @ coefficients) / jnp.maximum(1.0 - own, _SHRINKAGE)
+    residual = known * (model.read - terms @ coefficients) / jnp.maximum(1.0 - own, _LEAST_FREE)
     inner = residual @ residual.T
     penalty = jnp.maximum(_SHRINKAGE * jnp.trace(inner) / count**2, _LEAST)
     inverse = jnp.linalg.inv(inner + count * penalty * jnp.eye(len(inner)))

@@ -169,7 +169,7 @@ class Verdict(enum.IntEnum):
     WIDEN = 1
     """The simulated episodes do not cover the measured ones, but a wider distribution may."""
     UNEXPLAINED = 2
-    """No parameters explain the measured set, at an error rate of 1 %. The model lacks physics: use discovery."""
+    """No parameters explain the measured set, tested at 1 %. The model lacks physics: use discovery."""
     RADIUS_EXHAUSTED = 3
     """The measured set is not covered, and the distribution fills its bounds or was widened as often as allowed."""
     NOT_FINITE = 4

@@ -2,6 +2,13 @@
 
 import numpy as np
 
+from jaxtune.selftest import Rate
+
+
+def interval(rate: Rate) -> tuple[float, float]:
+    """Returns the 95 % interval of a self-test's rate, in which robots of gates that differ count for fewer."""
+    return wilson(rate.share * rate.independent, rate.independent)
+
 
 def wilson(hits: float, count: float, z: float = 1.96) -> tuple[float, float]:
     """Returns the 95 % score interval of a rate (Wilson, 1927), which stays within [0, 1] and works at 0 and 1.

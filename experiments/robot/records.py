@@ -118,7 +118,8 @@ class Tuning:
     compared_s: float
     """How many seconds of every walk were compared, from its start."""
     misfits: dict[str, float]
-    """Signals that no parameters explain, the worst first, as multiples of what is usual; none after `accept`."""
+    """Signals that no parameters explain, the worst first, as multiples of what is usual; none unless the log was
+    rejected."""
     explained: Prediction
     """Prediction for the policy that walked, in the tuned simulator; it should agree with the measurement."""
 

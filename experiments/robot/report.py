@@ -14,8 +14,8 @@ from experiments.robot.rounds import Terms
 
 VERDICTS = {
     "accept": "The simulator covers what was measured.",
-    "unexplained": "No parameters of the simulator explain what was measured, at an error rate of 1 %: physics is "
-    "missing in the model.",
+    "unexplained": "No parameters of the simulator explain what was measured, tested at 1 %: physics is missing in "
+    "the model.",
     "radius_exhausted": "The simulator does not cover what was measured, and its distribution cannot grow any wider.",
     "not_finite": "Nothing could be compared: a value is not finite.",
     "not_comparable": "There is too little to compare: walks, measured or simulated, were shorter than a window of 50 "

@@ -254,8 +254,9 @@ class Rounds:
         write_json(place / "tuning.json", tuning)
 
     def _misfits(self, index: int, state: TunerState, measured: Trajectory, info: tuner.Info) -> dict[str, float]:
-        """The signals that no parameters explain, the worst first; none after a set that was accepted."""
-        if info.calls == 0 or info.verdicts[int(info.calls) - 1] == Verdict.ACCEPT:
+        """The signals that no parameters explain, the worst first; none unless the set was rejected."""
+        rejected = (Verdict.UNEXPLAINED, Verdict.RADIUS_EXHAUSTED)
+        if info.calls == 0 or info.verdicts[int(info.calls) - 1] not in rejected:
             return {}
         found = self._programs.misfits(self._key(index, 4), state, measured)
         names = self._learner.channels()

@@ -8,7 +8,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from experiments.common.plots.base import COLOURS, save, spread
-from experiments.common.rates import wilson
+from experiments.common.rates import interval
 from jaxtune.selftest import SelfTest
 
 _MARKS = {
@@ -100,7 +100,7 @@ def power(path: Path, reports: Mapping[int, SelfTest], level: float) -> None:
     for column, (episodes, report) in enumerate(reports.items()):
         rates = [report.alarms, *report.outside.values(), *report.others.values()]
         shares = np.array([rate.share for rate in rates])
-        ends = np.array([wilson(rate.share * rate.independent, rate.independent) for rate in rates]).T
+        ends = np.array([interval(rate) for rate in rates]).T
         place = np.arange(len(names)) + 0.25 * (column - 0.5 * (len(reports) - 1))
         bars = np.maximum(np.abs(ends - shares), 0.0)
         axis.errorbar(shares, place, xerr=bars, fmt="o", ms=4, color=f"C{column}", label=f"{episodes} episodes")
