@@ -4,6 +4,7 @@ Speeds depend on the machine and on what else it does, so compare only ratios wi
 """
 
 import dataclasses
+import itertools
 import resource
 import tempfile
 import time
@@ -27,12 +28,12 @@ from envs.rig import Rig
 from experiments.common import checkpoint
 from experiments.common.cli import console, run
 from experiments.common.config import preset
-from experiments.walking import costs, foreign
+from experiments.walking import costs, foreign, memory
 from experiments.walking.learner import Learner
 from experiments.walking.policies import starting_policy
 from experiments.walking.robots import BITENO
 from experiments.walking.targets import TARGETS
-from jaxtune import tuner
+from jaxtune import devices, tuner
 from jaxtune.mjx import parameters
 
 _SIDE_BY_SIDE, _STEPS = 64, 200  # robots and steps of `rig`
@@ -54,10 +55,12 @@ class Args:
     """Folder of the results, a JSON file for each measurement."""
     preset: str = "cpu"
     """Size of the run: smoke (seconds, to see that it works), cpu (two cores) or gpu (one GPU)."""
+    envs: tuple[int, ...] = ()
+    """Numbers of environments of speed; the preset's if not given."""
     policy: str = "walk"
     """Policy that walks: walk (ships with the package), or a folder of experiments.train."""
-    seeds: int = 10
-    """Number of tunings of estimates, with a random seed each."""
+    seeds: tuple[int, ...] = tuple(range(10))
+    """Random seeds of estimates; each is a tuning with episodes and models of its own."""
     radius: float = 0.2
     """Radius (half width) of the distribution in estimates, in log space: 0.2 spans 0.82 to 1.22."""
 
@@ -69,16 +72,22 @@ def speed(args: Args) -> dict:
     other work on the machine can only slow a call down.
 
     Returns:
-      `first_call_s` and `steps_per_second` by physics.
+      `first_call_s` and `steps_per_second` by physics and number of environments.
     """
-    rows = {}
-    for physics in ("exact", "fast"):
-        sizes = preset(args.preset)
-        sizes = dataclasses.replace(sizes, task=dataclasses.replace(sizes.task, physics=physics))
+    rows, sizes = {}, preset(args.preset)
+    for physics, envs in itertools.product(("exact", "fast"), args.envs or (sizes.ppo.num_envs,)):
+        sizes = dataclasses.replace(
+            sizes,
+            task=dataclasses.replace(sizes.task, physics=physics),
+            ppo=dataclasses.replace(sizes.ppo, num_envs=envs),
+        )
         learner = Learner(sizes, BITENO.chosen("legs6"))
         dist = learner.dist(parameters.nominal(learner.entries), sizes.policy_radius)
-        train = jax.jit(
-            lambda key, policy, learner=learner, dist=dist: learner.train(key, policy, dist, learner.preset.chunk)
+        memory.check(learner)
+        train = devices.on_all(
+            jax.jit(
+                lambda key, policy, learner=learner, dist=dist: learner.train(key, policy, dist, learner.preset.chunk)
+            )
         )
         policy, key = learner.init(jax.random.PRNGKey(0)), jax.random.PRNGKey(1)
         seconds = []
@@ -87,7 +96,10 @@ def speed(args: Args) -> dict:
             policy, _ = jax.block_until_ready(train(key, policy))
             seconds.append(time.monotonic() - begin)
         steps = sizes.chunk * sizes.ppo.steps_per_update
-        rows[physics] = {"first_call_s": seconds[0], "steps_per_second": steps / min(seconds[1:])}
+        rows[f"{physics}, {envs} environments"] = {
+            "first_call_s": seconds[0],
+            "steps_per_second": steps / min(seconds[1:]),
+        }
     return rows
 
 

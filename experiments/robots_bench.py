@@ -18,7 +18,7 @@ from experiments.common.checkpoint import read_json, write_json
 from experiments.common.cli import console, run
 from experiments.common.config import preset
 from experiments.walking import foreign
-from experiments.walking.cases import check_positive
+from experiments.walking.cases import check_positive, check_seeds
 from jaxtune import dist as dists
 from jaxtune.mjx import parameters
 from jaxtune.tuner import TunerState, knobs
@@ -44,8 +44,8 @@ class Args:
     """Folder of the results. The same command with the same folder continues where it was."""
     robots: tuple[str, ...] = tuple(foreign.PACKAGES)
     """Robots: cheetah (MuJoCo Playground), hopper (Brax), half_cheetah (Gymnasium)."""
-    seeds: int = 5
-    """Number of seeds of each robot, from 0; hidden parameters, episodes and models depend on them."""
+    seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
+    """Random seeds of each robot; hidden parameters, episodes and models depend on them."""
     tunings: int = 3
     """Tunings of each run; each measures new episodes."""
     radius: float = 0.3
@@ -175,7 +175,8 @@ def main(args: Args) -> None:
     """
     for name in args.robots:
         foreign.check(name)
-    check_positive(seeds=args.seeds, tunings=args.tunings, radius=args.radius)
+    check_seeds(args.seeds)
+    check_positive(tunings=args.tunings, radius=args.radius)
     sizes = preset(args.preset)
     sizes = replace(sizes, scratch_updates=min(sizes.scratch_updates, _UPDATES))
     checkpoint.set_up_compiler(sizes.xla_flags)
@@ -183,7 +184,7 @@ def main(args: Args) -> None:
     results = {}
     for name in args.robots:
         place, world, policy = args.out / name, None, None
-        for seed in range(args.seeds):
+        for seed in args.seeds:
             path = place / f"seed_{seed}.json"
             if not path.exists():
                 world = world or foreign.world(name, sizes)

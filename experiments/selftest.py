@@ -20,6 +20,7 @@ from experiments.common import checkpoint, plots
 from experiments.common.cli import bars, console, run
 from experiments.common.config import preset
 from experiments.common.rates import interval
+from experiments.walking import memory
 from experiments.walking.cases import check_positive
 from experiments.walking.learner import Learner
 from experiments.walking.policies import default_policy, starting_policy
@@ -144,6 +145,7 @@ def tested(args: Args, robot: Kind, entries, others, episodes: int, progress: Pr
     sizes = replace(sizes, tuner=replace(sizes.tuner, set_episodes=episodes))
     hidden = {name: robot.entries[name] for values in others.values() for name in values if name not in entries}
     learner = Learner(sizes, entries, hidden, kind=robot)
+    memory.check(learner)
     policy = starting_policy(args.policy or default_policy(robot), learner, args.out)
     dist = learner.dist(parameters.nominal(entries), args.radius)
     machine = learner.tuner()

@@ -17,12 +17,12 @@ import jax
 from rich.progress import Progress, TaskID
 
 from envs.targets.protocol import Target
-from experiments.common import checkpoint, plots, report
+from experiments.common import checkpoint, hosts, plots, report
 from experiments.common.checkpoint import as_json, read_json, write_json, write_text
 from experiments.common.cli import bars, console, run
 from experiments.common.config import Preset, named_values, preset
-from experiments.walking import comparison
-from experiments.walking.cases import Case, check_positive, checked_case, errors
+from experiments.walking import comparison, memory
+from experiments.walking.cases import Case, check_positive, check_seeds, checked_case, errors
 from experiments.walking.comparison import METHODS, UPDATES, contenders
 from experiments.walking.learner import Learner, Policy
 from experiments.walking.policies import default_policy, starting_policy
@@ -33,7 +33,7 @@ from jaxtune.types import ParamDist, Verdict
 
 
 @dataclass(frozen=True, kw_only=True)
-class Args:
+class Args(hosts.HostArgs):
     """Tunes a robot's simulator to a second simulator, the target, and compares tuning methods."""
 
     out: Path = Path("runs/sim2sim")
@@ -54,8 +54,9 @@ class Args:
     methods: tuple[str, ...] = ("ours", "dr")
     """Methods to compare: ours, spm (the paper's update without the gate), dr (wide domain randomisation without
     tuning), oracle (trained with the target's parameters)."""
-    seeds: int = 1
-    """Number of random seeds; they count from 0."""
+    seeds: tuple[int, ...] = (0,)
+    """Random seeds; every method runs once with each. Other processes may play other seeds in the same folder; a last
+    call with all of them then joins the results."""
     preset: str = "cpu"
     """Size of the run: smoke (a minute, to see that it works), cpu (two cores) or gpu (one GPU)."""
     policy: str | None = None
@@ -103,7 +104,8 @@ def check(args: Args) -> tuple[Preset, Kind, dict[str, Entry], Case, tuner.Knobs
         raise ValueError(f"methods: got none, expected some of {', '.join(METHODS)}")
     truth = named_values("truth", args.truth, robot.entries)
     case = checked_case(args.case, args.start, entries, engines=robot.engines, target=args.target, truth=truth)
-    check_positive(radius=args.radius, dr_radius=args.dr_radius, seeds=args.seeds)
+    check_positive(radius=args.radius, dr_radius=args.dr_radius)
+    check_seeds(args.seeds)
     knobs = tuner.knobs(
         step_size=args.step_size, widen_factor=args.widen_factor, level=args.level, threshold=args.threshold
     )
@@ -148,7 +150,7 @@ class Runner:
         path = self._args.out / "results" / f"{name}_{seed}.json"
         tunings = self._learner.preset.tunings
         task = progress.add_task(f"{name} seed {seed}", total=tunings)
-        if not path.exists():
+        if not checkpoint.exists(path):
             with checkpoint.lock(path):
                 lines = self._play_tunings(name, seed, progress, task)
                 sets = self._contenders[name].sets * tunings
@@ -160,8 +162,7 @@ class Runner:
         lines = []
         for line in self._tunings(name, seed):
             lines.append(line)
-            with (self._args.out / "metrics.jsonl").open("a") as log:
-                log.write(json.dumps(line) + "\n")
+            checkpoint.append_line(self._args.out / "metrics.jsonl", line)
             note = f" return {line['return']:.1f} {' '.join(line.get('verdicts', ()))}"
             progress.update(task, completed=line["tuning"], description=f"{name} seed {seed}{note}")
         return lines
@@ -207,22 +208,25 @@ def main(args: Args) -> None:
     """Runs every pair that is not finished, writes metrics, summary and plots, and prints two tables.
 
     Raises:
-      ValueError: an option is wrong, the folder holds another run, or no measured episode lasts as long as a window.
+      ValueError: an option is wrong, the run does not fit into memory, the folder holds another, or no measured episode
+        lasts as long as a window.
     """
     checkpoint.set_up_compiler(preset(args.preset).xla_flags)
+    hosts.join(args)
     sizes, robot, entries, case, knobs = check(args)
     args = dataclasses.replace(args, policy=args.policy or default_policy(robot))
     identity = {**dataclasses.asdict(args), "sizes": sizes}
-    # A later call may add methods and seeds to the same folder.
-    for option in ("out", "methods", "seeds"):
+    # Other calls may play other methods and seeds in the same folder, on other machines.
+    for option in ("out", "methods", "seeds", *hosts.OPTIONS):
         del identity[option]
     hidden = parameters.select(robot.entries, [name for name in case.hidden if name not in entries])
     learner = Learner(sizes, entries, hidden, kind=robot)
+    memory.check(learner)
     checkpoint.open_run(args.out, identity)
     target = robot.engines[case.target](learner.robot, case.true_params(entries, args.start))
     runner = Runner(args, learner, target, starting_policy(args.policy, learner, args.out), knobs)
     with bars() as progress:
-        results = {name: [runner(name, seed, progress) for seed in range(args.seeds)] for name in args.methods}
+        results = {name: [runner(name, seed, progress) for seed in args.seeds] for name in args.methods}
     off = case.off(entries)
     settings = {name: getattr(args, name) for name in ("case", "start", "preset", "seeds")}
     summary = comparison.summarise(settings, results, off)

@@ -19,10 +19,11 @@ import numpy as np
 from rich.table import Table
 
 from envs.targets.mjx import MjxTarget
-from experiments.common import checkpoint, plots
+from experiments.common import checkpoint, hosts, plots
 from experiments.common.cli import bars, console, run
 from experiments.common.config import Preset, named_values, preset
-from experiments.walking.cases import Case, check_positive, checked_case, errors
+from experiments.walking import memory
+from experiments.walking.cases import Case, check_positive, check_seeds, checked_case, errors
 from experiments.walking.comparison import UPDATES
 from experiments.walking.learner import Learner, Policy
 from experiments.walking.policies import default_policy, starting_policy
@@ -37,7 +38,7 @@ and mean return and falls of the last policy in the target."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Args:
+class Args(hosts.HostArgs):
     """Tunes one simulator with every combination of the tuner's settings, by one compiled program."""
 
     out: Path = Path("runs/sweep")
@@ -62,8 +63,8 @@ class Args:
     """First radii (half widths of the distribution), in log space: 0.2 spans 0.82 to 1.22 times the centre."""
     levels: tuple[float, ...] = (0.8, 0.95)
     """Quantiles of the novelty of held-out simulated sets that are the gate's threshold."""
-    seeds: int = 2
-    """Number of random seeds of every combination; they count from 0."""
+    seeds: tuple[int, ...] = (0, 1)
+    """Random seeds; every combination runs once with each."""
     preset: str = "cpu"
     """Size of the run: smoke (a minute, to see that it works), cpu (two cores) or gpu (one GPU)."""
     fixed_policy: bool = False
@@ -95,8 +96,9 @@ def check(args: Args) -> tuple[Preset, Kind, dict[str, Entry], Case]:
     case = checked_case(args.case, args.start, entries, engines=robot.engines, truth=truth)
     combinations = itertools.product(args.step_sizes, args.widen_factors, args.radii, args.levels)
     for step_size, widen_factor, radius, level in combinations:
-        check_positive(radius=radius, seeds=args.seeds)
+        check_positive(radius=radius)
         tuner.knobs(step_size=step_size, widen_factor=widen_factor, level=level)
+    check_seeds(args.seeds)
     if case.target != "mjx":
         raise ValueError(f"case: got '{args.case}', expected friction or mass: a sweep needs a target in mjx")
     if args.update not in UPDATES:
@@ -114,7 +116,7 @@ def lanes(args: Args) -> np.ndarray:
     Returns:
       [step sizes, widening factors, radii, levels, seeds, 5], the last axis in that order.
     """
-    axes = (args.step_sizes, args.widen_factors, args.radii, args.levels, range(args.seeds))
+    axes = (args.step_sizes, args.widen_factors, args.radii, args.levels, args.seeds)
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
 
 
@@ -175,13 +177,19 @@ def main(args: Args) -> None:
     """Runs the sweep, prints a table with the best combination first, and writes summary.json and heat_map.png.
 
     Raises:
-      ValueError: an option is wrong, or the folder holds another run or belongs to a process that still works there.
+      ValueError: an option is wrong, the lanes do not fit into memory, or the folder holds another run or belongs to a
+        process that still works there.
     """
     checkpoint.set_up_compiler(preset(args.preset).xla_flags)
+    hosts.join(args)
     sizes, robot, entries, case = check(args)
     args = dataclasses.replace(args, policy=args.policy or default_policy(robot))
     learner = Learner(sizes, entries, kind=robot)
-    checkpoint.open_run(args.out, {**dataclasses.asdict(args), "out": None, "sizes": sizes})
+    memory.check(learner, args.lanes or sizes.sweep_lanes)
+    identity = {**dataclasses.asdict(args), "sizes": sizes}
+    for option in ("out", *hosts.OPTIONS):
+        del identity[option]
+    checkpoint.open_run(args.out, identity)
     with checkpoint.lock(args.out / "summary.json"):
         sweep(args, learner, case)
 
@@ -201,13 +209,13 @@ def sweep(args: Args, learner: Learner, case: Case) -> None:
     tune = devices.on_all(jax.jit(lambda rows: devices.spread(several, (rows,))))
     rows = grid.reshape(-1, grid.shape[-1])
     size = min(args.lanes or learner.preset.sweep_lanes, len(rows))
-    (args.out / "lanes").mkdir(exist_ok=True)
+    checkpoint.check_writable(args.out / "lanes")
     with bars() as progress:
         task = progress.add_task(f"tuning {len(rows)} simulators", total=len(rows))
         pieces = []
         for start in range(0, len(rows), size):
             path = args.out / "lanes" / f"{start:04d}.json"
-            if not path.exists():
+            if not checkpoint.exists(path):
                 # The last piece is filled up: another size would be another program.
                 some = rows[(start + np.arange(size)) % len(rows)]
                 begin = time.monotonic()

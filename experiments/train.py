@@ -6,17 +6,18 @@ from pathlib import Path
 import jax
 
 from envs import corrected
-from experiments.common import checkpoint, plots
+from experiments.common import checkpoint, hosts, plots
 from experiments.common.checkpoint import write_json
 from experiments.common.cli import console, run
 from experiments.common.config import preset
+from experiments.walking import memory
 from experiments.walking.learner import Learner
 from experiments.walking.policies import trained
 from experiments.walking.robots import kind
 
 
 @dataclass(frozen=True, kw_only=True)
-class Args:
+class Args(hosts.HostArgs):
     """Trains a policy from scratch with PPO, and saves it for the other commands."""
 
     out: Path
@@ -43,15 +44,17 @@ def main(args: Args) -> None:
     """Trains, saves the policy, draws the training curve, and prints the speed.
 
     Raises:
-      ValueError: an option is wrong, or the corrected model cannot be read.
+      ValueError: an option is wrong, the corrected model cannot be read, or the training does not fit into memory.
     """
     checkpoint.set_up_compiler(preset(args.preset).xla_flags)
+    hosts.join(args)
     sizes, robot = preset(args.preset), kind(args.robot)
     entries = robot.chosen(args.parameters)
     updates = sizes.scratch_updates if args.updates is None else args.updates
     if updates < 1:
         raise ValueError(f"updates: got {updates}, expected 1 or more")
     learner = Learner(sizes, entries, correction=args.model and corrected.read(args.model), kind=robot)
+    memory.check(learner)
     _, curve = trained(jax.random.PRNGKey(args.seed), learner, updates, args.out)
     write_json(args.out / "curve.json", {"args": args, "curve": curve})
     plots.training(args.out / "curve.png", curve, robot.control_s, robot.shown)

@@ -121,7 +121,10 @@ def gather(values: Any) -> Any:
 
 
 def on_all(program: Callable[..., Any]) -> Callable[..., Any]:
-    """Lets a compiled program use all devices, unless a mesh is in scope already.
+    """Lets a compiled program use all devices, of all hosts, unless a mesh is in scope already.
+
+    With several hosts (`jax.distributed`) all call it with equal arguments, and each gets all results, on its first
+    device.
 
     The mesh is in scope while the program runs, not longer: models of MJX lie on one device, and JAX would refuse
     whatever is computed with them outside a program.
@@ -134,9 +137,25 @@ def on_all(program: Callable[..., Any]) -> Callable[..., Any]:
         here = mesh()
         whole = NamedSharding(here, PartitionSpec())
         # Arrays come from one device or, where an earlier call made them, from all: JAX would compile for each.
-        put = lambda leaf: jax.device_put(leaf, whole) if isinstance(leaf, jax.Array) else leaf  # noqa: E731
-        args, kwargs = jax.tree.map(put, (args, kwargs))
+        args, kwargs = jax.tree.map(lambda leaf: _whole(leaf, whole), (args, kwargs))
         with jax.set_mesh(here):
-            return program(*args, **kwargs)
+            found = program(*args, **kwargs)
+            if jax.process_count() == 1:
+                return found
+            # No host can read what other hosts hold a share of, so each gets a copy of its own.
+            return jax.tree.map(lambda leaf: leaf.addressable_data(0), _gathered(found))
 
     return call
+
+
+_gathered = jax.jit(gather)
+
+
+def _whole(leaf: Any, sharding: NamedSharding) -> Any:
+    """Puts an array on all devices; hosts that hold equal copies of it make one array of them."""
+    if not isinstance(leaf, jax.Array):
+        return leaf
+    if sharding.is_fully_addressable:
+        return jax.device_put(leaf, sharding)
+    copies = [jax.device_put(leaf, device) for device in sharding.addressable_devices]
+    return jax.make_array_from_single_device_arrays(leaf.shape, sharding, copies)

@@ -1,7 +1,8 @@
 """Saving and loading: checkpoints, JSON, and the folder of a run with its config and versions.
 
 Every file is written whole or not at all: a run may be killed at any moment, and must be able to continue from its
-files. A draft is written, put on the disk (fsync), and renamed into place.
+files. A draft is written, put on the disk (fsync), and renamed into place. In a run on several hosts the first one does
+all this (`experiments.common.hosts`).
 """
 
 import contextlib
@@ -26,6 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
 
+from experiments.common import hosts
 from experiments.common.cli import console
 
 _PACKAGES = ("jaxtune", "jax", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "orbax-checkpoint", "numpy")
@@ -161,6 +163,7 @@ def write_json(path: Path, value: Any) -> None:
     write_text(path, json.dumps(as_json(value), indent=1) + "\n")
 
 
+@hosts.on_first
 def write_text(path: Path, text: str) -> None:
     """Writes a text file, whole or not at all, as `write_json` does."""
     draft = path.with_suffix(f".{secrets.token_hex(4)}{_DRAFT}")
@@ -177,6 +180,20 @@ def write_text(path: Path, text: str) -> None:
     _sync(path.parent)
 
 
+@hosts.on_first
+def append_line(path: Path, value: Any) -> None:
+    """Adds a value to a log of JSON lines. A process that is killed in between leaves part of a line."""
+    with path.open("a") as log:
+        log.write(json.dumps(as_json(value)) + "\n")
+
+
+@hosts.on_first
+def exists(path: Path) -> bool:
+    """Whether a file of a run is there."""
+    return path.exists()
+
+
+@hosts.on_first
 def read_json(path: Path) -> Any:
     """Reads a JSON file of a run.
 
@@ -213,15 +230,21 @@ def lock(path: Path) -> Iterator[None]:
     Raises:
       ValueError: another process works on it.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.with_name(f".{path.name}{_LOCK}").open("w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise ValueError(f"out: another process works on {path}; wait for it, or choose another folder") from None
+    with contextlib.ExitStack() as held:
+        hosts.from_first(lambda: _lock(path, held))
         yield
 
 
+def _lock(path: Path, held: contextlib.ExitStack) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    file = held.enter_context(path.with_name(f".{path.name}{_LOCK}").open("w"))
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise ValueError(f"out: another process works on {path}; wait for it, or choose another folder") from None
+
+
+@hosts.on_first
 def open_run(out: Path, config: Any) -> None:
     """Makes the folder of a run and writes its config, or checks that an earlier run there had the same config.
 
@@ -252,6 +275,7 @@ def open_run(out: Path, config: Any) -> None:
             write_json(path, {"config": wanted, "versions": versions()})
 
 
+@hosts.on_first
 def check_writable(out: Path) -> None:
     """Makes a folder, and checks that files can be written there, before hours are spent on what goes into them.
 
@@ -267,6 +291,7 @@ def check_writable(out: Path) -> None:
         raise ValueError(f"out: got {out}, where nothing can be written: {error.strerror}") from None
 
 
+@hosts.on_first
 def save(path: Path, state: Any, config: Any, notes: Any = None) -> None:
     """Writes a pytree of arrays as an orbax checkpoint, together with the config that `load` will compare.
 
@@ -283,8 +308,8 @@ def save(path: Path, state: Any, config: Any, notes: Any = None) -> None:
     path.mkdir(parents=True, exist_ok=True)
     numbers = [int(old.name.rpartition("_")[2]) for old in path.glob("state_*") if old.name[6:].isdecimal()]
     new = path / f"state_{max(numbers, default=0) + 1}"
-    with ocp.StandardCheckpointer() as checkpointer:
-        checkpointer.save(new.absolute(), _with_numbers(state))
+    with _checkpointer() as checkpointer:
+        checkpointer.save(new.absolute(), _numbers(state))
     for item in (new, *new.rglob("*")):
         _sync(item)
     _sync(path)
@@ -296,6 +321,7 @@ def save(path: Path, state: Any, config: Any, notes: Any = None) -> None:
             shutil.rmtree(old)
 
 
+@hosts.on_first
 def load(path: Path, like: Any, config: Any) -> Any:
     """Reads a pytree that `save` wrote.
 
@@ -319,12 +345,12 @@ def load(path: Path, like: Any, config: Any) -> Any:
     place = path / entry.get("state", "state")
     if not place.is_dir() or ("sha256" in entry and _checksum(place) != entry["sha256"]):
         raise ValueError(f"policy: {path} is damaged: its checksum is not the one in its config.json")
-    with ocp.StandardCheckpointer() as checkpointer:
-        wanted = jax.tree.map(ocp.utils.to_shape_dtype_struct, _with_numbers(like))
-        state = checkpointer.restore(place.absolute(), wanted)
-    # Orbax commits arrays to a device, and a step with committed input and uncommitted output would compile twice.
-    found = iter(jax.tree.map(jnp.asarray, jax.device_get(jax.tree.leaves(state))))
-    return jax.tree.map(lambda leaf: next(found) if jnp.size(leaf) else leaf, like)
+    with _checkpointer() as checkpointer:
+        found = checkpointer.restore(place.absolute(), _numbers(like))
+    # What was left out is None, and stays as it is.
+    fill = lambda leaf, new: leaf if new is None else jnp.asarray(new)  # noqa: E731
+    whole = jax.tree.map(fill, _plain(like), found, is_leaf=lambda leaf: leaf is None)
+    return ocp.tree.deserialize_tree(whole, like, keep_empty_nodes=True)
 
 
 def read_notes(path: Path) -> Any:
@@ -352,9 +378,22 @@ def check_finite(what: str, state: Any) -> None:
             raise ValueError(f"{what}: got a number that is not finite in {jax.tree_util.keystr(where)}")
 
 
-def _with_numbers(state: Any) -> Any:
-    """Leaves out arrays without elements, such as a simulator has for what its model lacks: orbax cannot save them."""
-    return jax.tree.map(lambda leaf: leaf if jnp.size(leaf) else None, state)
+def _checkpointer() -> ocp.StandardCheckpointer:
+    """One that does not wait for other hosts, since the first alone calls it."""
+    alone = ocp.options.MultiprocessingOptions(active_processes={0}, barrier_sync_key_prefix="first")
+    return ocp.StandardCheckpointer(multiprocessing_options=alone)
+
+
+def _numbers(state: Any) -> Any:
+    """Returns a pytree's arrays as NumPy's, in plain dicts and lists: so orbax saves them on any number of hosts.
+
+    Arrays without elements, such as a simulator has for what its model lacks, are left out: orbax cannot save them.
+    """
+    return jax.tree.map(lambda leaf: np.asarray(leaf) if jnp.size(leaf) else None, _plain(state))
+
+
+def _plain(state: Any) -> Any:
+    return ocp.tree.serialize_tree(state, keep_empty_nodes=True)
 
 
 def _same(message: str, found: Any, wanted: Any, where: str = "config") -> None:

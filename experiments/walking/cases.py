@@ -1,12 +1,14 @@
 """The cases of `sim2sim`: how the target differs from the simulator, after the paper's Figs. 3.1 to 3.4."""
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from jaxtune.mjx import Entry, parameters
+
+_LARGEST_SEED = 2**24  # that a float32 holds exactly, as the lanes of a sweep do
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,3 +125,16 @@ def check_positive(**options: float) -> None:
     for option, value in options.items():
         if not 0 < value < float("inf"):
             raise ValueError(f"{option}: got {value}, expected a positive, finite number")
+
+
+def check_seeds(seeds: Sequence[int]) -> None:
+    """Checks that there are random seeds, each of them once.
+
+    Raises:
+      ValueError: there are none, one comes twice, or one is negative or so large that single precision rounds it.
+    """
+    if not seeds:
+        raise ValueError("seeds: got none, expected one or more")
+    for seed in seeds:
+        if not 0 <= seed <= _LARGEST_SEED or seeds.count(seed) > 1:
+            raise ValueError(f"seeds: got {seed} among {len(seeds)}, expected numbers up to {_LARGEST_SEED}, each once")

@@ -4,7 +4,7 @@
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -141,7 +141,7 @@ def on_devices(sizes: Preset, policy: str) -> dict[str, dict]:
     return rows
 
 
-def estimates(sizes: Preset, policy: str, radius: float, seeds: int) -> dict[str, dict]:
+def estimates(sizes: Preset, policy: str, radius: float, seeds: Sequence[int]) -> dict[str, dict]:
     """Compares estimates of the coordinates of simulated robots, on the same episodes.
 
     Args:
@@ -168,7 +168,7 @@ def estimates(sizes: Preset, policy: str, radius: float, seeds: int) -> dict[str
     }
     collect = _compiled(lambda key: machine.collect(key, start, dist))
     found = {name: ([], []) for name in methods}
-    for seed in range(seeds):
+    for seed in seeds:
         key_collect, key_fit = jax.random.split(jax.random.PRNGKey(seed))
         data = collect(key_collect)
         truth = np.asarray(dists.normalise(dist, data.held_out_coords))

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from rich.progress import Progress
 
-from experiments.common import checkpoint
+from experiments.common import checkpoint, hosts
 from experiments.common.checkpoint import write_json
 from experiments.common.cli import bars
 from experiments.walking.learner import Learner, Policy
@@ -68,7 +68,7 @@ def walk(
         "chunk": chunk,
         "preset": learner.preset,
     }
-    if kept and (kept / "config.json").exists():
+    if kept and checkpoint.exists(kept / "config.json"):
         policy, curve = checkpoint.load(kept, policy, identity), checkpoint.read_notes(kept)
         if len(curve) * chunk > updates + chunk - 1:
             raise ValueError(f"updates: got {updates}, but {kept} holds a training of {len(curve) * chunk}")
@@ -82,7 +82,8 @@ def walk(
         if progress:
             rate = line["reward"] / learner.kind.control_s
             progress.update(task, completed=steps, description=f"reward {rate:.2f} per second")
-        if kept and time.monotonic() - last >= _KEEP_S:
+        # Hosts have clocks of their own, and must agree.
+        if kept and hosts.from_first(lambda last=last: time.monotonic() - last >= _KEEP_S):
             checkpoint.check_finite("policy", policy.learner)
             checkpoint.save(kept, policy, identity, curve)
             last = time.monotonic()
@@ -111,7 +112,7 @@ def trained(key: jax.Array, learner: Learner, updates: int, out: Path) -> tuple[
         checkpoint.check_finite("policy", policy.learner)
         checkpoint.save(out, policy.learner, policy_config(learner))
         write_json(out / "curve.json", {"curve": curve})
-        shutil.rmtree(kept, ignore_errors=True)
+        hosts.from_first(lambda: shutil.rmtree(kept, ignore_errors=True))
     return policy, curve
 
 
@@ -144,7 +145,7 @@ def starting_policy(name: str, learner: Learner, out: Path | None = None) -> Pol
             raise ValueError(f"policy: got 'walk', but {learner.kind.name} ships none; expected scratch or a folder")
     if name == "scratch":
         place = out / "policy"
-        if not (place / "config.json").exists():
+        if not checkpoint.exists(place / "config.json"):
             trained(jax.random.PRNGKey(0), learner, learner.preset.scratch_updates, place)
     ppo = checkpoint.load(place, fresh.learner, policy_config(learner))
     # Disk holds networks, optimiser and statistics alone. Robots are reset, so they may have another model by now.

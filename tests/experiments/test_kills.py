@@ -3,47 +3,18 @@
 import json
 import os
 import signal
-import subprocess
-import sys
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
+from processes import DISCOVER, ROBOT, SIM2REAL, SIM2SIM, STUB, TRAIN, end, networks, read, same, start, with_cache
 
 from experiments.discovery.field.bench import FieldBench
-
-ROOT = Path(__file__).parents[2]
-ROBOT = f"{ROOT / 'tests' / 'sled.py'}:simulator"
-# A checkpoint after every chunk of updates, not every minute.
-TRAIN = "from experiments.walking import policies; policies._KEEP_S = 0.0; from experiments import train as command"
-SIM2SIM = "from experiments import sim2sim as command"
-SIM2REAL = "from experiments import sim2real as command"
-DISCOVER = "from experiments import discover as command"
-STUB = "from experiments import robot_stub as command"
 
 
 @pytest.fixture(scope="module")
 def environment(tmp_path_factory):
-    """Programs are compiled once for all processes of this file."""
-    return {**os.environ, "JAX_COMPILATION_CACHE_DIR": str(tmp_path_factory.mktemp("cache"))}
-
-
-def start(imports, options, environment):
-    code = f"import sys; {imports}; from experiments.common.cli import run; run(command.main, command.Args)"
-    return subprocess.Popen(
-        [sys.executable, "-W", "ignore", "-c", code, *options],
-        cwd=ROOT,
-        env=environment,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        start_new_session=True,
-    )
-
-
-def end(process):
-    error = process.communicate()[1].decode()
-    assert process.returncode == 0, error
+    return with_cache(tmp_path_factory.mktemp("cache"))
 
 
 def killed(imports, options, environment, begun, kills, rng):
@@ -59,24 +30,6 @@ def killed(imports, options, environment, begun, kills, rng):
     end(start(imports, options, environment))
 
 
-def same(found, expected):
-    """Whether two results are equal but for what depends on the clock."""
-    if isinstance(expected, dict):
-        assert found.keys() == expected.keys()
-        for name in expected.keys() - {"seconds", "versions", "out", "args"}:
-            same(found[name], expected[name])
-    elif isinstance(expected, list):
-        assert len(found) == len(expected)
-        for pair in zip(found, expected, strict=True):
-            same(*pair)
-    else:
-        assert found == expected
-
-
-def read(path):
-    return json.loads(path.read_text())
-
-
 def check_train(environment, tmp_path, kills, updates=60):
     options = ["--robot", ROBOT, "--preset", "smoke", "--updates", str(updates), "--out"]
     end(start(TRAIN, [*options, str(tmp_path / "whole")], environment))
@@ -88,19 +41,9 @@ def check_train(environment, tmp_path, kills, updates=60):
     assert ours["config"] == theirs["config"]
     assert not (out / "training").exists()
     # What it does is what the other does, to the last bit.
-    export = "from experiments import export as command"
-    networks = []
-    for place in (out, tmp_path / "whole"):
-        to = place / "exported"
-        end(
-            start(
-                export, ["--robot", ROBOT, "--preset", "smoke", "--policy", str(place), "--out", str(to)], environment
-            )
-        )
-        with np.load(to / "policy.npz", allow_pickle=False) as stored:
-            networks.append({name: stored[name] for name in stored.files})
-    for name, values in networks[0].items():
-        np.testing.assert_array_equal(values, networks[1][name])
+    ours, theirs = (networks(place, place / "exported", environment) for place in (out, tmp_path / "whole"))
+    for name, values in ours.items():
+        np.testing.assert_array_equal(values, theirs[name])
 
 
 @pytest.mark.slow

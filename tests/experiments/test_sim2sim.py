@@ -30,7 +30,8 @@ from experiments.walking.robots import BITENO
         ("dr_radius", float("nan"), "nan"),
         ("start", 0.0, "0.0"),
         ("start", 0.01, "0.2 to 5"),
-        ("seeds", 0, "0"),
+        ("seeds", (), "none"),
+        ("seeds", (0, -1), "-1"),
         ("threshold", float("inf"), "inf"),
         ("widen_factor", 0.9, "0.9"),
         ("step_size", -1.0, "-1.0"),
@@ -50,7 +51,9 @@ def test_sweep_checks_every_combination():
 
 
 def test_sweep_lanes_are_all_combinations():
-    args = sweep.Args(step_sizes=(0.1, 0.2, 0.3), widen_factors=(1.5, 2.0), radii=(0.2,), levels=(0.9, 0.95), seeds=2)
+    args = sweep.Args(
+        step_sizes=(0.1, 0.2, 0.3), widen_factors=(1.5, 2.0), radii=(0.2,), levels=(0.9, 0.95), seeds=(0, 1)
+    )
     grid = sweep.lanes(args)
     assert grid.shape == (3, 2, 1, 2, 2, 5)
     np.testing.assert_allclose(grid[2, 1, 0, 1, 1], [0.3, 2.0, 0.2, 0.95, 1.0])
@@ -98,7 +101,7 @@ def _lines(name, seed):
 
 
 def test_summary_has_the_promised_keys(tmp_path):
-    settings = {"case": "mass", "start": 0.5, "preset": "cpu", "seeds": 2}
+    settings = {"case": "mass", "start": 0.5, "preset": "cpu", "seeds": [0, 1]}
     results = {"ours": [{"lines": _lines("ours", seed), "measured_episodes": 5} for seed in range(2)]}
     summary = comparison.summarise(settings, results, ("left_thigh_mass",))
     ours = summary["methods"]["ours"]

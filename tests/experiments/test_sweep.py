@@ -7,7 +7,9 @@ from experiments.common import checkpoint
 
 
 def test_lanes_are_all_combinations_with_every_seed():
-    grid = sweep.lanes(sweep.Args(step_sizes=(0.25, 0.5), widen_factors=(1.5,), radii=(0.2, 0.3, 0.4), seeds=4))
+    grid = sweep.lanes(
+        sweep.Args(step_sizes=(0.25, 0.5), widen_factors=(1.5,), radii=(0.2, 0.3, 0.4), seeds=(0, 1, 2, 3))
+    )
     assert grid.shape == (2, 1, 3, 2, 4, 5)
     assert grid[1, 0, 2, 0, 3].tolist() == [0.5, 1.5, 0.4, 0.8, 3.0]
     assert len({tuple(lane) for lane in grid.reshape(-1, 5)}) == 48
@@ -27,7 +29,8 @@ def test_a_folder_in_which_another_process_works_is_refused(tmp_path, monkeypatc
     [
         ({"step_sizes": (0.5, 0.0)}, "step_size: got 0.0"),
         ({"levels": (1.5,)}, "level: got 1.5"),
-        ({"seeds": 0}, "seeds: got 0"),
+        ({"seeds": ()}, "seeds: got none"),
+        ({"seeds": (1, 1)}, "seeds: got 1 among 2"),
         ({"update": "leap"}, "update: got 'leap', expected one of posterior, vote"),
         ({"update": "posterior"}, "step_sizes: got 3, expected one"),
         ({"lanes": 0}, "lanes: got 0"),

@@ -7,6 +7,8 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 
+from experiments.common import hosts
+
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
@@ -30,9 +32,13 @@ def spread(axis, x: np.ndarray, values: np.ndarray, name: str) -> None:
 
 def save(figure: plt.Figure, path: Path) -> None:
     """Writes a figure as PNG, making the folder where it is missing, and closes it so that its memory is freed."""
+    hosts.from_first(lambda: _write(figure, path))
+    plt.close(figure)
+
+
+def _write(figure: plt.Figure, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=120)
-    plt.close(figure)
 
 
 def embedded(figure: plt.Figure) -> str:

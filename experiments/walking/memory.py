@@ -1,0 +1,63 @@
+"""Whether a run fits into memory, estimated from its sizes before anything is traced or compiled.
+
+A program holds a multiple of the observations and actions that it works on. The multiples are those of XLA's memory
+analysis of BITeno's programs on a CPU, between 64 and 256 environments and between 195 and 895 episodes.
+"""
+
+import math
+import os
+
+import jax
+
+from experiments.walking.learner import Learner
+
+_TRAINING = 14.0  # of a PPO update's rollout: its batches, their gradients, the physics of a step
+_TUNING = 2.0  # of a tuning's episodes: windows, and batches of them
+_MODELS = 100e6  # B, of both models while they are trained
+_USABLE = 0.9  # share of a device's memory
+
+
+def needed(learner: Learner) -> dict[str, float]:
+    """Estimates the memory that training and a tuning take, each by itself.
+
+    Args:
+      learner: robot and sizes.
+
+    Returns:
+      Bytes by name: `training` over all devices, and `tuning` on each, as every device learns from all episodes.
+    """
+    sizes, tuner = learner.preset, learner.preset.tuner
+    step = 4.0 * (learner.robot.observation_size + learner.robot.action_size)
+    rollout = step * sizes.ppo.steps_per_update
+    episodes = step * sizes.episode_steps * (tuner.episodes + tuner.held_out_sets * tuner.set_episodes)
+    return {"training": _TRAINING * rollout, "tuning": _TUNING * episodes + _MODELS}
+
+
+def check(learner: Learner, lanes: int = 1) -> None:
+    """Checks that a run fits.
+
+    Args:
+      learner: robot and sizes.
+      lanes: runs side by side, spread over devices.
+
+    Raises:
+      ValueError: it does not; says how much is needed for what, and how much there is.
+    """
+    there, devices = available(), len(jax.devices())
+    for what, size in needed(learner).items():
+        size *= lanes / devices if what == "training" or lanes > 1 else 1.0
+        if size > _USABLE * there:
+            envs, episodes = learner.preset.ppo.num_envs, learner.preset.tuner.episodes
+            runs = f", {lanes} runs side by side" if lanes > 1 else ""
+            raise ValueError(
+                f"{'lanes' if lanes > 1 else 'preset'}: {what} takes about {size / 2**30:.3g} GiB on a device ({envs} "
+                f"environments, {episodes} episodes{runs}), expected less than the {there / 2**30:.3g} GiB that it has"
+            )
+
+
+def available() -> float:
+    """Memory of a device in bytes; the devices of a CPU have equal shares of the machine's."""
+    own = jax.local_devices()
+    if own[0].platform != "cpu":
+        return (own[0].memory_stats() or {}).get("bytes_limit", math.inf)
+    return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / len(own)

@@ -1,0 +1,64 @@
+import json
+import sys
+
+import pytest
+
+from experiments import gpu_bench
+from experiments.common.config import PRESETS
+from experiments.walking import memory
+from experiments.walking.learner import Learner
+from experiments.walking.robots import BITENO
+
+
+@pytest.fixture
+def fake(monkeypatch):
+    """Parts that note that they ran, in the place of commands that take minutes."""
+    script = "import json, sys; open(sys.argv[1], 'a').write(sys.argv[2] + '\\n'); sys.exit(int(sys.argv[3]))"
+    codes = dict.fromkeys(("speed", "policy", "tunings_cached"), 0)
+
+    def commands(sizes, out):
+        return {part: ["-c", script, str(out / "ran.txt"), part, str(code)] for part, code in codes.items()}
+
+    monkeypatch.setattr(gpu_bench, "commands", commands)
+    monkeypatch.setattr(
+        gpu_bench,
+        "RESULTS",
+        {
+            "speed": lambda out: {"exact": 2.0, "fast": 5.0},
+            "policy": lambda out: {"without_s": 3.0},
+            "tunings_cached": lambda out: {"seconds": 4.0},
+        },
+    )
+    monkeypatch.setattr(gpu_bench, "_PYTHON", [sys.executable])
+    return codes
+
+
+def test_finished_parts_are_not_run_again(fake, tmp_path, capsys):
+    args = gpu_bench.Args(out=tmp_path / "out", preset="smoke", parts=tuple(fake))
+    fake["policy"] = 3
+    with pytest.raises(ValueError, match="'policy' ended with code 3"):
+        gpu_bench.main(args)
+    fake["policy"] = 0
+    gpu_bench.main(args)
+    assert (args.out / "ran.txt").read_text().split() == ["speed", "policy", "policy", "tunings_cached"]
+    summary = json.loads((args.out / "summary.json").read_text())
+    assert {name: part["found"] for name, part in summary["parts"].items()}["policy"] == {"without_s": 3.0}
+    assert "500,000" in capsys.readouterr().out
+
+
+def test_every_part_has_a_command_whose_result_can_be_read(tmp_path):
+    assert set(gpu_bench.commands("gpu", tmp_path)) == set(gpu_bench.RESULTS) == set(gpu_bench.Args().parts)
+
+
+def test_a_run_that_does_not_fit_into_memory_is_refused(monkeypatch):
+    learner = Learner(PRESETS["cpu"], BITENO.chosen(None))
+    memory.check(learner)
+    some, many = memory.needed(learner), memory.needed(Learner(PRESETS["gpu"], BITENO.chosen(None)))
+    assert all(many[name] > 4 * some[name] for name in some)
+    monkeypatch.setattr(memory, "available", lambda: 1.05 * some["tuning"])
+    with pytest.raises(ValueError, match=r"preset: tuning takes about 0\.187 GiB"):
+        memory.check(learner)
+    monkeypatch.setattr(memory, "available", lambda: 10 * some["tuning"])
+    memory.check(learner)
+    with pytest.raises(ValueError, match=r"lanes: tuning takes .* 64 runs side by side"):
+        memory.check(learner, lanes=64)
