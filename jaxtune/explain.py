@@ -1,5 +1,7 @@
 """What a tuning did, in words: for a console, a notebook or a log."""
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from jaxtune import dist as dists
@@ -25,6 +27,8 @@ ADVICE = {
 """What to do next."""
 
 
+_WEAK = 0.5  # least error of a coordinate that is hardly identified, as a share of its standard deviation
+_SMALL = 0.3  # weight in a combination that is left out, as a share of the largest
 _MISFIT = 0.05  # largest p-value that is worth a word
 _EXCESS = {
     "cover": "shapes that the verification model does not know",
@@ -32,6 +36,73 @@ _EXCESS = {
     "misfit": "motion that no parameters of the table explain",
     "beyond": "parameters beyond the distribution",
 }
+
+
+def weak(info) -> np.ndarray:
+    """Tells which coordinates the episodes hardly narrow: estimates err by more than half of what no data would leave.
+
+    Args:
+      info: of one tuning.
+
+    Returns:
+      [coords] in the order of `dist.names`; all False where the update gives no errors.
+    """
+    found = np.diag(_errors(info))
+    return np.sqrt(found, where=found >= 0, out=np.zeros_like(found)) > _WEAK
+
+
+@dataclass(frozen=True, kw_only=True)
+class Combination:
+    """A weighted sum of coordinates that is known better than each of them."""
+
+    weights: dict[str, float]
+    """By name, the largest 1."""
+    error: float
+    """Of the sum, rms over held-out sets."""
+
+    def __str__(self) -> str:
+        terms = " ".join(f"{weight:+.2g} {name}" for name, weight in self.weights.items())
+        return f"{terms.removeprefix('+')} is known to {self.error:.3f}"
+
+
+def combinations(info) -> tuple[Combination, ...]:
+    """Finds what the episodes tell of coordinates that they hardly tell singly, such as the sum of two masses.
+
+    These are the principal axes of the errors of the weak coordinates, scaled by the distribution, along which
+    estimates err by less than half of what no data would leave.
+
+    Args:
+      info: of one tuning.
+
+    Returns:
+      One for each such axis, the best known first.
+    """
+    names, found = np.array(dists.names(info.dist)), _errors(info)
+    vague = np.flatnonzero(weak(info))
+    values, axes = np.linalg.eigh(found[np.ix_(vague, vague)])
+    sd = _ignorance(info) * dists.ravel(info.dist.radius)
+    told = []
+    for value, axis in zip(values, axes.T, strict=True):
+        chosen = np.abs(axis) > _SMALL * np.abs(axis).max()
+        if value < _WEAK**2 and chosen.sum() > 1:
+            weights = axis / sd[vague]
+            unit = weights[np.abs(weights).argmax()]
+            picked = dict(zip(names[vague][chosen].tolist(), (weights[chosen] / unit).tolist(), strict=True))
+            told.append(Combination(weights=picked, error=float(np.sqrt(max(value, 0.0)) / abs(unit))))
+    return tuple(told)
+
+
+def _errors(info) -> np.ndarray:
+    """[coords, coords] mean products of estimates' errors, in standard deviations of the distribution."""
+    size = len(dists.names(info.dist))
+    found = np.broadcast_to(np.nan_to_num(np.asarray(info.update.errors, float)), (size, size))
+    return found / np.outer(_ignorance(info), _ignorance(info))
+
+
+def _ignorance(info) -> np.ndarray:
+    """[coords] standard deviation of a uniform draw from the distribution, in radii."""
+    low, high = map(np.asarray, dists.normalised_box(info.dist))
+    return (high - low) / np.sqrt(12.0)
 
 
 def explain(info) -> str:
@@ -59,11 +130,14 @@ def explain(info) -> str:
             lines.append(f"  fits badly in the distribution that was read last (p {fit:.2f})")
         moved = dists.move(info.dist, info.update.step).centre
         interval = np.asarray(dists.ravel(info.dist.radius) * info.update.interval)
+        vague = weak(info)
         for column, name in enumerate(dists.names(info.dist)):
             line = f"  {name}: {float(info.dist.centre[name]):.3f}"
             if info.update.identifiable[column]:
                 around = "" if np.isnan(interval[column]) else f" +- {interval[column]:.3f}"
-                lines.append(f"{line} -> {float(moved[name]):.3f}{around}")
+                note = ", weakly identified" if vague[column] else ""
+                lines.append(f"{line} -> {float(moved[name]):.3f}{around}{note}")
             else:
                 lines.append(f"{line}, not identifiable from these episodes")
+        lines += [f"  together: {one}" for one in combinations(info)]
     return "\n".join([*lines, ADVICE[verdict]])

@@ -164,7 +164,7 @@ class GateInfo:
 
 @chex.dataclass(frozen=True)
 class UpdateInfo:
-    """What one update did, [coords] each in the order of `dist.names`, but for the scalars at the end.
+    """What one update did, [coords] each in the order of `dist.names`, but for what is said at the end.
 
     Step and interval are in radii of the distribution before the update. For an identifiable coordinate the new
     estimate is `centre + radius * step`, give or take `radius * interval`. For any other one `step` is zero, and
@@ -177,6 +177,7 @@ class UpdateInfo:
     loss: jax.Array  # scalar: `vote_update`'s logistic loss in nats, `posterior_update`'s error of episodes left out
     p_value: jax.Array = math.nan  # scalar: as the gate's, of misfit and beyond alone
     p_misfit: jax.Array = math.nan  # scalar: of misfit alone
+    errors: jax.Array = math.nan  # [coords, coords] mean product of the errors of held-out estimates, in radii
 
 
 Verify = Callable[[jax.Array, TunerConfig, Collected, Trajectory, Knobs], GateInfo]
@@ -439,6 +440,7 @@ def posterior_update(
         loss=model.error.mean(),
         p_value=_p_value(jnp.fmax(excess["misfit"], excess["beyond"])),
         p_misfit=_p_value(excess["misfit"]),
+        errors=(held_out - truth).T @ (held_out - truth) / len(truth),
     )
 
 
@@ -463,4 +465,12 @@ def no_update(dist: ParamDist) -> UpdateInfo:
     unknown = jnp.full_like(zeros, jnp.nan)
     nan = jnp.asarray(jnp.nan)
     none = jnp.zeros_like(zeros, bool)
-    return UpdateInfo(step=zeros, interval=unknown, identifiable=none, loss=nan, p_value=nan, p_misfit=nan)
+    return UpdateInfo(
+        step=zeros,
+        interval=unknown,
+        identifiable=none,
+        loss=nan,
+        p_value=nan,
+        p_misfit=nan,
+        errors=jnp.full((len(zeros), len(zeros)), jnp.nan),
+    )

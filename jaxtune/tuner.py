@@ -358,6 +358,7 @@ class Tuner:
             step=(dists.ravel(moved.centre) - dists.ravel(tested.centre)) / unit,
             interval=update.interval * radius / unit,
             identifiable=before.identifiable | update.identifiable,
+            errors=update.errors * jnp.outer(radius / unit, radius / unit),
         )
         # Taken back: what the reading before found remains, within the radius that it was found in.
         back = before.replace(

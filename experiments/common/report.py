@@ -8,6 +8,7 @@ import jinja2
 import numpy as np
 
 from jaxtune import dist as dists
+from jaxtune.explain import combinations, weak
 from jaxtune.mjx import Entry, parameters
 from jaxtune.tuner import Info
 from jaxtune.types import ParamDist, Verdict
@@ -40,8 +41,9 @@ def tuning(info: Info) -> dict:
 
     Returns:
       `verdicts`, `radius` and the gate's numbers as lists over its calls; the update's `step` and `interval` by
-      parameter, in radii, and whether the parameter was `identifiable`; the p-values of the update's fit; the number of
-      falls and of episodes with values that are not finite; and means of the training metrics.
+      parameter, in radii, and whether the parameter was `identifiable`; those that are `weak`, and the
+      combinations that are known `together`; the p-values of the update's fit; the number of falls and of episodes with
+      values that are not finite; and means of the training metrics.
     """
     calls = int(info.calls)
     order = dists.names(info.dist)
@@ -56,6 +58,8 @@ def tuning(info: Info) -> dict:
         "radius": np.asarray(info.radius)[:calls],
         **gate,
         **update,
+        "weak": tuple(np.array(order)[weak(info)].tolist()),
+        "together": combinations(info),
         "update_loss": float(info.update.loss),
         "fit_p_value": float(info.update.p_value),
         "misfit_p_value": float(info.update.p_misfit),

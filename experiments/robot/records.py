@@ -7,6 +7,8 @@ else.
 
 from dataclasses import dataclass, field
 
+from jaxtune.explain import Combination
+
 
 @dataclass(frozen=True, kw_only=True)
 class WalkMeans:
@@ -101,6 +103,10 @@ class Tuning:
     """Half width of the interval, by parameter, in radii."""
     identifiable: dict[str, bool]
     """Whether the log narrows a parameter down."""
+    weak: tuple[str, ...]
+    """Parameters whose estimates err by more than half of what no data would leave."""
+    together: tuple[Combination, ...]
+    """Sums of such parameters that are known better, in coordinates."""
     update_loss: float | None
     """How badly the update's model fits (`jaxtune.rules.UpdateInfo.loss`)."""
     fit_p_value: float | None

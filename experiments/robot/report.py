@@ -58,6 +58,7 @@ def write(path: Path, history: Sequence[Round], terms: Terms) -> None:
         advice=ADVICE[last.tuning.verdict],
         quantities=_QUANTITIES,
         unidentified=last.tuning.unidentified,
+        together=last.tuning.together if last.tuning.verdict == "accept" else (),
         surprise=surprise(last.measured, last.tuning.explained),
         safe=last.expected_falls <= terms.max_fall_rate,
         terms=terms,
@@ -87,6 +88,7 @@ def show(console: Console, last: Round) -> None:
     for name, ends in last.tuning.moved.items():
         interval = "-" if ends.low is None else f"{ends.low:.3f} to {ends.high:.3f}"
         note = " (not identifiable from this log)" if name in last.tuning.unidentified else ""
+        note = note or (" (weakly identified)" if name in last.tuning.weak else "")
         table.add_row(name + note, f"{ends.before:.3f}", f"{ends.after:.3f}", interval)
     console.print(table)
     for one in last.measured.suspected:

@@ -151,6 +151,8 @@ def line(verdicts, measured, predicted, explained=0.5, cut_short=0, suspected=()
             "verdicts": verdicts,
             "moved": moved,
             "identifiable": known,
+            "weak": ["trunk_mass"],
+            "together": [{"weights": {"trunk_mass": 1.0, "thigh_mass": 0.4}, "error": 0.03}],
             "compared_s": 2.5,
             "explained": {"fall_rate": explained, **simulated},
             **calls,

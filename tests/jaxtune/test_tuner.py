@@ -2,6 +2,7 @@ import dataclasses
 import functools
 import re
 import textwrap
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 import toys
 
-from jaxtune import baselines, dvm, rules, spm
+from jaxtune import baselines, dvm, explain, rules, spm
 from jaxtune import dist as dists
 from jaxtune import tuner as tuners
 from jaxtune.tuner import GateInfo, Tuner, UpdateInfo, knobs
@@ -553,6 +554,17 @@ def test_a_set_that_was_not_accepted_is_explained_without_movements(play):
     assert "Do not trust the parameters." in text
 
 
+def test_what_is_known_weakly_or_only_together_is_said(play):
+    info = play(0.5)[2]
+    # Errors of 0.5 radii, nine tenths of a draw's, that cancel in the sum.
+    errors = 0.25 * jnp.array([[1.0, -0.98], [-0.98, 1.0]])
+    text = tuners.explain(info.replace(update=info.update.replace(errors=errors)))
+    assert "mass: 0.000 -> 0.100 +- 0.025, weakly identified" in text
+    assert re.search(r"together: 1 friction \+1 mass is known to 0\.020", text)
+    # No errors, no statement.
+    assert "weakly" not in tuners.explain(info) and "together" not in tuners.explain(info)
+
+
 def test_a_parameter_that_the_episodes_do_not_show_is_said_so(play):
     info = play(0.5)[2]
     info = info.replace(update=info.update.replace(identifiable=jnp.array([True, False])))
@@ -672,6 +684,27 @@ def test_posterior_moves_to_the_truth_narrows_and_leaves_the_unseen_alone(side):
     assert info.step[0] == 0.0
     # As wide as the 0.9 quantile of uniform draws, 0.9 of the radius.
     np.testing.assert_allclose(info.interval[0], 0.9, atol=0.15)
+
+
+def test_coordinates_that_trade_against_each_other_are_known_together():
+    # What moves is the sum of both, so neither is known alone.
+    dist = toys.uniform({"friction": 0.0, "load": 0.0, "mass": 0.0}, 0.4)
+    key_simulate, key_measure = jax.random.split(jax.random.key(0))
+    together = lambda coords: {"friction": coords["friction"], "mass": coords["mass"] + coords["load"]}  # noqa: E731
+    machine = Tuner(
+        config=toys.TUNER,
+        train_policy=tuners.keep,
+        simulate=lambda key, policy, coords: SLIDER.simulate(key, policy, together(coords)),
+    )
+    collected = machine.collect(key_simulate, toys.policy(), dist)
+    measured = SLIDER.measure({"friction": 0.1, "mass": 0.2}, 3)(key_measure, toys.policy())
+    _, update = tuners.posterior_update(key_measure, toys.TUNER, collected, measured, dist, knobs())
+    info = SimpleNamespace(dist=dist, update=update)
+    np.testing.assert_array_equal(explain.weak(info), [False, True, True])
+    (both,) = explain.combinations(info)
+    assert both.weights == pytest.approx({"load": 1.0, "mass": 1.0}, abs=0.15)
+    # Of a sum that has a standard deviation of 0.33 in the distribution.
+    assert 0.0 < both.error < 0.08
 
 
 def test_posterior_narrows_no_further_than_it_may():
