@@ -44,13 +44,16 @@ _LINE_SEARCHES = 6  # of MJX's solver, the fewest with which dry friction comes 
 class Args:
     """Measures one thing, prints it as a table and writes it as JSON."""
 
-    what: tyro.conf.Positional[Literal["speed", "devices", "profile", "estimates", "targets", "rig", "logs", "tuner"]]
+    what: tyro.conf.Positional[
+        Literal["speed", "devices", "profile", "estimates", "memory", "targets", "rig", "logs", "tuner"]
+    ]
     """speed: training steps per second, with exact and fast physics. devices: steps per second of episodes and of
     training on one device, two, four and so on. profile: where the time of a tuning goes. estimates: errors of the
-    regression and of the search-parameter model on the same episodes. targets: simulation steps per second of every
-    engine that is installed. rig: simulation steps per second of suspended robots, with the step of MJX
-    and with that of discovery. logs: seconds to read ten minutes of 40 columns at 1 kHz. tuner: seconds to
-    compile and to run a tuning, and four runs side by side, of the CheetahRun of MuJoCo Playground."""
+    regression and of the search-parameter model on the same episodes. memory: resident memory of this process over 50
+    tunings with training. targets: simulation steps per second of every engine that is installed. rig: simulation steps
+    per second of suspended robots, with the step of MJX and with that of discovery. logs: seconds to read ten minutes
+    of 40 columns at 1 kHz. tuner: seconds to compile and to run a tuning, and four runs side by side, of the CheetahRun
+    of MuJoCo Playground."""
     out: Path = Path("runs/bench")
     """Folder of the results, a JSON file for each measurement."""
     preset: str = "cpu"
@@ -244,6 +247,7 @@ MEASURES = {
     "devices": lambda args: costs.on_devices(preset(args.preset), args.policy),
     "profile": lambda args: costs.profile(preset(args.preset), args.policy),
     "estimates": lambda args: costs.estimates(preset(args.preset), args.policy, args.radius, args.seeds),
+    "memory": lambda args: costs.memory(preset(args.preset), args.policy),
     "targets": targets,
     "rig": rig,
     "logs": logs,

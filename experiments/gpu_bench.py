@@ -67,7 +67,6 @@ def commands(sizes: str, out: Path) -> dict[str, list[str]]:
         "sweep": [
             *["experiments.sweep", "--preset", sizes, "--step-sizes", *settings, "--out", str(out / "sweep")],
             *(["--widen-factors", "2.0", "--radii", "0.2", "--levels", "0.9", "--seeds", "0"] if small else []),
-            *([] if small else ["--seeds", "0", "1"]),
         ],
         "profile": ["experiments.bench", "profile", "--preset", sizes, "--out", str(out / "bench")],
     }
@@ -82,8 +81,8 @@ def _training(out: Path) -> dict[str, float]:
     curve = read_json(out / "policy" / "curve.json")["curve"]
     first, last = curve[0], curve[-1]
     # The first line of the curve holds the compilation; all lines are of equal work.
-    seconds = (last["seconds"] - first["seconds"]) * len(curve) / max(len(curve) - 1, 1)
-    return {"steps": last["steps"], "with_compilation_s": last["seconds"], "without_s": seconds}
+    later = (last["seconds"] - first["seconds"]) / (len(curve) - 1) if len(curve) > 1 else last["seconds"]
+    return {"steps": last["steps"], "with_compilation_s": last["seconds"], "without_s": later * len(curve)}
 
 
 def _tunings(place: str) -> Callable[[Path], dict[str, float]]:

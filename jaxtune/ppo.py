@@ -23,6 +23,7 @@ collected the rollout (`PPO._steer`).
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import chex
 import jax
@@ -196,8 +197,8 @@ class PPO:
 
         Returns:
           The learner, the environments' state, and metrics as scalars: the environment's own (means over the rollout),
-          `reward` per step, `done` (share of steps that ended an episode), `kl` (nats), `learning_rate`, `loss`, and
-          `std` of the actions.
+          `reward` per step, `done` (share of steps that ended an episode), `kl` (nats), `learning_rate`, `loss`, `std`
+          of the actions, and `skipped`, the share of gradient steps that were not taken since a number was not finite.
         """
         key_unroll, key_learn = jax.random.split(key)
         keys = jax.random.split(key_unroll, self.config.num_envs)
@@ -205,6 +206,7 @@ class PPO:
         data = devices.gather(data)
         # As in Brax's own training, the loss already reads observations with the updated statistics.
         normalizer = running_statistics.update(state.normalizer, data.observation)
+        normalizer = _choose(_finite(normalizer), normalizer, state.normalizer)
         (params, opt_state), learned = jax.lax.scan(
             lambda carry, key: self._pass(key, carry, normalizer, data),
             (state.params, state.opt_state),
@@ -212,7 +214,8 @@ class PPO:
         )
         metrics = {"reward": data.reward, "done": 1.0 - data.discount, **env_metrics, **learned}
         state = PPOState(params=params, normalizer=normalizer, opt_state=opt_state)
-        return state, env_state, jax.tree.map(jnp.mean, metrics)
+        # Steps that were not taken have no loss; `skipped` counts them.
+        return state, env_state, jax.tree.map(jnp.nanmean, metrics)
 
     def collect(
         self, keys: jax.Array, state: PPOState, env: Env, env_state: State
@@ -271,13 +274,15 @@ class PPO:
         learning_rate = self._steer(opt_state.hyperparams["learning_rate"], aux["kl_mean"])
         opt_state = opt_state._replace(hyperparams={**opt_state.hyperparams, "learning_rate": learning_rate})
         updates, opt_state = self._optimizer.update(grads, opt_state, params)
+        sane = _finite((loss, updates, opt_state))
         metrics = {
             "loss": loss,
             "kl": aux["kl_mean"],
             "std": aux["policy_dist_mean_std"],
             "learning_rate": learning_rate,
+            "skipped": 1.0 - sane,
         }
-        return (optax.apply_updates(params, updates), opt_state), metrics
+        return _choose(sane, (optax.apply_updates(params, updates), opt_state), carry), metrics
 
     def _steer(self, learning_rate: jax.Array, kl: jax.Array) -> jax.Array:
         """Adapts the step size to the divergence, within its range (Rudin et al., CoRL 2021).
@@ -292,3 +297,12 @@ class PPO:
         faster = jnp.minimum(learning_rate * 1.5, high)
         target = self.config.target_kl
         return jnp.where(kl > 2 * target, slower, jnp.where((kl < target / 2) & (kl > 0), faster, learning_rate))
+
+
+def _finite(values: Any) -> jax.Array:
+    """Tells whether all numbers of a pytree are finite; whole numbers are."""
+    return jnp.all(jnp.stack([jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(values)]))
+
+
+def _choose(condition: jax.Array, then: Any, otherwise: Any) -> Any:
+    return jax.tree.map(lambda one, other: jnp.where(condition, one, other), then, otherwise)

@@ -1,11 +1,14 @@
-"""Where the time of a tuning goes, what more devices save of it, and how exact its estimates are.
+"""Where the time of a tuning goes, what more devices save of it, how exact its estimates are, and its memory.
 
-`experiments.bench` prints all three.
+`experiments.bench` prints all four.
 """
 
+import gc
+import os
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -19,11 +22,12 @@ from experiments.common.config import Preset
 from experiments.walking.learner import Learner, Policy
 from experiments.walking.policies import starting_policy
 from experiments.walking.robots import BITENO
-from jaxtune import devices, dvm, regression, rules, spm
+from jaxtune import devices, dvm, regression, rules, spm, tuner
 from jaxtune import dist as dists
 from jaxtune.mjx import parameters
 
 _STEPS = 50  # in which the speed of MuJoCo C is measured
+_SETTLED = 5  # tunings after which memory should be flat
 _TIMES = 3  # runs of a program, of which the fastest counts
 
 
@@ -191,6 +195,42 @@ def estimates(sizes: Preset, policy: str, radius: float, seeds: Sequence[int]) -
             **by_coordinate,
         }
     return rows
+
+
+def memory(sizes: Preset, policy: str, tunings: int = 50) -> dict[str, dict]:
+    """Measures the resident memory of this process over many tunings, each with its training.
+
+    Args:
+      sizes: of everything.
+      policy: what walks first.
+      tunings: number of them.
+
+    Returns:
+      By number of the tuning, from 1: `resident_mib`, and `growth`, that since the fifth tuning as a share of it. By
+      then everything is compiled and allocated.
+    """
+    learner = Learner(sizes, BITENO.chosen("legs6"))
+    play = learner.play(MjxTarget(robot=learner.robot, params=parameters.nominal(learner.entries)))
+    machine = learner.tuner()
+    step = learner.step(machine, play)
+    dist = learner.dist(parameters.nominal(learner.entries), 0.2)
+    state, resident = machine.init(starting_policy(policy, learner), dist, tuner.knobs()), []
+    for number in range(tunings):
+        state, _ = step(jax.random.PRNGKey(number), state)
+        jax.block_until_ready(state)
+        gc.collect()
+        resident.append(_resident())
+    settled = resident[min(_SETTLED, tunings) - 1]
+    return {
+        str(number + 1): {"resident_mib": size / 2**20, "growth": size / settled - 1.0}
+        for number, size in enumerate(resident)
+        if number % 5 == 4 or number == 0
+    }
+
+
+def _resident() -> int:
+    """Bytes of this process in memory (Linux)."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
 def _timed(program: Callable, inputs: tuple) -> tuple[Any, float]:
