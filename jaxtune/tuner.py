@@ -33,8 +33,8 @@ Departures from the paper, besides those of gate and update (`jaxtune.rules`):
 - An accepted set is read up to `refinements` times more, with episodes simulated in the distribution that the update
   narrowed. In a narrower distribution estimates are more exact, and the robot need not walk for it. If the set does
   not fit there (`UpdateInfo.p_value` <= 1 - level), the radius before is taken back. If it does not whatever the
-  coordinates (`p_misfit` <= 0.01), the verdict becomes `unexplained`: in a wide distribution, parameters can absorb
-  what is missing.
+  coordinates when it is read again for the first time (`p_misfit` <= 0.01), the verdict becomes `unexplained`: in a
+  wide distribution, parameters can absorb what is missing.
 - A tuning ends with training the policy, where the paper's begins with it. The last tuning therefore leaves a policy
   that was trained in the last distribution.
 - The radius grows only after a failed check (in print it grows before each), is capped by the bounds, and the loop ends
@@ -351,7 +351,9 @@ class Tuner:
         # The gate has just tested the distribution of the first reading.
         again = carry["left"] < 1 + self.config.refinements
         misfits = again & (update.p_value <= 1.0 - knobs.level)
-        unexplained = again & (update.p_misfit <= _UNEXPLAINED)
+        # Tested once a tuning, so that its rate of false alarms is that of one test.
+        first = carry["left"] == self.config.refinements
+        unexplained = first & (update.p_misfit <= _UNEXPLAINED)
         radius, unit = dists.ravel(dist.radius), dists.ravel(tested.radius)
         changed = (dists.ravel(moved.radius) < _CHANGED * radius) | (jnp.abs(update.step) > 1.0 - _CHANGED)
         update = update.replace(

@@ -758,12 +758,12 @@ def test_an_accepted_set_is_read_again_until_the_distribution_hardly_narrows(ref
     )
 
 
-def misfitting(p_value, p_misfit):
-    """`halving`, whose set does not fit from the second reading on."""
+def misfitting(p_value, p_misfit, below=0.9):
+    """`halving`, whose set does not fit where the radius is below a share of the first one: from the second reading."""
 
     def update(key, config, collected, measured, dist, knobs):
         moved, info = halving(key, config, collected, measured, dist, knobs)
-        again = dists.ravel(dist.radius).max() < 0.9 * FIRST_RADIUS
+        again = dists.ravel(dist.radius).max() < below * FIRST_RADIUS
         p = [jnp.where(again, value, 1.0) for value in (p_value, p_misfit)]
         return moved, info.replace(p_value=p[0], p_misfit=p[1])
 
@@ -796,6 +796,22 @@ def test_a_narrower_distribution_that_does_not_fit_is_taken_back(p_value, p_misf
     interval = {0.04: 0.5 * 0.25, 0.2: 1.0}[radius] if verdict == Verdict.ACCEPT else np.nan
     np.testing.assert_allclose(info.update.interval, interval, rtol=1e-5)
     np.testing.assert_allclose(info.update.step, centre / FIRST_RADIUS, rtol=1e-5)
+
+
+def test_a_set_is_unexplained_by_its_first_reading_in_a_narrower_distribution_alone():
+    # Several readings would be several tests at 1 %.
+    tuner = Tuner(
+        config=dataclasses.replace(toys.TINY, refinements=2),
+        train_policy=toys.train_policy,
+        simulate=SLIDER.simulate,
+        verify=baselines.open_gate,
+        update=misfitting(0.01, 0.01, below=0.4),
+    )
+    measured = SLIDER.measure(TWO, 2)(jax.random.key(0), toys.policy())
+    state, info = jax.jit(tuner.tune)(jax.random.key(1), start(tuner), measured)
+    assert info.verdicts[0] == Verdict.ACCEPT
+    # The last narrowing, from a half to a quarter, is taken back.
+    np.testing.assert_allclose(dists.ravel(state.dist.radius), 0.5 * FIRST_RADIUS, rtol=1e-5)
 
 
 # All of it ---------------------------------------------------------------------------------------------------------
