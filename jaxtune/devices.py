@@ -26,6 +26,10 @@ AXIS = "devices"
 def mesh(count: int | None = None) -> Mesh:
     """Makes a mesh of the first `count` devices, or of all.
 
+    With JAX 0.11 it also turns the partitioner Shardy off, for the whole process: on an empty constant in a function
+    that is spread, such as MJX makes for whatever a model lacks, that one ends the process (seen with 0.11.2). A
+    program with a mesh of its own sets `jax_use_shardy_partitioner` to False itself.
+
     Raises:
       ValueError: there are not so many.
     """
@@ -33,6 +37,8 @@ def mesh(count: int | None = None) -> Mesh:
     count = len(every) if count is None else count
     if not 1 <= count <= len(every):
         raise ValueError(f"devices: got {count}, expected 1 to {len(every)}")
+    if count > 1 and jax.__version_info__ >= (0, 11):
+        jax.config.update("jax_use_shardy_partitioner", False)
     return jax.make_mesh((count,), (AXIS,), devices=every[:count], axis_types=(AxisType.Auto,))
 
 
