@@ -57,7 +57,9 @@ class Args:
     gates: int = 2
     """Gates, each with episodes and models of its own."""
     whole: int = 0
-    """Robots of every case with which a whole tuning is run as well; each takes as long as a tuning does."""
+    """Robots of every case with which whole tunings are run as well."""
+    tunings: int = 1
+    """Whole tunings of each of these robots, one after another; the policy stays as it is."""
     others: tuple[str, ...] = ()
     """Differences that the gate should notice, as name=value in physical values: torque_scale=0.75, or '*_mass=2' for
     all tuned masses at once. Several names are joined by commas. If none, every parameter of the robot that is not
@@ -129,7 +131,7 @@ def check(args: Args) -> tuple[Kind, dict[str, Entry], dict[str, dict[str, float
     """
     sizes, robot = preset(args.preset), kind(args.robot)
     entries = robot.chosen(args.parameters)
-    check_positive(radius=args.radius, robots=args.robots, gates=args.gates)
+    check_positive(radius=args.radius, robots=args.robots, gates=args.gates, tunings=args.tunings)
     if args.whole < 0:
         raise ValueError(f"whole: got {args.whole}, expected 0 or more")
     numbers = args.episodes or (sizes.tuner.set_episodes,)
@@ -163,6 +165,7 @@ def tested(args: Args, robot: Kind, entries, others, episodes: int, progress: Pr
         robots=args.robots,
         gates=args.gates,
         whole=args.whole,
+        tunings=args.tunings,
         others=coords,
         done=lambda number, total: progress.update(task, completed=number, total=total),
     )
@@ -185,9 +188,8 @@ def show(reports: Mapping[int, SelfTest]) -> None:
             table.add_row(name, "", "", "", _rate(rate), "")
         console.print(table)
         console.print(f"all true values in their intervals: {_rate(report.covered)}", markup=False)
-        for name, ends in report.tuned.items():
-            held = f"truth in the distribution after: {_rate(report.held[name])}"
-            console.print(f"whole tunings, {name}: {ends}; {held}", markup=False)
+        for place, text in selftest.whole_tunings(report).items():
+            console.print(f"{place}: {text}", markup=False)
     for line in lacking(reports):
         console.print(line, markup=False, highlight=False)
 

@@ -23,7 +23,7 @@ import numpy as np
 
 from jaxtune import devices
 from jaxtune import dist as dists
-from jaxtune.tuner import Tuner, TunerState
+from jaxtune.tuner import Info, Tuner, TunerState
 from jaxtune.types import Coords, ParamDist, Verdict
 
 INSIDE = "inside the distribution"
@@ -61,6 +61,20 @@ class Rate:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Tuned:
+    """What was counted of one tuning, the first, second and so on of the robots of a case."""
+
+    verdicts: dict[str, int]
+    """How it ended: robots by verdict."""
+    held: Rate
+    """Robots accepted whose true coordinates all lie in the distribution afterwards."""
+    covered: Rate
+    """Robots accepted whose identifiable coordinates all lie in their intervals."""
+    error: dict[str, float]
+    """Median |centre - truth| afterwards, by coordinate, whatever the verdict."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class SelfTest:
     """What was counted. Robots of one gate share its models, so they are no independent draws."""
 
@@ -85,10 +99,8 @@ class SelfTest:
     """Median half width of its interval, likewise."""
     covered: Rate
     """Robots inside whose identifiable coordinates all lie in their intervals."""
-    tuned: dict[str, dict[str, int]]
-    """How whole tunings ended: counts of verdicts by case; empty where none was run."""
-    held: dict[str, Rate]
-    """Accepted whole tunings after which all true coordinates lie in the distribution, by case."""
+    tuned: dict[str, tuple[Tuned, ...]]
+    """Whole tunings in their order, by case; empty where none was run."""
 
 
 def run(
@@ -99,6 +111,7 @@ def run(
     robots: int = 20,
     gates: int = 1,
     whole: int = 0,
+    tunings: int = 1,
     others: Mapping[str, Coords] = MappingProxyType({}),
     done: Callable[[int, int], None] = lambda number, total: None,
 ) -> SelfTest:
@@ -110,21 +123,23 @@ def run(
       state: whose policy walks, and whose distribution is tested.
       robots: simulated robots of every case and gate.
       gates: calls of the gate, each with new episodes and models. Models differ by chance, so rates need several.
-      whole: robots of every case with which a whole tuning is run as well, widenings and refinements included.
+      whole: robots of every case with which whole tunings are run as well, widenings and refinements included.
+      tunings: of each such robot, one after another. Each measures a new set and starts from the distribution that the
+        one before left; the policy stays as it is.
       others: cases by name, of coordinates that replace those drawn. `tuner.simulate` must know them; a coordinate that
         is not in the distribution is 0, that is nominal, in all other cases.
       done: called after every gate and tuning with their number so far and in all.
 
     Raises:
-      ValueError: fewer than two robots, or no gate.
+      ValueError: fewer than two robots, or no gate or tuning.
     """
-    if robots < 2 or gates < 1:
-        raise ValueError(f"robots, gates: got {robots} and {gates}, expected at least 2 and 1")
+    if robots < 2 or gates < 1 or tunings < 1:
+        raise ValueError(f"robots, gates, tunings: got {robots}, {gates} and {tunings}, expected at least 2, 1 and 1")
     outside = _outside(state.dist)
     others = {name: dict(coords) for name, coords in others.items()}
     extra = sorted({name for coords in others.values() for name in coords} - set(dists.names(state.dist)))
     key_gates, key_whole = jax.random.split(key)
-    total = gates + whole * (1 + len(others))
+    total = gates + whole * tunings * (1 + len(others))
     cases = [{}, *outside.values(), *others.values()]
     calls = _call(key_gates, tuner, state, cases, extra, robots, gates, lambda number: done(number, total))
     rejected, noticed = (
@@ -132,7 +147,9 @@ def run(
     )
     ends = len(outside) + 1
     whole_cases = {INSIDE: {}} | others if whole else {}
-    tuned, held = _tune(key_whole, tuner, state, whole_cases, extra, whole, lambda number: done(gates + number, total))
+    tuned = _tune(
+        key_whole, tuner, state, whole_cases, extra, whole, tunings, lambda number: done(gates + number, total)
+    )
     known, errors, intervals = (calls[name] for name in ("identifiable", "errors", "intervals"))
     unit, order = np.asarray(dists.ravel(state.dist.radius)), dists.names(state.dist)
     columns = lambda values: dict(zip(order, np.moveaxis(values, -1, 0), strict=True))  # noqa: E731
@@ -152,7 +169,6 @@ def run(
         interval=median(intervals),
         covered=_count(((errors <= intervals) | ~known).all(axis=-1)),
         tuned=tuned,
-        held=held,
     )
 
 
@@ -205,25 +221,50 @@ def _tune(
     cases: Mapping[str, Mapping],
     extra: list[str],
     robots: int,
+    tunings: int,
     done: Callable[[int], None],
-) -> tuple[dict[str, dict[str, int]], dict[str, Rate]]:
-    """Runs whole tunings: counts of verdicts, and accepted ones that hold the truth, by case."""
+) -> dict[str, tuple[Tuned, ...]]:
+    """Runs whole tunings of robots of every case, and counts how they end."""
     measure, tune = (devices.on_all(jax.jit(program)) for program in (partial(_measured, tuner), tuner.tune))
-    tuned, held = {}, {}
+    tuned = {}
     for number, (name, replaced) in enumerate(cases.items()):
-        ends, inside = Counter(), []
+        rows = []
         for robot in range(robots):
-            keys = jax.random.split(jax.random.fold_in(jax.random.fold_in(key, number), robot), 3)
-            coords = _draw(keys[0], state.dist, 1, replaced, extra)
-            measured = jax.tree.map(lambda leaf: leaf[0], measure(keys[1], state, coords))
-            after, info = tune(keys[2], state, measured)
-            verdict = Verdict(int(info.verdicts[int(info.calls) - 1]))
-            ends[verdict.name.lower()] += 1
-            if verdict == Verdict.ACCEPT:
-                inside.append(bool(_inside(after.dist, coords).all()))
-            done(number * robots + robot + 1)
-        tuned[name], held[name] = dict(ends), Rate(sum(inside), len(inside))
-    return tuned, held
+            key_robot = jax.random.fold_in(jax.random.fold_in(key, number), robot)
+            coords, now = _draw(key_robot, state.dist, 1, replaced, extra), state
+            for index in range(tunings):
+                key_measure, key_tune = jax.random.split(jax.random.fold_in(key_robot, index + 1))
+                measured = jax.tree.map(lambda leaf: leaf[0], measure(key_measure, now, coords))
+                now, info = jax.device_get(tune(key_tune, now, measured))
+                rows.append(_ended(now.dist, info, coords))
+                done((number * robots + robot) * tunings + index + 1)
+        tuned[name] = tuple(_tuned(rows[index::tunings], dists.names(state.dist)) for index in range(tunings))
+    return tuned
+
+
+def _ended(dist: ParamDist, info: Info, coords: Coords) -> dict:
+    """How one tuning of a robot, coordinates [1] by name, ended: with the distribution that it left."""
+    truth = np.asarray(dists.ravel({name: coords[name][0] for name in dist.centre}))
+    centre, radius = (np.asarray(dists.ravel(value)) for value in (info.dist.centre, info.dist.radius))
+    errors = np.abs(centre + radius * info.update.step - truth)
+    verdict = Verdict(int(info.verdicts[int(info.calls) - 1]))
+    return {
+        "verdict": verdict,
+        "held": bool(_inside(dist, coords).all()),
+        "covered": bool(((errors <= radius * info.update.interval) | ~info.update.identifiable).all()),
+        "errors": np.abs(np.asarray(dists.ravel(dist.centre)) - truth),
+    }
+
+
+def _tuned(rows: Sequence[Mapping], names: Sequence[str]) -> Tuned:
+    """Counts rows of `_ended`, one for each robot."""
+    accepted = [row for row in rows if row["verdict"] == Verdict.ACCEPT]
+    return Tuned(
+        verdicts=dict(Counter(row["verdict"].name.lower() for row in rows)),
+        held=Rate(sum(row["held"] for row in accepted), len(accepted)),
+        covered=Rate(sum(row["covered"] for row in accepted), len(accepted)),
+        error=dict(zip(names, np.median([row["errors"] for row in rows], axis=0).tolist(), strict=True)),
+    )
 
 
 def _count(values: np.ndarray) -> Rate:
@@ -244,11 +285,23 @@ def summary(report: SelfTest) -> str:
         held = percent(report.noticed[name])
         lines.append(f"{name}: {told}; rejected one radius outside: {percent(rate)}, or then inside: {held}")
     lines += [f"{name}: rejected: {percent(rate)}" for name, rate in report.others.items()]
-    lines += [
-        f"whole tunings, {name}: " + ", ".join(f"{count} {verdict}" for verdict, count in sorted(ends.items()))
-        for name, ends in report.tuned.items()
-    ]
+    lines += [f"{place}: {text}" for place, text in whole_tunings(report).items()]
     return "\n".join(lines)
+
+
+def whole_tunings(report: SelfTest) -> dict[str, str]:
+    """Says in words how whole tunings ended, by case and number of the tuning."""
+    return {
+        f"tuning {index + 1}, {name}": ", ".join(
+            [
+                *(f"{count} {verdict}" for verdict, count in sorted(one.verdicts.items())),
+                f"truth in the distribution: {one.held.hits} of {one.held.of}",
+                f"in its intervals: {one.covered.hits} of {one.covered.of}",
+            ]
+        )
+        for name, each in report.tuned.items()
+        for index, one in enumerate(each)
+    }
 
 
 def _outside(dist: ParamDist) -> dict[str, dict[str, np.ndarray]]:

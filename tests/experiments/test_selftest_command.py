@@ -7,7 +7,7 @@ from rich.console import Console
 from experiments import selftest
 from experiments.common import plots
 from experiments.walking.robots import BITENO
-from jaxtune.selftest import Rate, SelfTest
+from jaxtune.selftest import Rate, SelfTest, Tuned
 
 LEGS = BITENO.chosen("legs6")
 
@@ -52,6 +52,7 @@ def test_a_case_that_cannot_be_is_named(option, message):
         ({"robots": 0}, "robots: got 0"),
         ({"gates": -1}, "gates: got -1"),
         ({"whole": -1}, "whole: got -1, expected 0 or more"),
+        ({"tunings": 0}, "tunings: got 0"),
         ({"episodes": (5, 0)}, "episodes: got 0"),
         ({"level": 1.5}, "level: got 1.5"),
         ({"radius": 0.0}, "radius: got 0.0"),
@@ -74,8 +75,11 @@ REPORT = SelfTest(
     error={"colour": float("nan"), "mass": 0.02},
     interval={"colour": float("nan"), "mass": 0.07},
     covered=Rate(36, 40),
-    tuned={"inside the distribution": {"accept": 3}},
-    held={"inside the distribution": Rate(3, 3)},
+    tuned={
+        "inside the distribution": (
+            Tuned(verdicts={"accept": 3}, held=Rate(3, 3), covered=Rate(2, 3), error={"colour": 0.1, "mass": 0.02}),
+        )
+    },
 )
 
 
@@ -87,7 +91,8 @@ def test_tables_say_what_was_counted(monkeypatch):
     assert re.search(r"mass, one radius outside +│ 1.00 +│ 0.020 +│ 0.070 +│ 0.95 \(0.83 to 0.99\) +│ 0.97", text)
     assert re.search(r"colour, one radius outside +│ 0.0\d +│ - +│ - +│ bounds leave no room", text)
     assert "all true values in their intervals: 0.90" in text
-    assert "whole tunings, inside the distribution: {'accept': 3}" in text
+    assert "tuning 1, inside the distribution: 3 accept, truth in the distribution: 3 of 3" in text
+    assert "in its intervals: 2 of 3" in text
 
 
 def test_the_plot_has_a_row_for_every_case(tmp_path):

@@ -8,6 +8,7 @@ import toys
 from jaxtune import selftest
 from jaxtune.selftest import INSIDE, Rate
 from jaxtune.tuner import Tuner, keep, knobs
+from jaxtune.types import Verdict
 
 THREE = {"colour": 0.0, "friction": 0.0, "mass": 0.0}  # colour enters no equation of the slider
 CONFIG = dataclasses.replace(toys.TUNER, episodes=256, dvm=dataclasses.replace(toys.DVM, train_steps=60))
@@ -24,9 +25,17 @@ def report():
     others = {"push": {"wind": 0.6}, "heavy": {"mass": 0.9}}
     calls = []
     found = selftest.run(
-        jax.random.key(0), tuner, state, robots=12, gates=2, whole=2, others=others, done=lambda *now: calls.append(now)
+        jax.random.key(0),
+        tuner,
+        state,
+        robots=12,
+        gates=2,
+        whole=2,
+        tunings=2,
+        others=others,
+        done=lambda *now: calls.append(now),
     )
-    assert calls == [(number, 8) for number in range(1, 9)]
+    assert calls == [(number, 14) for number in range(1, 15)]
     return found
 
 
@@ -50,12 +59,25 @@ def test_what_the_robot_does_not_show_is_said(report):
 
 
 def test_whole_tunings_say_how_they_end(report):
-    assert sum(report.tuned[INSIDE].values()) == 2
-    assert report.tuned[INSIDE] == {"accept": 2}
-    # A mass beyond the first box is found by widening; no parameter stands in for a push.
-    assert report.tuned["heavy"] == {"accept": 2}
-    assert report.held["heavy"].of == 2
-    assert "accept" not in report.tuned["push"]
+    for first, last in (report.tuned[INSIDE], report.tuned["heavy"]):
+        # A mass beyond the first box is found by widening.
+        assert first.verdicts == {"accept": 2}
+        assert first.held.of == first.covered.of == 2
+        assert last.error["mass"] < 0.1
+    # No parameter stands in for a push.
+    for one in report.tuned["push"]:
+        assert "accept" not in one.verdicts
+        assert one.held == Rate(0, 0)
+    assert "tuning 2, heavy: 2 accept, truth in the distribution: 2 of 2" in selftest.summary(report)
+
+
+def test_a_tuning_is_counted_by_its_verdict_box_and_intervals():
+    row = {"verdict": Verdict.ACCEPT, "held": True, "covered": False, "errors": np.array([0.1, 0.3])}
+    rows = [row, row | {"covered": True, "errors": np.array([0.2, 0.3])}, row | {"verdict": Verdict.UNEXPLAINED}]
+    one = selftest._tuned(rows, ("friction", "mass"))
+    assert one.verdicts == {"accept": 2, "unexplained": 1}
+    assert (one.held, one.covered) == (Rate(2, 2), Rate(1, 2))
+    assert one.error == {"friction": 0.1, "mass": 0.3}
 
 
 def test_gates_that_differ_count_for_fewer_robots():
@@ -74,7 +96,8 @@ def test_a_bound_that_leaves_no_room_outside_is_left_out():
     assert selftest._outside(toys.uniform({"mass": 0.0}, 0.2, 0.3)) == {}
 
 
-@pytest.mark.parametrize(("robots", "gates"), [(1, 1), (2, 0)])
-def test_a_test_of_nothing_is_refused(robots, gates):
-    with pytest.raises(ValueError, match=f"robots, gates: got {robots} and {gates}, expected at least 2 and 1"):
-        selftest.run(jax.random.key(0), *machine(), robots=robots, gates=gates)
+@pytest.mark.parametrize(("robots", "gates", "tunings"), [(1, 1, 1), (2, 0, 1), (2, 1, 0)])
+def test_a_test_of_nothing_is_refused(robots, gates, tunings):
+    got = f"robots, gates, tunings: got {robots}, {gates} and {tunings}, expected at least 2, 1 and 1"
+    with pytest.raises(ValueError, match=got):
+        selftest.run(jax.random.key(0), *machine(), robots=robots, gates=gates, tunings=tunings)
