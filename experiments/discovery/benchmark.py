@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Protocol
 
 from experiments.common import checkpoint, plots
-from experiments.common.checkpoint import read_json, write_json
+from experiments.common.checkpoint import read_json, write_json, write_text
 from experiments.discovery import gate
 from experiments.discovery.investigate import investigate
 from experiments.discovery.scores import page, score, tally
@@ -110,7 +110,7 @@ class Benchmark:
         single = [row for row in rows if len(row["effects"]) < 2]
         if single:
             plots.confusion(out / "confusion.png", [row | {"asked": _class_of(row)} for row in single])
-        (out / "README.md").write_text(page(identity, len(self.cases), rows, lines))
+        write_text(out / "README.md", page(identity, len(self.cases), rows, lines))
         return lines
 
 

@@ -75,7 +75,8 @@ def investigate(
     free = free_runs(log, question, result)
     stamp = {"seconds": time.monotonic() - began, "versions": checkpoint.versions()}
     summary = summarise(question, log, logs[0], result) | stamp
-    write_json(out / "summary.json", summary)
-    write_json(out / "details.json", details(question, result, free))
     corrected.save(out / "model", spec, question.rig, result.model)
+    write_json(out / "details.json", details(question, result, free))
+    # Last: a discovery with this file is finished.
+    write_json(out / "summary.json", summary)
     return Answer(log=log, question=question, result=result, summary=summary, free=free)

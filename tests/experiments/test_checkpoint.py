@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from faults import Killed, killed_at
 
 from experiments.common import checkpoint
 from experiments.common.config import PRESETS
@@ -27,36 +28,6 @@ CONFIG = {"hidden": [8]}
 
 def state(value):
     return {"kernel": jnp.full((3, 2), value), "steps": jnp.asarray(7), "none": jnp.zeros((0,))}
-
-
-class Killed(BaseException):
-    """Ends a process at once: no `except Exception` sees it."""
-
-
-def killed_at(monkeypatch, moment, write):
-    """Calls `write`, killed before or after one of its steps on the disk; tells whether there was such a step."""
-    steps = [0]
-
-    def counted(function):
-        def step(*args, **kwargs):
-            steps[0] += 1
-            if 2 * steps[0] == moment:
-                raise Killed
-            result = function(*args, **kwargs)
-            if 2 * steps[0] + 1 == moment:
-                raise Killed
-            return result
-
-        return step
-
-    with monkeypatch.context() as patch:
-        for module, name in ((os, "fsync"), (os, "replace"), (os, "rename"), (shutil, "rmtree")):
-            patch.setattr(module, name, counted(getattr(module, name)))
-        try:
-            write()
-        except Killed:
-            return True
-    return False
 
 
 def test_a_checkpoint_is_the_old_or_the_new_one_whenever_it_is_killed(monkeypatch, tmp_path):
