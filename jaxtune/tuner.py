@@ -35,6 +35,7 @@ Departures from the paper, besides those of gate and update (`jaxtune.rules`):
   not fit there (`UpdateInfo.p_value` <= 1 - level), the radius before is taken back. If it does not whatever the
   coordinates when it is read again for the first time (`p_misfit` <= 0.01), the verdict becomes `unexplained`: in a
   wide distribution, parameters can absorb what is missing.
+- The sets of earlier tunings count as well, since physics does not depend on the policy that walked (`rules.pooled`).
 - A tuning ends with training the policy, where the paper's begins with it. The last tuning therefore leaves a policy
   that was trained in the last distribution.
 - The radius grows only after a failed check (in print it grows before each), is capped by the bounds, and the loop ends
@@ -92,6 +93,7 @@ from jaxtune.rules import (
     misfits,
     no_gate_log,
     no_update,
+    pooled,
     posterior_update,
     vote_update,
 )
@@ -289,7 +291,20 @@ class Tuner:
             )
 
         carry = jax.lax.while_loop(lambda carry: carry["left"] > 0, body, self.before(state.dist))
-        return state.replace(dist=carry["dist"]), make_info(carry, measured)
+        return self.ended(state, carry, measured)
+
+    def ended(self, state: TunerState, carry: dict, measured: Trajectory) -> tuple[TunerState, Info]:
+        """Makes state and info of a tuning whose loop has ended; an accepted set is joined with earlier ones.
+
+        Args:
+          state: from before the tuning.
+          carry: what the loop carried last.
+          measured: the measured set.
+        """
+        joined = pooled(carry["dist"], carry["tested"], carry["update"])
+        accepted = carry["verdict"] == Verdict.ACCEPT
+        dist, update = _choose(accepted, joined, (carry["dist"], carry["update"]))
+        return state.replace(dist=dist), make_info(carry | {"update": update}, measured)
 
     def before(self, dist: ParamDist) -> dict:
         """Makes what the loop of a tuning carries before its first round; it ends when no rounds are `left`."""
@@ -362,9 +377,13 @@ class Tuner:
             identifiable=before.identifiable | update.identifiable,
             errors=update.errors * jnp.outer(radius / unit, radius / unit),
         )
-        # Taken back: what the reading before found remains, within the radius that it was found in.
+        # Taken back: what the reading before found remains, within the radius that it was found in. Its errors are not
+        # those of sets that fit.
         back = before.replace(
-            interval=dists.ravel(carry["wider"]) / unit, p_value=update.p_value, p_misfit=update.p_misfit
+            interval=dists.ravel(carry["wider"]) / unit,
+            p_value=update.p_value,
+            p_misfit=update.p_misfit,
+            errors=jnp.full_like(before.errors, jnp.nan),
         )
         nothing = no_update(tested).replace(p_value=update.p_value, p_misfit=update.p_misfit)
         verdict = jnp.where(unexplained, Verdict.UNEXPLAINED, carry["verdict"])

@@ -814,6 +814,92 @@ def test_a_set_is_unexplained_by_its_first_reading_in_a_narrower_distribution_al
     np.testing.assert_allclose(dists.ravel(state.dist.radius), 0.5 * FIRST_RADIUS, rtol=1e-5)
 
 
+# Sets of several tunings --------------------------------------------------------------------------------------------
+
+SPREAD = np.array([[0.01, 0.003], [0.003, 0.0025]], np.float32)  # covariance of one set's error, in coordinates
+
+
+@jax.jit
+def pool(dist, estimate, covariance, identifiable=(True, True)):
+    """Joins a distribution with the estimate of a set, as a tuning that neither widens nor narrows does."""
+    unit = dists.ravel(dist.radius)
+    step = (estimate - dists.ravel(dist.centre)) / unit
+    update = UpdateInfo(
+        step=step,
+        interval=jnp.ones(2),
+        identifiable=jnp.asarray(identifiable),
+        loss=jnp.zeros(()),
+        errors=covariance / jnp.outer(unit, unit),
+    )
+    return rules.pooled(dists.move(dist, step), dist, update)
+
+
+def test_sets_are_weighted_by_how_well_each_is_known():
+    first, update = pool(toys.uniform(TWO, 0.5), jnp.array([0.2, -0.1]), SPREAD)
+    # Nothing was known before: the first estimate stays as it is.
+    np.testing.assert_allclose(dists.ravel(first.centre), [0.2, -0.1], rtol=1e-5)
+    np.testing.assert_allclose(update.interval, 1.0, rtol=1e-4)
+    second, update = pool(first, jnp.array([0.26, -0.1]), 2.0 * SPREAD)
+    weights = np.linalg.inv(SPREAD), np.linalg.inv(2.0 * SPREAD)
+    joined = np.linalg.solve(sum(weights), weights[0] @ [0.2, -0.1] + weights[1] @ [0.26, -0.1])
+    np.testing.assert_allclose(dists.ravel(second.centre), joined, rtol=1e-3)
+    np.testing.assert_allclose(second.precision, sum(weights), rtol=1e-3)
+    # A third of the variance is left of what the second alone would leave.
+    np.testing.assert_allclose(update.interval, np.sqrt(1 / 3), rtol=1e-3)
+    np.testing.assert_allclose(dists.ravel(first.centre) + 0.5 * update.step, joined, rtol=1e-3)
+
+
+def test_five_sets_have_the_error_that_five_sets_should_have():
+    truth = jnp.array([0.1, -0.05])
+    estimates = truth + np.random.default_rng(0).multivariate_normal(np.zeros(2), SPREAD, (400, 5)).astype(np.float32)
+
+    def run(each):
+        dist = toys.uniform(TWO, 0.5)
+        for estimate in each:
+            dist, _ = pool(dist, estimate, SPREAD)
+        return dists.ravel(dist.centre) - truth
+
+    errors = np.asarray(jax.vmap(run)(estimates))
+    # One run in 250 forgets what chance contradicts, which costs a little.
+    np.testing.assert_allclose(errors.T @ errors / 400, SPREAD / 5, rtol=0.3)
+
+
+def test_what_contradicts_an_estimate_is_forgotten():
+    first, _ = pool(toys.uniform(TWO, 0.5), jnp.array([0.2, -0.1]), SPREAD)
+    second, update = pool(first, jnp.array([0.2, 0.3]), SPREAD)
+    np.testing.assert_allclose(dists.ravel(second.centre), [0.2, 0.3], rtol=1e-4)
+    np.testing.assert_allclose(second.precision, np.linalg.inv(SPREAD), rtol=1e-3)
+    np.testing.assert_allclose(update.interval, 1.0, rtol=1e-4)
+
+
+def test_an_update_without_errors_leaves_nothing_known():
+    first, _ = pool(toys.uniform(TWO, 0.5), jnp.array([0.2, -0.1]), SPREAD)
+    second, update = pool(first, jnp.array([0.1, 0.0]), jnp.full((2, 2), jnp.nan))
+    np.testing.assert_allclose(dists.ravel(second.centre), [0.1, 0.0], atol=1e-6)
+    np.testing.assert_array_equal(second.precision, 0.0)
+    np.testing.assert_array_equal(update.interval, 1.0)
+
+
+def test_a_coordinate_that_a_set_does_not_show_stays_where_it_is():
+    first, _ = pool(toys.uniform(TWO, 0.5), jnp.array([0.2, -0.1]), SPREAD)
+    second, update = pool(first, jnp.array([0.2, -0.08]), SPREAD, (False, True))
+    assert float(second.centre["friction"]) == pytest.approx(0.2, abs=1e-6)
+    assert -0.1 < float(second.centre["mass"]) < -0.08
+    assert float(update.step[0]) == pytest.approx(0.0, abs=1e-6)
+
+
+def test_a_tuning_that_is_not_accepted_forgets_nothing():
+    tuner = Tuner(config=toys.TINY, train_policy=toys.train_policy, simulate=SLIDER.simulate)
+    measured = SLIDER.measure(TWO, 2)(jax.random.key(0), toys.policy())
+    before = toys.uniform(TWO, FIRST_RADIUS).replace(precision=jnp.eye(2))
+    state = tuner.init(toys.policy(), before, knobs())
+    carry = tuner.before(before) | {"verdict": jnp.asarray(Verdict.RADIUS_EXHAUSTED)}
+    after, _ = tuner.ended(state, carry, measured)
+    close(after.dist, before)
+    accepted, _ = tuner.ended(state, carry | {"verdict": jnp.asarray(Verdict.ACCEPT)}, measured)
+    np.testing.assert_array_equal(accepted.dist.precision, 0.0)
+
+
 # All of it ---------------------------------------------------------------------------------------------------------
 
 
