@@ -6,6 +6,7 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.ticker import NullFormatter
 
 from envs.logs import Run
 from experiments.common.plots.base import save
@@ -119,12 +120,17 @@ def accepted_terms(terms: Sequence, labels: Sequence[str]) -> plt.Figure:
     """
     figure, axis = plt.subplots(figsize=(8, 1.5 + 0.5 * len(terms)), layout="constrained")
     place = np.arange(len(terms))
-    axis.barh(place, [term.evidence.gain for term in terms], color="tab:blue", height=0.5, label="gain")
-    axis.plot([term.thresholds.gain for term in terms], place, "|", color="black", ms=22, mew=2, label="threshold")
+    gains, thresholds = ([getattr(term, of).gain for term in terms] for of in ("evidence", "thresholds"))
+    axis.barh(place, gains, color="tab:blue", height=0.5, label="gain")
+    axis.plot(thresholds, place, "|", color="black", ms=22, mew=2, label="threshold")
     axis.set(yticks=place, xscale="log", xlabel="fall of the cost on train and select")
+    # Whole decades, so that there is more than one labelled tick; labels between them would overlap.
+    ends = np.log10([value for value in gains + thresholds if value > 0])
+    axis.set_xlim(10.0 ** np.floor(ends.min()), 10.0 ** np.ceil(ends.max()))
+    axis.xaxis.set_minor_formatter(NullFormatter())
     axis.set_yticklabels(labels)
     axis.invert_yaxis()
-    axis.legend(fontsize=8, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2)
+    axis.legend(fontsize=8, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, markerscale=0.4)
     return figure
 
 
