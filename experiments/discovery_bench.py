@@ -13,7 +13,7 @@ import jax
 from rich.table import Table
 
 from experiments.common import checkpoint
-from experiments.common.cli import console, run
+from experiments.common.cli import bars, console, run
 from experiments.discovery.blind_bench import Bench
 from experiments.discovery.blind_cases import SIZES
 from experiments.discovery.field.bench import FieldBench
@@ -64,19 +64,21 @@ def main(args: Args) -> None:
     made = FieldBench if args.size in FIELD_SIZES else Bench
     bench = made(args.out, args.size, args.seed, args.nominal_error)
     cases = bench.cases[: args.limit or None][int(number) :: int(pieces)]
+    with bars() as progress:
+        for done, case in enumerate(progress.track(cases, description="cases"), start=1):
+            if args.write_only:
+                console.print(f"{done}/{len(cases)} {bench.write(case)}")
+                continue
+            answer = bench.answer(case)
+            names = ", ".join(effect["name"] for effect in [*answer["effects"], *answer["parameter_changes"]])
+            console.print(
+                f"{done}/{len(cases)} case {case.number}: {answer['verdict']} {names} ({answer['seconds']:.0f} s)"
+            )
+            bench.report(identity)
+            if done % _KEPT == 0:
+                jax.clear_caches()
     if args.write_only:
-        for done, case in enumerate(cases, start=1):
-            console.print(f"{done}/{len(cases)} {bench.write(case)}")
         return
-    for done, case in enumerate(cases, start=1):
-        answer = bench.answer(case)
-        names = ", ".join(effect["name"] for effect in [*answer["effects"], *answer["parameter_changes"]])
-        console.print(
-            f"{done}/{len(cases)} case {case.number}: {answer['verdict']} {names} ({answer['seconds']:.0f} s)"
-        )
-        bench.report(identity)
-        if done % _KEPT == 0:
-            jax.clear_caches()
     table = Table("measure", "value", "95 % interval", "cases", "to reach")
     for cells in shown(bench.report(identity)):
         table.add_row(*cells)

@@ -15,8 +15,8 @@ from rich.table import Table
 
 from experiments.common import checkpoint, plots
 from experiments.common.checkpoint import read_json, write_json
-from experiments.common.cli import console, run
-from experiments.common.config import preset
+from experiments.common.cli import bars, console, run
+from experiments.common.config import Preset, preset
 from experiments.walking import foreign
 from experiments.walking.cases import check_positive, check_seeds
 from jaxtune import dist as dists
@@ -149,6 +149,20 @@ def summary(results: list[dict]) -> dict:
     }
 
 
+def played(args: Args, sizes: Preset, name: str) -> list[dict]:
+    """Runs the seeds of one robot, or reads those that an earlier call has run."""
+    place = args.out / name
+    paths = {seed: place / f"seed_{seed}.json" for seed in args.seeds}
+    if not all(path.exists() for path in paths.values()):
+        world = foreign.world(name, sizes)
+        policy = world.policy(place)
+        with bars() as progress:
+            for seed, path in progress.track(paths.items(), description=name):
+                if not path.exists():
+                    write_json(path, tuned(world, args, policy, seed))
+    return [read_json(path) for path in paths.values()]
+
+
 def show(summaries: Mapping[str, dict]) -> None:
     """Prints what `summary` found of every robot as two tables: errors, and verdicts with seconds."""
     table = Table("robot", "parameters", "number", "median error before", "after")
@@ -181,17 +195,7 @@ def main(args: Args) -> None:
     sizes = replace(sizes, scratch_updates=min(sizes.scratch_updates, _UPDATES))
     checkpoint.set_up_compiler(sizes.xla_flags)
     checkpoint.open_run(args.out, {"radius": args.radius, "tunings": args.tunings, "preset": args.preset})
-    results = {}
-    for name in args.robots:
-        place, world, policy = args.out / name, None, None
-        for seed in args.seeds:
-            path = place / f"seed_{seed}.json"
-            if not path.exists():
-                world = world or foreign.world(name, sizes)
-                policy = world.policy(place) if policy is None else policy
-                write_json(path, tuned(world, args, policy, seed))
-                console.print(f"{name}, seed {seed}: {path}", markup=False)
-            results.setdefault(name, []).append(read_json(path))
+    results = {name: played(args, sizes, name) for name in args.robots}
     summaries = {name: summary(each) for name, each in results.items()}
     write_json(args.out / "summary.json", {"args": args, "robots": summaries, "versions": checkpoint.versions()})
     plots.recovery(args.out / "errors.png", results)

@@ -21,7 +21,7 @@ from envs.biteno import constants, walks
 from envs.targets import recorded
 from experiments.common import checkpoint, plots
 from experiments.common.checkpoint import as_json, from_json, read_json, write_json
-from experiments.common.cli import console, run
+from experiments.common.cli import bars, console, run
 from experiments.common.config import preset
 from experiments.robot import policy_files
 from experiments.robot import transfer as transfers
@@ -218,15 +218,18 @@ def main(args: Args) -> None:
     # The first policy is trained in the nominal model, also where the methods then learn in a corrected one.
     nominal = programs if args.model is None else transfers.compile_programs(replace(first, model=None))
     results: dict[str, list[Outcome]] = {name: [] for name in args.methods}
-    for seed in args.seeds:
-        prepare(args, nominal, seed)
-        before = evaluate(args, programs, args.out / f"start_{seed}" / "learner")
-        for name in args.methods:
-            transfer = transfer_of(args, name, seed)
-            with stand_in(transfer.out):
-                rounds = transfers.play(transfer, programs)
-            after = evaluate(args, programs, transfer.out / f"round_{args.rounds:03d}" / "learner")
-            results[name].append(Outcome(seed=seed, rounds=rounds, start=before, end=after))
+    with bars() as progress:
+        task = progress.add_task("runs", total=len(args.seeds) * len(args.methods))
+        for seed in args.seeds:
+            prepare(args, nominal, seed)
+            before = evaluate(args, programs, args.out / f"start_{seed}" / "learner")
+            for name in args.methods:
+                transfer = transfer_of(args, name, seed)
+                with stand_in(transfer.out):
+                    rounds = transfers.play(transfer, programs)
+                after = evaluate(args, programs, transfer.out / f"round_{args.rounds:03d}" / "learner")
+                results[name].append(Outcome(seed=seed, rounds=rounds, start=before, end=after))
+                progress.advance(task)
     write_json(args.out / "summary.json", {"methods": results, "versions": checkpoint.versions()})
     plots.transfer(args.out / "fig6.png", as_json(results))
     show(args, results)

@@ -12,12 +12,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rich.progress import Progress
 from rich.table import Table
 
 from envs.logs import Log, Run, splits
 from envs.segments import HISTORY_S
 from experiments.common import checkpoint
-from experiments.common.cli import console, run
+from experiments.common.cli import bars, console, run
 from experiments.discovery import playback, sysid_fit, sysid_parameters
 from experiments.discovery.setup import read_logs
 
@@ -63,7 +64,8 @@ def main(args: Args) -> None:
     log, spec = read_logs(args.logs, robot=args.robot)
     begin = time.perf_counter()
     bench = Bench(log, sysid_parameters.robot_of(spec, log))
-    tried = _fit_all(args, bench)
+    with bars() as progress:
+        tried = _fit_all(args, bench, progress)
     chosen = {}
     for measure in MEASURES:
         best = min(tried, key=lambda one: one.select[measure])
@@ -132,8 +134,9 @@ class Candidate:
         return f"{self.subset}, pieces of {self.horizon_s:g} s, weight {self.weight:g}"
 
 
-def _fit_all(args: Args, bench: Bench) -> list[Candidate]:
-    found = []
+def _fit_all(args: Args, bench: Bench, progress: Progress) -> list[Candidate]:
+    found, total = [], len(args.horizons) * len(args.weights) * len(args.subsets)
+    task = progress.add_task("fits", total=total)
     for horizon, weight in itertools.product(args.horizons, args.weights):
         before = None
         for subset in args.subsets:
@@ -147,6 +150,7 @@ def _fit_all(args: Args, bench: Bench) -> list[Candidate]:
             select = {name: value if np.isfinite(value) else np.inf for name, value in select.items()}
             found.append(Candidate(subset, horizon, weight, seconds, fitted, select))
             console.print(f"{found[-1].name()}: {seconds:.0f} s, {select}", highlight=False)
+            progress.advance(task)
     return found
 
 

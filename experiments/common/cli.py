@@ -17,6 +17,7 @@ console = Console()
 
 _errors = Console(stderr=True)
 _INTERRUPTED = 130  # exit code of a command that Ctrl-C ended, by the shell's convention
+_DAY_S = 86400.0
 _LINE_S = 60.0  # between two lines of progress where there is no terminal to draw bars on
 
 
@@ -62,11 +63,13 @@ def bars() -> Progress:
     """Makes the progress display of a command, a context manager with a bar for every task.
 
     On a terminal the bars are drawn in place. Elsewhere (a file, a pipe, a job's log) every unfinished task prints a
-    plain line once a minute, so that a long run can be followed without thousands of redrawn bars.
+    plain line once a minute, so that a long run can be followed without thousands of redrawn bars. Both say the time
+    that is left, by the mean pace so far, once two steps are done.
     """
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()
     kind = Progress if console.is_terminal else _Lines
-    return kind(*columns, TimeElapsedColumn(), TimeRemainingColumn(), console=console)
+    # A step may take minutes, and the pace is that of all steps within the period.
+    return kind(*columns, TimeElapsedColumn(), TimeRemainingColumn(), console=console, speed_estimate_period=_DAY_S)
 
 
 class _Lines(Progress):
@@ -89,4 +92,7 @@ class _Lines(Progress):
             for task in self.tasks:
                 if not task.finished:
                     total = "" if task.total is None else f" {task.completed:g}/{task.total:g}"
-                    self.console.print(f"{minutes:.0f} min: {task.description}{total}", highlight=False, markup=False)
+                    left = task.time_remaining
+                    left = "" if left is None else f", {left / 60.0:.0f} min left"
+                    line = f"{minutes:.0f} min: {task.description}{total}{left}"
+                    self.console.print(line, highlight=False, markup=False)

@@ -420,11 +420,13 @@ def test_progress_is_a_line_a_minute_where_there_is_no_terminal(monkeypatch):
     with cli.bars() as progress:
         progress.update(progress.add_task("done", total=1), completed=1)
         task = progress.add_task("training", total=100)
-        progress.update(task, completed=20)
+        for _ in range(2):
+            progress.advance(task, 10)
+            time.sleep(0.01)
         deadline = time.monotonic() + 10.0
         while "min: training 20/100" not in output.getvalue() and time.monotonic() < deadline:
             time.sleep(0.01)
-        assert "min: training 20/100" in output.getvalue()
+        assert "min: training 20/100, 0 min left" in output.getvalue()
         assert "min: done" not in output.getvalue()
 
 
