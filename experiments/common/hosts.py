@@ -29,8 +29,6 @@ OPTIONS = ("coordinator", "hosts", "host")
 """Names of the options; results do not depend on them."""
 
 _PATIENCE_S = 3600
-
-_PATIENCE_S = 3600
 _reading = False  # whether the first host is in a function that the others do not call
 
 
