@@ -41,7 +41,7 @@ class Args:
     out: Path = Path("runs/selftest")
     """Folder of the results: selftest.json and power.png."""
     robot: str = "biteno"
-    """Robot: biteno, go2, playground:NAME, or path/to/file.py:function."""
+    """Robot: biteno, go2, playground:NAME, playground-warp:NAME, or path/to/file.py:function."""
     policy: str | None = None
     """Policy that walks: walk (biteno's, ships with the package), scratch (trained first), or a folder of
     experiments.train."""

@@ -37,17 +37,18 @@ class Sled:
     """
 
     dt = 0.02
+    impl = "jax"
 
     def __init__(self):
         self.mj_model = mujoco.MjModel.from_xml_string(SLED)
-        self._mjx_model = mjx.put_model(self.mj_model)
+        self._mjx_model = mjx.put_model(self.mj_model, impl=self.impl)
 
     @property
     def mjx_model(self):
         return self._mjx_model
 
     def reset(self, key):
-        data = mjx.make_data(self.mj_model)
+        data = mjx.make_data(self.mj_model, impl=self.impl)
         data = data.replace(qvel=0.1 * jax.random.normal(key, (1,)))
         return self._state(data, jnp.zeros(1))
 
@@ -59,6 +60,12 @@ class Sled:
     def _state(self, data, action):
         obs = jnp.concatenate([data.qpos, data.qvel, action])
         return State(data=data, obs=obs, reward=data.qvel[0], done=(jnp.abs(data.qpos[0]) > 1.5).astype(float))
+
+
+class Warped(Sled):
+    """The same, simulated by MuJoCo Warp."""
+
+    impl = "warp"
 
 
 class Keyed(Sled):

@@ -1,6 +1,7 @@
 """The robots that commands work with, by the name that `--robot` takes.
 
-`biteno` and `go2` ship with the package. `playground:NAME` is an environment of MuJoCo Playground.
+`biteno` and `go2` ship with the package. `playground:NAME` is an environment of MuJoCo Playground, and
+`playground-warp:NAME` the same, simulated by MuJoCo Warp.
 `path/to/file.py:function` is a robot of one's own: the function returns a `jaxtune.mjx.Simulator`, or an environment,
 for which a parameter table is then proposed (`jaxtune.mjx.parameters_of`).
 """
@@ -30,6 +31,7 @@ from experiments.common.config import WALK, Preset
 from experiments.walking.targets import TARGETS
 from jaxtune.mjx import Entry, Robot, Simulator, model_of, parameters_of, select
 
+_IMPLEMENTATIONS = {"playground": "jax", "playground-warp": "warp"}  # of MJX, for environments of Playground
 _LONGEST = 1000  # control steps of a compared episode, where a preset has no fewer
 
 
@@ -99,19 +101,21 @@ def kind(name: str) -> Kind:
     if name in _SHIPPED:
         return _SHIPPED[name]()
     place, colon, what = name.rpartition(":")
-    if colon and place == "playground":
-        return _foreign(name, _playground(what))
+    if colon and place in _IMPLEMENTATIONS:
+        # The policies of one are the other's.
+        return _foreign(name, _playground(name, what, _IMPLEMENTATIONS[place]), saved=f"playground:{what}")
     if colon and place.endswith(".py"):
         if not Path(place).is_file():
             raise ValueError(f"robot: {place} does not exist")
         return _foreign(name, _from_file(Path(place).resolve(), what))
     raise ValueError(
-        f"robot: got '{name}', expected {', '.join(_SHIPPED)}, playground:NAME or path/to/file.py:function"
+        f"robot: got '{name}', expected {', '.join(_SHIPPED)}, playground:NAME, playground-warp:NAME or "
+        "path/to/file.py:function"
     )
 
 
-def _foreign(name: str, made: Any) -> Kind:
-    """Makes a kind of a simulator, or of an environment without a table."""
+def _foreign(name: str, made: Any, saved: str = "") -> Kind:
+    """Makes a kind of a simulator, or of an environment without a table; `saved` is its name in policies, if another."""
     try:
         if not isinstance(made, Simulator):
             table = parameters_of(model_of(made), control_s=float(getattr(made, "dt", 0.0)))
@@ -128,7 +132,7 @@ def _foreign(name: str, made: Any) -> Kind:
         engines={"mjx": lambda robot, params: MjxTarget(robot=robot, params=params)},
         control_s=float(made.env.dt),
         power=_power,
-        config=lambda preset: {"robot": name},
+        config=lambda preset: {"robot": saved or name},
         meta=lambda preset, robot: {
             "robot": name,
             "rate_hz": 1.0 / float(robot.env.dt),
@@ -162,16 +166,25 @@ def _power(state: Any) -> jax.Array:
     return jnp.full((), jnp.nan) if data is None else jnp.maximum(data.qfrc_actuator * data.qvel, 0.0).sum()
 
 
-def _playground(name: str) -> Any:
+def _playground(robot: str, name: str, impl: str) -> Any:
     try:
         from mujoco_playground import registry
     except ModuleNotFoundError as error:
         raise ValueError("robot: MuJoCo Playground is not installed; expected `pip install playground`") from error
     if name not in registry.ALL_ENVS:
-        raise ValueError(f"robot: got 'playground:{name}', expected one of {', '.join(registry.ALL_ENVS)}")
+        raise ValueError(f"robot: got '{robot}', expected one of {', '.join(registry.ALL_ENVS)}")
     # Some environments have no such setting, and one implementation.
     has_choice = "impl" in registry.get_default_config(name)
-    return registry.load(name, config_overrides={"impl": "jax"} if has_choice else None)
+    if impl == "warp":
+        if not has_choice:
+            raise ValueError(f"robot: got '{robot}', expected 'playground:{name}', which has no other implementation")
+        # The contacts of all robots are in one array, which devices cannot share.
+        if len(jax.devices()) > 1:
+            raise ValueError(
+                f"robot: got '{robot}' on {len(jax.devices())} devices, expected one: set CUDA_VISIBLE_DEVICES=0, or on "
+                "a CPU XLA_FLAGS=--xla_force_host_platform_device_count=1"
+            )
+    return registry.load(name, config_overrides={"impl": impl} if has_choice else None)
 
 
 @cache

@@ -7,6 +7,9 @@
 An environment has `reset(key) -> state` and `step(state, action) -> state`, with `obs`, `reward` and `done` in its
 state: those of MuJoCo Playground and of Brax's MJX backend have. Every episode is simulated in a copy of it that has a
 model of its own.
+
+With `impl="warp"`, where Warp is installed, MuJoCo Warp simulates in MJX's place, on one device. Its environments say
+beforehand how many contacts all robots have room for (Playground's `naconmax`).
 """
 
 import copy
@@ -19,6 +22,7 @@ from typing import Any
 import chex
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 from jax.tree_util import Partial
 from mujoco import mjx
@@ -96,12 +100,24 @@ class Simulator:
             object.__setattr__(self, "model", model_of(self.env))
         if not isinstance(self.steps, int) or self.steps < 1:
             raise ValueError(f"steps: got {self.steps!r}, expected at least 1, a whole number")
-        parameters.check(self.model, self.parameters)
+        parameters.check(self._nominal, self.parameters)
+        self._check_warp()
         if not self.parameters:
             raise ValueError("parameters: got none, expected a row for each that may be wrong")
         self._check_delay()
         self._check_reach()
         self._check_reset()
+
+    def _check_warp(self) -> None:
+        """Checks that robots that Warp simulates side by side may differ in what the table changes."""
+        if not self._is_warp:
+            return
+        for name, entry in self.parameters.items():
+            for changed in sorted(set(entry.field_names) - set(self._written(self.parameters))):
+                raise ValueError(
+                    f"parameter '{name}', fields: got '{changed}', which MJX's Warp implementation has once for all "
+                    "robots; expected another field, or an environment with impl='jax'"
+                )
 
     def _check_delay(self) -> None:
         delays = {name: entry for name, entry in self.parameters.items() if entry.kind == "control"}
@@ -324,12 +340,13 @@ class Simulator:
                     f"parameter '{name}': it is not part of the model, so no randomization_fn can draw it; expected it "
                     f"in leave_out=('{name}',), or a training that draws it itself"
                 )
-        changed = {*DERIVED, *(field for entry in table.values() for field in entry.field_names)}
+        changed = self._written(table)
 
         def randomize(model: mjx.Model, rng: jax.Array) -> tuple[mjx.Model, mjx.Model]:
             def fields(key):
                 drawn = {name: draws[0] for name, draws in dists.sample(key, dist, 1).items() if name in table}
-                robot = parameters.apply(model, parameters.from_coords(table, drawn), table)
+                nominal = self._nominal if self._is_warp else model
+                robot = parameters.apply(nominal, parameters.from_coords(table, drawn), table)
                 return {name: _get(robot, name) for name in changed}
 
             axes = jax.tree.map(lambda _: None, model).tree_replace(dict.fromkeys(changed, 0))
@@ -344,7 +361,37 @@ class Simulator:
         return (self.observe,) if isinstance(self.observe, str) else tuple(self.observe or ())
 
     def _env(self, params: Params) -> Any:
-        return self.with_model(self.env, parameters.apply(self.model, params, self.parameters))
+        model = parameters.apply(self._nominal, params, self.parameters)
+        if self._is_warp:
+            model = self.model.tree_replace({name: _get(model, name) for name in self._written(self.parameters)})
+        return self.with_model(self.env, model)
+
+    @property
+    def _is_warp(self) -> bool:
+        return getattr(self.model, "impl", None) == mjx.Impl.WARP
+
+    @cached_property
+    def _nominal(self) -> mjx.Model:
+        """The nominal model in the implementation whose stages JAX traces, which make the derived fields."""
+        if not self._is_warp:
+            return self.model
+        source = getattr(self.env, "mj_model", None)
+        if not isinstance(source, mujoco.MjModel):
+            raise ValueError(
+                f"env: got {type(self.env).__name__} with a model of impl='warp' but no mj_model, expected the MjModel "
+                "that it was made of, or impl='jax'"
+            )
+        return mjx.put_model(source, impl="jax")
+
+    def _written(self, table: Mapping[str, Entry]) -> tuple[str, ...]:
+        """Fields that differ between robots: those of a table, and what follows from them."""
+        every = {*DERIVED, *(changed for entry in table.values() for changed in entry.field_names)}
+        if self._is_warp:
+            # Warp reads neither the diagonal of the inertia nor its mean.
+            from mujoco.mjx.warp import types
+
+            every = {name for name in every if types._BATCH_DIM["Model"].get(name.replace(".", "__"))}
+        return tuple(sorted(every))
 
     @staticmethod
     def _as_state(own, *, reward, **fields) -> State:

@@ -4,11 +4,13 @@ Every robot has its own physical parameters, and starts a new episode by itself 
 """
 
 from collections.abc import Mapping
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from brax.envs.base import Env as BraxEnv
 from brax.envs.base import State as BraxState
+from mujoco import mjx
 
 from jaxtune.mjx.entry import Entry
 from jaxtune.mjx.episodes import Robot
@@ -72,10 +74,7 @@ class TrainingBatch(BraxEnv):
 
         def restart():
             # New random states, where Brax's own wrapper would go back to one cached state.
-            fresh = jax.vmap(self._robot.reset)(params, robots.key)
-            return jax.tree.map(
-                lambda new, old: jnp.where(ended.reshape(-1, *[1] * (old.ndim - 1)), new, old), fresh, robots
-            )
+            return jax.vmap(_choose)(ended, jax.vmap(self._robot.reset)(params, robots.key), robots)
 
         # All robots are reset and most of the results thrown away, so it is not done where no episode ended.
         following = jax.lax.cond(ended.any(), restart, lambda: robots)
@@ -106,3 +105,14 @@ class TrainingBatch(BraxEnv):
     def backend(self) -> str:
         """Name of the physics engine; Brax's environment interface requires it, and nothing here reads it."""
         return "mjx"
+
+
+def _choose(condition: jax.Array, one: Any, other: Any) -> Any:
+    """One of two states of a robot. Warp's data has parts that all robots share, and chooses by itself."""
+    whole = lambda leaf: isinstance(leaf, mjx.Data)  # noqa: E731
+    return jax.tree.map(
+        lambda new, old: old.where(condition, new) if whole(old) else jnp.where(condition, new, old),
+        one,
+        other,
+        is_leaf=whole,
+    )

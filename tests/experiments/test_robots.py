@@ -28,7 +28,7 @@ ROBOT = f"{FILE}:simulator"
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("go3", "robot: got 'go3', expected biteno, go2, playground:NAME or path/to/file.py:function"),
+        ("go3", "robot: got 'go3', expected biteno, go2, playground:NAME, playground-warp:NAME or"),
         ("no/file.py:make", "robot: no/file.py does not exist"),
         (f"{FILE}:sledge", "has no function 'sledge'"),
         (f"{FILE}:nothing", "robot '.*:nothing': env: got NoneType, which has no MJX model"),
@@ -54,6 +54,18 @@ def test_environments_of_playground_are_taken_by_name():
     assert {"torso_mass", "strength", "damping", "delay"} < kind("playground:CheetahRun").entries.keys()
     with pytest.raises(ValueError, match=r"robot: got 'playground:CheetahWalk', expected one of .*CheetahRun"):
         kind("playground:CheetahWalk")
+
+
+def test_warp_simulates_an_environment_of_playground_on_one_device(monkeypatch):
+    pytest.importorskip("mujoco_playground", reason="needs the extra playground")
+    monkeypatch.setattr(jax, "devices", lambda: ["first", "second"])
+    with pytest.raises(ValueError, match=r"'playground-warp:CheetahRun' on 2 devices, expected one: set CUDA_VISIBLE"):
+        kind("playground-warp:CheetahRun")
+    monkeypatch.setattr(jax, "devices", lambda: ["first"])
+    warp, own = kind("playground-warp:CheetahRun"), kind("playground:CheetahRun")
+    assert warp.entries == own.entries
+    # What one has learnt, the other plays.
+    assert warp.config(None) == own.config(None) == {"robot": "playground:CheetahRun"}
 
 
 def test_a_file_may_have_the_name_of_a_package(tmp_path):
