@@ -24,8 +24,8 @@ class Args:
     out: Path
     """Folder of policy.onnx, policy.npz, network.py and, for biteno, player.py."""
     robot: str = "biteno"
-    """Robot and task: biteno, go2, playground:NAME (an environment of MuJoCo Playground; playground-warp:NAME, simulated
-    by MuJoCo Warp), or path/to/file.py:function, which returns a jaxtune.mjx.Simulator or an environment."""
+    """Robot and task: biteno, go2, playground:NAME (an environment of MuJoCo Playground) or playground-warp:NAME (the
+    same by MuJoCo Warp), or path/to/file.py:function, which returns a jaxtune.mjx.Simulator or an environment."""
     policy: str | None = None
     """Policy: walk (biteno's, ships with the package) or a folder of experiments.train."""
     preset: str = "cpu"

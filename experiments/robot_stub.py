@@ -32,8 +32,8 @@ class Args:
     """Plays a simulated robot: walks with the policies in a folder, plays targets while suspended, and writes logs."""
 
     robot: str = "biteno"
-    """Robot and task: biteno, go2, playground:NAME (an environment of MuJoCo Playground; playground-warp:NAME, simulated
-    by MuJoCo Warp), or path/to/file.py:function, which returns a jaxtune.mjx.Simulator or an environment."""
+    """Robot and task: biteno, go2, playground:NAME (an environment of MuJoCo Playground) or playground-warp:NAME (the
+    same by MuJoCo Warp), or path/to/file.py:function, which returns a jaxtune.mjx.Simulator or an environment."""
     folder: Path
     """Folder that is searched, at any depth, for requests to walk (`round_*/request.json` beside `round_*/policy`) and
     for targets to play while suspended (`hung/targets`)."""

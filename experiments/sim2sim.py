@@ -39,8 +39,8 @@ class Args(hosts.HostArgs):
     out: Path = Path("runs/sim2sim")
     """Folder of the run. The same command with the same folder continues after the last finished (method, seed)."""
     robot: str = "biteno"
-    """Robot and task: biteno, go2, playground:NAME (an environment of MuJoCo Playground; playground-warp:NAME, simulated
-    by MuJoCo Warp), or path/to/file.py:function, which returns a jaxtune.mjx.Simulator or an environment."""
+    """Robot and task: biteno, go2, playground:NAME (an environment of MuJoCo Playground) or playground-warp:NAME (the
+    same by MuJoCo Warp), or path/to/file.py:function, which returns a jaxtune.mjx.Simulator or an environment."""
     case: str = "mass"
     """How the target differs: friction, mass, bullet (the engine PyBullet), weak_motor or weaker_motor (PyBullet with
     0.75 or 0.6 of the torque)."""

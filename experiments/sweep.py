@@ -44,8 +44,8 @@ class Args(hosts.HostArgs):
     out: Path = Path("runs/sweep")
     """Folder of summary.json and heat_map.png. The same command with the same folder goes on after the last lanes."""
     robot: str = "biteno"
-    """Robot and task: biteno, go2, playground:NAME (an environment of MuJoCo Playground; playground-warp:NAME, simulated
-    by MuJoCo Warp), or path/to/file.py:function, which returns a jaxtune.mjx.Simulator or an environment."""
+    """Robot and task: biteno, go2, playground:NAME (an environment of MuJoCo Playground) or playground-warp:NAME (the
+    same by MuJoCo Warp), or path/to/file.py:function, which returns a jaxtune.mjx.Simulator or an environment."""
     case: str = "mass"
     """How the target differs: friction or mass."""
     start: float = 0.5

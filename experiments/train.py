@@ -23,8 +23,8 @@ class Args(hosts.HostArgs):
     out: Path
     """Folder of the policy: orbax checkpoint, config.json, curve.json, curve.png."""
     robot: str = "biteno"
-    """Robot and task: biteno, go2, playground:NAME (an environment of MuJoCo Playground; playground-warp:NAME, simulated
-    by MuJoCo Warp), or path/to/file.py:function, which returns a jaxtune.mjx.Simulator or an environment."""
+    """Robot and task: biteno, go2, playground:NAME (an environment of MuJoCo Playground) or playground-warp:NAME (the
+    same by MuJoCo Warp), or path/to/file.py:function, which returns a jaxtune.mjx.Simulator or an environment."""
     preset: str = "cpu"
     """Size of the run: smoke (seconds, to see that it works), cpu (two cores) or gpu (one GPU)."""
     parameters: str | None = None

@@ -30,8 +30,8 @@ class Transfer:
     out: Path = Path("runs/sim2real")
     """Folder of the run. The same command with the same folder continues where it was."""
     robot: str = "biteno"
-    """Robot and task: biteno, go2, playground:NAME (an environment of MuJoCo Playground; playground-warp:NAME, simulated
-    by MuJoCo Warp), or path/to/file.py:function, which returns a jaxtune.mjx.Simulator or an environment."""
+    """Robot and task: biteno, go2, playground:NAME (an environment of MuJoCo Playground) or playground-warp:NAME (the
+    same by MuJoCo Warp), or path/to/file.py:function, which returns a jaxtune.mjx.Simulator or an environment."""
     rounds: int = 5
     """Number of rounds; a later call may raise it."""
     method: str = "ours"

@@ -115,7 +115,7 @@ def kind(name: str) -> Kind:
 
 
 def _foreign(name: str, made: Any, saved: str = "") -> Kind:
-    """Makes a kind of a simulator, or of an environment without a table; `saved` is its name in policies, if another."""
+    """Makes a kind of a simulator, or of an environment without a table; policies call it `saved`, where given."""
     try:
         if not isinstance(made, Simulator):
             table = parameters_of(model_of(made), control_s=float(getattr(made, "dt", 0.0)))
@@ -181,8 +181,8 @@ def _playground(robot: str, name: str, impl: str) -> Any:
         # The contacts of all robots are in one array, which devices cannot share.
         if len(jax.devices()) > 1:
             raise ValueError(
-                f"robot: got '{robot}' on {len(jax.devices())} devices, expected one: set CUDA_VISIBLE_DEVICES=0, or on "
-                "a CPU XLA_FLAGS=--xla_force_host_platform_device_count=1"
+                f"robot: got '{robot}' on {len(jax.devices())} devices, expected one: set CUDA_VISIBLE_DEVICES=0, or "
+                "on a CPU XLA_FLAGS=--xla_force_host_platform_device_count=1"
             )
     return registry.load(name, config_overrides={"impl": impl} if has_choice else None)
 

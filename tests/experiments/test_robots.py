@@ -58,10 +58,11 @@ def test_environments_of_playground_are_taken_by_name():
 
 def test_warp_simulates_an_environment_of_playground_on_one_device(monkeypatch):
     pytest.importorskip("mujoco_playground", reason="needs the extra playground")
-    monkeypatch.setattr(jax, "devices", lambda: ["first", "second"])
+    first = jax.devices()[0]
+    monkeypatch.setattr(jax, "devices", lambda *_: [first, "second"])
     with pytest.raises(ValueError, match=r"'playground-warp:CheetahRun' on 2 devices, expected one: set CUDA_VISIBLE"):
         kind("playground-warp:CheetahRun")
-    monkeypatch.setattr(jax, "devices", lambda: ["first"])
+    monkeypatch.setattr(jax, "devices", lambda *_: [first])
     warp, own = kind("playground-warp:CheetahRun"), kind("playground:CheetahRun")
     assert warp.entries == own.entries
     # What one has learnt, the other plays.
