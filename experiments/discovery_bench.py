@@ -64,6 +64,8 @@ def main(args: Args) -> None:
     made = FieldBench if args.size in FIELD_SIZES else Bench
     bench = made(args.out, args.size, args.seed, args.nominal_error)
     cases = bench.cases[: args.limit or None][int(number) :: int(pieces)]
+    # Those of an earlier call take no time, and would spoil the pace by which time is foretold.
+    cases = [case for case in cases if args.write_only or bench.answered(case) is None]
     with bars() as progress:
         for done, case in enumerate(progress.track(cases, description="cases"), start=1):
             if args.write_only:

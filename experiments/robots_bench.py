@@ -149,17 +149,17 @@ def summary(results: list[dict]) -> dict:
     }
 
 
-def played(args: Args, sizes: Preset, name: str) -> list[dict]:
+def results_of(args: Args, sizes: Preset, name: str) -> list[dict]:
     """Runs the seeds of one robot, or reads those that an earlier call has run."""
     place = args.out / name
     paths = {seed: place / f"seed_{seed}.json" for seed in args.seeds}
-    if not all(path.exists() for path in paths.values()):
+    missing = {seed: path for seed, path in paths.items() if not path.exists()}
+    if missing:
         world = foreign.world(name, sizes)
         policy = world.policy(place)
         with bars() as progress:
-            for seed, path in progress.track(paths.items(), description=name):
-                if not path.exists():
-                    write_json(path, tuned(world, args, policy, seed))
+            for seed, path in progress.track(missing.items(), description=name):
+                write_json(path, tuned(world, args, policy, seed))
     return [read_json(path) for path in paths.values()]
 
 
@@ -195,7 +195,7 @@ def main(args: Args) -> None:
     sizes = replace(sizes, scratch_updates=min(sizes.scratch_updates, _UPDATES))
     checkpoint.set_up_compiler(sizes.xla_flags)
     checkpoint.open_run(args.out, {"radius": args.radius, "tunings": args.tunings, "preset": args.preset})
-    results = {name: played(args, sizes, name) for name in args.robots}
+    results = {name: results_of(args, sizes, name) for name in args.robots}
     summaries = {name: summary(each) for name, each in results.items()}
     write_json(args.out / "summary.json", {"args": args, "robots": summaries, "versions": checkpoint.versions()})
     plots.recovery(args.out / "errors.png", results)

@@ -185,7 +185,7 @@ def main(args: Args) -> None:
     sizes, robot, entries, case = check(args)
     args = dataclasses.replace(args, policy=args.policy or default_policy(robot))
     learner = Learner(sizes, entries, kind=robot)
-    memory.check(learner, args.lanes or sizes.sweep_lanes)
+    memory.check(learner, min(args.lanes or sizes.sweep_lanes, lanes(args)[..., 0].size))
     identity = {**dataclasses.asdict(args), "sizes": sizes}
     for option in ("out", *hosts.OPTIONS):
         del identity[option]

@@ -47,13 +47,7 @@ def make(centre: Coords, radius: float, lower: Coords, upper: Coords) -> ParamDi
 
     # As `widen` does: a radius as wide as the bounds fills them from any centre.
     radii = {name: min(radius, upper[name] - lower[name]) for name in centre}
-    return ParamDist(
-        centre=strong(centre),
-        radius=strong(radii),
-        lower=strong(lower),
-        upper=strong(upper),
-        precision=jnp.zeros((len(centre), len(centre)), jnp.float32),
-    )
+    return ParamDist(centre=strong(centre), radius=strong(radii), lower=strong(lower), upper=strong(upper))
 
 
 def names(dist: ParamDist) -> tuple[str, ...]:

@@ -79,16 +79,19 @@ def combinations(info) -> tuple[Combination, ...]:
     """
     names, found = np.array(dists.names(info.dist)), _errors(info)
     vague = np.flatnonzero(weak(info))
-    values, axes = np.linalg.eigh(found[np.ix_(vague, vague)])
-    sd = _ignorance(info) * dists.ravel(info.dist.radius)
+    among = found[np.ix_(vague, vague)]
+    sd = (_ignorance(info) * dists.ravel(info.dist.radius))[vague]
     told = []
-    for value, axis in zip(values, axes.T, strict=True):
+    for axis in np.linalg.eigh(among)[1].T:
         chosen = np.abs(axis) > _SMALL * np.abs(axis).max()
-        if value < _WEAK**2 and chosen.sum() > 1:
-            weights = axis / sd[vague]
+        # The error is that of the sum that is told, without its small terms.
+        axis = np.where(chosen, axis, 0.0) / np.linalg.norm(axis[chosen])
+        error = np.sqrt(max(axis @ among @ axis, 0.0))
+        if error < _WEAK and chosen.sum() > 1:
+            weights = axis / sd
             unit = weights[np.abs(weights).argmax()]
             picked = dict(zip(names[vague][chosen].tolist(), (weights[chosen] / unit).tolist(), strict=True))
-            told.append(Combination(weights=picked, error=float(np.sqrt(max(value, 0.0)) / abs(unit))))
+            told.append(Combination(weights=picked, error=float(error / abs(unit))))
     return tuple(told)
 
 

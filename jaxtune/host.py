@@ -25,7 +25,7 @@ import numpy as np
 
 from jaxtune.checks import check_measured, check_set
 from jaxtune.rules import TunerConfig, Update, Verify, calibrated_gate, misfits, posterior_update
-from jaxtune.tuner import Info, Measure, TrainPolicy, Tuner, TunerState, counted, keep
+from jaxtune.tuner import Info, Measure, TrainPolicy, Tuner, TunerState, counted, keep, make_info
 from jaxtune.types import Trajectory, Verdict
 
 HostSimulate = Callable[[jax.Array, Any, dict[str, np.ndarray]], Trajectory]
@@ -98,7 +98,7 @@ class HostTuner:
             if carry["verdict"] == Verdict.ACCEPT:
                 updated = self._update(key_update, collected, measured, carry["dist"], state.knobs)
                 carry = self._refine(carry, *updated, state.knobs)
-        return self._tuner.ended(state, carry, measured)
+        return state.replace(dist=carry["dist"]), make_info(carry, measured)
 
     def misfits(self, key: jax.Array, state: TunerState, measured: Trajectory) -> jax.Array:
         """Says which observations and actions no parameters explain, as `Tuner.misfits` does."""

@@ -41,8 +41,6 @@ _IDENTIFIABLE = 0.9
 _LEAST_ERROR = 1e-4  # radii; without noise a regression may be exact
 # Least distance of median and 0.9-quantile of each statistic, where all simulated sets are alike.
 _LEAST_SPREAD = {"cover": 0.02, "lost": 0.1, "misfit": 0.05, "beyond": 0.1}
-# Largest p-value at which an estimate contradicts those before. At 1 % chance alone would cost five sets a third.
-_CONTRADICTION = 1e-3
 _SAME = 1e-6  # of an observation's size: it does not change
 SETS = {"cpu": 1, "other": 64}
 """Held-out sets that are scored side by side on a device (`devices.in_chunks`)."""
@@ -443,50 +441,6 @@ def posterior_update(
         p_value=_p_value(jnp.fmax(excess["misfit"], excess["beyond"])),
         p_misfit=_p_value(excess["misfit"]),
         errors=(held_out - truth).T @ (held_out - truth) / len(truth),
-    )
-
-
-def pooled(moved: ParamDist, tested: ParamDist, update: UpdateInfo) -> tuple[ParamDist, UpdateInfo]:
-    """Joins the estimate of an accepted set with the centre before, which earlier sets have left, by their precisions.
-
-    With m the centre and P the precision before the update, x its estimate and C the covariance of its error
-    (`UpdateInfo.errors`),
-
-        precision <- P + C^-1
-        centre    <- x - (P + C^-1)^-1 P (x - m)
-        interval  <- interval times the ratio of the standard deviations of both errors.
-
-    Errors of sets are independent: each is read by a regression of new episodes. What the centre was is forgotten where
-    the two contradict each other at 0.1 %: then the truth lay outside the box, or the robot has changed. Where the
-    update gives no errors, it stays as it is, and its precision is zero.
-
-    Args:
-      moved: the distribution that the update has left.
-      tested: the one that the gate has tested; its centre is the one before.
-      update: what was done, in radii of `tested`.
-
-    Returns:
-      Distribution and report, both of the joined estimate.
-    """
-    unit = dists.ravel(tested.radius)
-    size = len(unit)
-    known = jnp.isfinite(update.errors).all()
-    covariance = jnp.where(known, update.errors, 0.0) + _LEAST_ERROR**2 * jnp.eye(size)
-    new, before = jnp.linalg.inv(covariance), tested.precision * jnp.outer(unit, unit)
-    step = (dists.ravel(moved.centre) - dists.ravel(tested.centre)) / unit
-    # The inverse of the sum of both covariances; the one before may have none.
-    both = before - before @ jnp.linalg.solve(before + new, before)
-    agreed = jax.scipy.special.gammaincc(size / 2.0, jnp.maximum(step @ both @ step, 0.0) / 2.0) > _CONTRADICTION
-    before = jnp.where(agreed, before, 0.0)
-    covers = jnp.linalg.inv(before + new)
-    back = jnp.where(update.identifiable & known, covers @ before @ step, 0.0)
-    radius = dists.ravel(moved.radius)
-    moved = dists.move(moved, -back * unit / radius)
-    narrower = jnp.where(known, jnp.sqrt(jnp.diag(covers) / jnp.diag(covariance)), 1.0)
-    return moved.replace(precision=jnp.where(known, before + new, 0.0) / jnp.outer(unit, unit)), update.replace(
-        step=update.step - back,
-        interval=update.interval * narrower,
-        errors=jnp.where(known, covers, update.errors),
     )
 
 

@@ -231,12 +231,13 @@ def _tune(
         rows = []
         for robot in range(robots):
             key_robot = jax.random.fold_in(jax.random.fold_in(key, number), robot)
-            coords, now = _draw(key_robot, state.dist, 1, replaced, extra), state
-            for index in range(tunings):
-                key_measure, key_tune = jax.random.split(jax.random.fold_in(key_robot, index + 1))
+            key_draw, *keys = jax.random.split(key_robot, 1 + 2 * tunings)
+            coords, now = _draw(key_draw, state.dist, 1, replaced, extra), state
+            for index, (key_measure, key_tune) in enumerate(zip(keys[::2], keys[1::2], strict=True)):
                 measured = jax.tree.map(lambda leaf: leaf[0], measure(key_measure, now, coords))
-                now, info = jax.device_get(tune(key_tune, now, measured))
-                rows.append(_ended(now.dist, info, coords))
+                # The state stays on its devices: from others the programs would be compiled anew.
+                now, info = tune(key_tune, now, measured)
+                rows.append(_ended(*jax.device_get((now.dist, info)), coords))
                 done((number * robots + robot) * tunings + index + 1)
         tuned[name] = tuple(_tuned(rows[index::tunings], dists.names(state.dist)) for index in range(tunings))
     return tuned

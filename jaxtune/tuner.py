@@ -35,7 +35,6 @@ Departures from the paper, besides those of gate and update (`jaxtune.rules`):
   not fit there (`UpdateInfo.p_value` <= 1 - level), the radius before is taken back. If it does not whatever the
   coordinates when it is read again for the first time (`p_misfit` <= 0.01), the verdict becomes `unexplained`: in a
   wide distribution, parameters can absorb what is missing.
-- The sets of earlier tunings count as well, since physics does not depend on the policy that walked (`rules.pooled`).
 - A tuning ends with training the policy, where the paper's begins with it. The last tuning therefore leaves a policy
   that was trained in the last distribution.
 - The radius grows only after a failed check (in print it grows before each), is capped by the bounds, and the loop ends
@@ -93,7 +92,6 @@ from jaxtune.rules import (
     misfits,
     no_gate_log,
     no_update,
-    pooled,
     posterior_update,
     vote_update,
 )
@@ -291,20 +289,7 @@ class Tuner:
             )
 
         carry = jax.lax.while_loop(lambda carry: carry["left"] > 0, body, self.before(state.dist))
-        return self.ended(state, carry, measured)
-
-    def ended(self, state: TunerState, carry: dict, measured: Trajectory) -> tuple[TunerState, Info]:
-        """Makes state and info of a tuning whose loop has ended; an accepted set is joined with earlier ones.
-
-        Args:
-          state: from before the tuning.
-          carry: what the loop carried last.
-          measured: the measured set.
-        """
-        joined = pooled(carry["dist"], carry["tested"], carry["update"])
-        accepted = carry["verdict"] == Verdict.ACCEPT
-        dist, update = _choose(accepted, joined, (carry["dist"], carry["update"]))
-        return state.replace(dist=dist), make_info(carry | {"update": update}, measured)
+        return state.replace(dist=carry["dist"]), make_info(carry, measured)
 
     def before(self, dist: ParamDist) -> dict:
         """Makes what the loop of a tuning carries before its first round; it ends when no rounds are `left`."""
@@ -366,8 +351,8 @@ class Tuner:
         # The gate has just tested the distribution of the first reading.
         again = carry["left"] < 1 + self.config.refinements
         misfits = again & (update.p_value <= 1.0 - knobs.level)
-        # Tested once a tuning, so that its rate of false alarms is that of one test.
-        first = carry["left"] == self.config.refinements
+        # Tested once a tuning, so that its rate of false alarms is that of one test: at filled bounds by the gate.
+        first = (carry["left"] == self.config.refinements) & ~dists.at_bounds(tested)
         unexplained = first & (update.p_misfit <= _UNEXPLAINED)
         radius, unit = dists.ravel(dist.radius), dists.ravel(tested.radius)
         changed = (dists.ravel(moved.radius) < _CHANGED * radius) | (jnp.abs(update.step) > 1.0 - _CHANGED)
@@ -377,13 +362,9 @@ class Tuner:
             identifiable=before.identifiable | update.identifiable,
             errors=update.errors * jnp.outer(radius / unit, radius / unit),
         )
-        # Taken back: what the reading before found remains, within the radius that it was found in. Its errors are not
-        # those of sets that fit.
+        # Taken back: what the reading before found remains, within the radius that it was found in.
         back = before.replace(
-            interval=dists.ravel(carry["wider"]) / unit,
-            p_value=update.p_value,
-            p_misfit=update.p_misfit,
-            errors=jnp.full_like(before.errors, jnp.nan),
+            interval=dists.ravel(carry["wider"]) / unit, p_value=update.p_value, p_misfit=update.p_misfit
         )
         nothing = no_update(tested).replace(p_value=update.p_value, p_misfit=update.p_misfit)
         verdict = jnp.where(unexplained, Verdict.UNEXPLAINED, carry["verdict"])

@@ -146,20 +146,15 @@ class ParamDist:
         U(max(centre - radius, lower), min(centre + radius, upper)).
 
     Policy, gate and search-parameter model are all trained on draws of it. An update moves `centre` and may narrow
-    `radius`; widening multiplies `radius`; `lower` and `upper` are fixed physical bounds. These four fields map the
-    same names to scalars in coordinates (log space for multipliers). This is the paper's Xi ~ U(mu, r), with a radius
-    for every coordinate. Make one with `jaxtune.dist.make`, which checks it.
-
-    `precision` is what all tunings so far know of the centre: the inverse of the covariance of its error, [coords,
-    coords] in the order of `jaxtune.dist.names`, in 1 / coordinate^2. It is zero before the first tuning, and where
-    nothing is known.
+    `radius`; widening multiplies `radius`; `lower` and `upper` are fixed physical bounds. All four fields map the same
+    names to scalars in coordinates (log space for multipliers). This is the paper's Xi ~ U(mu, r), with a radius for
+    every coordinate. Make one with `jaxtune.dist.make`, which checks it.
     """
 
     centre: dict
     radius: dict
     lower: dict
     upper: dict
-    precision: jax.Array
 
 
 class Verdict(enum.IntEnum):

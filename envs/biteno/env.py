@@ -29,9 +29,9 @@ _MIN_HEIGHT_M = 0.35
 _MAX_TILT_COS = np.cos(np.pi / 4)
 
 _BASES = ("stand", "raibert")
+_EXPLODED = 1e4  # m, rad or either per second
 # Time step in s, steps in a policy step, solver iterations, line-search iterations. At 1 ms, three iterations agree
 # with more of them to five decimals after 0.3 s; one is off by up to 0.023 rad.
-_EXPLODED = 1e4  # m, rad or either per second
 _PHYSICS = {"exact": (0.001, 10, 3, 5), "fast": (0.002, 5, 2, 5)}
 
 

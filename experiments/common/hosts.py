@@ -4,7 +4,7 @@
     python -m experiments.train --out policy --coordinator first:9876 --hosts 2 --host 1    # on another
 
 All hosts compute the same; where devices share work (`jaxtune.devices`), the devices of all hosts do. Files are the
-first host's: it alone reads, writes and prints, and the others hear of it what it read. So the folder of a run need not
+first host's: it alone reads, writes and prints, and the others are sent what it read. So the folder of a run need not
 be visible to them, and what decides how a run goes on is decided once.
 """
 
@@ -88,7 +88,7 @@ def from_first(read: Callable[[], Any]) -> Any:
       read: reads or writes files, or decides by the clock. What it returns is pickled.
 
     Raises:
-      ValueError, OSError: what the function raised on the first host is raised on all, so that none waits for another.
+      Exception: what the function raised on the first host is raised on all, so that none waits for another.
     """
     global _reading
     if _reading or not jax.distributed.is_initialized():
@@ -98,7 +98,7 @@ def from_first(read: Callable[[], Any]) -> Any:
         _reading = True
         try:
             found = read(), None
-        except (ValueError, OSError) as error:
+        except Exception as error:  # whatever it is: the others wait for an answer
             found = None, error
         finally:
             _reading = False

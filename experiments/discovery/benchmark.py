@@ -62,7 +62,7 @@ class Benchmark:
         """
         folder = self.out / "answers" / name_of(case)
         with checkpoint.lock(folder):
-            return self._answered(case) or self._answer(case, folder)
+            return self.answered(case) or self._answer(case, folder)
 
     def _answer(self, case: Case, folder: Path) -> dict:
         log, began = self.write(case), time.monotonic()
@@ -76,7 +76,8 @@ class Benchmark:
             write_json(folder / "failed.json", answer | {"traceback": traceback.format_exc()})
             return answer
 
-    def _answered(self, case: Case) -> dict | None:
+    def answered(self, case: Case) -> dict | None:
+        """Reads an earlier answer to a case, as `answer` returns it; None where there is none."""
         folder = self.out / "answers" / name_of(case)
         there = [path for name in ("summary.json", "failed.json") if (path := folder / name).exists()]
         return read_json(there[0]) if there else None
@@ -89,7 +90,7 @@ class Benchmark:
         """
         rows = []
         for case in self.cases:
-            answer = self._answered(case)
+            answer = self.answered(case)
             if answer is not None:
                 truth = read_json(self.truth_path(case))
                 rows.append(score(truth, answer) | {"case": name_of(case)})

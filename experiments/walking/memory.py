@@ -45,13 +45,15 @@ def check(learner: Learner, lanes: int = 1) -> None:
     """
     there, devices = available(), len(jax.devices())
     for what, size in needed(learner).items():
-        size *= lanes / devices if what == "training" or lanes > 1 else 1.0
+        # Lanes are whole on a device; the training of a single run is shared, its tuning is not.
+        size *= math.ceil(lanes / devices) if lanes > 1 else 1.0 / devices if what == "training" else 1.0
         if size > _USABLE * there:
             envs, episodes = learner.preset.ppo.num_envs, learner.preset.tuner.episodes
             runs = f", {lanes} runs side by side" if lanes > 1 else ""
             raise ValueError(
                 f"{'lanes' if lanes > 1 else 'preset'}: {what} takes about {size / 2**30:.3g} GiB on a device ({envs} "
-                f"environments, {episodes} episodes{runs}), expected less than the {there / 2**30:.3g} GiB that it has"
+                f"environments, {episodes} episodes{runs}), expected less than {_USABLE * there / 2**30:.3g} GiB, "
+                f"{_USABLE:.0%} of what it has"
             )
 
 

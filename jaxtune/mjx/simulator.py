@@ -381,7 +381,9 @@ class Simulator:
                 f"env: got {type(self.env).__name__} with a model of impl='warp' but no mj_model, expected the MjModel "
                 "that it was made of, or impl='jax'"
             )
-        return mjx.put_model(source, impl="jax")
+        made = mjx.put_model(source, impl="jax")
+        # What was changed after the model was made counts.
+        return made.tree_replace({name: _get(self.model, name) for name in self._written(self.parameters)})
 
     def _written(self, table: Mapping[str, Entry]) -> tuple[str, ...]:
         """Fields that differ between robots: those of a table, and what follows from them."""

@@ -108,7 +108,7 @@ class TrainingBatch(BraxEnv):
 
 
 def _choose(condition: jax.Array, one: Any, other: Any) -> Any:
-    """One of two states of a robot. Warp's data has parts that all robots share, and chooses by itself."""
+    """One of two states of a robot. Warp's data has arrays that all robots share, so its own `where` chooses."""
     whole = lambda leaf: isinstance(leaf, mjx.Data)  # noqa: E731
     return jax.tree.map(
         lambda new, old: old.where(condition, new) if whole(old) else jnp.where(condition, new, old),

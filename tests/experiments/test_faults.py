@@ -119,12 +119,12 @@ def test_a_discovery(found, monkeypatch, tmp_path):
 
 
 def test_a_case_that_counts_as_answered_has_all_its_files(found, monkeypatch, tmp_path):
-    def killed(path, value):
+    def in_order(path, value):
         if path.name == "summary.json":
             assert (path.parent / "details.json").exists() and (path.parent / "model" / "effects.json").exists()
         checkpoint.write_json(path, value)
 
-    monkeypatch.setattr(investigate, "write_json", killed)
+    monkeypatch.setattr(investigate, "write_json", in_order)
     investigate.investigate([tmp_path], tmp_path / "answer")
     assert (tmp_path / "answer" / "summary.json").exists()
 

@@ -58,6 +58,9 @@ def test_robots_of_a_training_start_anew_one_by_one(sleds):
     np.testing.assert_allclose(found.obs, expected.obs, atol=1e-5)
     assert abs(float(found.obs[1, 0])) < 0.1
     np.testing.assert_allclose(found.reward, expected.reward, atol=1e-5)
+    for name in ("qpos", "qvel"):
+        ours, theirs = (getattr(state.pipeline_state.env.data, name) for state in (found, expected))
+        np.testing.assert_allclose(ours, theirs, atol=1e-5)
 
 
 def _with(env, data):
