@@ -81,7 +81,7 @@ def test_a_benchmark_of_robots(monkeypatch, tmp_path):
     monkeypatch.setattr(robots_bench.foreign, "world", lambda *_: world)
     monkeypatch.setattr(robots_bench, "tuned", tuned)
     command = lambda out: robots_bench.main(robots_bench.Args(out=out, preset="smoke", seeds=(0, 1)))  # noqa: E731
-
+    # Config, three robots with two seeds each, and summary.
     assert check_every_kill(monkeypatch, tmp_path, command) == 2 * 3 * 8
 
 
