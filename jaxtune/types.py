@@ -260,13 +260,15 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Form:
-    """Another form of an effect: parameters more, usually one, which are free only after the effect was found."""
+    """Another form of an effect: parameters more, usually one, which are tried only beside the effect."""
 
     name: str
     effect: str
     """Row that has the parameter: the effect itself, or another one that acts beside it at the same places."""
     parameter: str | None = None
     """None for all parameters of that row."""
+    screened: bool = False
+    """True where the effect may show in this form alone: it is screened with the form's smallest size too."""
 
 
 @dataclass(frozen=True, kw_only=True)

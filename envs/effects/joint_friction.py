@@ -10,7 +10,8 @@ import jax.numpy as jnp
 from jaxtune.types import Effect, Form, Parameter
 
 _JOINT_FRICTION = {"family": "joint_friction", "on": "joint"}
-_PRESLIDING = Form("presliding", "presliding", "travel_rad")
+# The engine's own friction creeps under load, where a robot's joint holds: a fit with it may gain nothing.
+_PRESLIDING = Form("presliding", "presliding", "travel_rad", screened=True)
 # While a joint slides, friction that differs between directions is symmetric friction and a constant torque.
 _DIRECTION = Form("direction_dependent", "constant_push", "nm")
 

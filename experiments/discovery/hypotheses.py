@@ -8,7 +8,7 @@ import numpy as np
 
 from envs.axes import Axis
 from jaxtune.discovery.problem import Hypothesis
-from jaxtune.types import Effect, Parameter
+from jaxtune.types import Effect, Form, Parameter
 
 _LARGE = 0.7  # of the bounds: the largest size that is screened
 _TRAVEL_RAD, _MOST_TRAVELS = 0.002, 5.0  # over which dry friction sets in, and how many of these at most
@@ -45,15 +45,16 @@ def forms(axes: Sequence[Axis], rows: Mapping[str, Effect], every: Sequence[Hypo
     """
     index = {(axis.effect, axis.parameter, axis.place): number for number, axis in enumerate(axes)}
     return tuple(
-        _as_form(_hypothesis(axes, index, rows[form.effect], one.places, form.parameter), one, form.name)
+        _as_form(_hypothesis(axes, index, rows[form.effect], one.places, form.parameter), one, form)
         for one in every
         for form in rows[one.name].forms
     )
 
 
-def _as_form(shape: Hypothesis, effect: Hypothesis, form: str) -> Hypothesis:
+def _as_form(shape: Hypothesis, effect: Hypothesis, form: Form) -> Hypothesis:
     # Where two effects may each be a form of the other, the larger part gives the name.
-    return replace(shape, name=effect.name, family=effect.family, form=form, prior=0.5 * shape.prior)
+    prior = 0.5 * shape.prior
+    return replace(shape, name=effect.name, family=effect.family, form=form.name, screened=form.screened, prior=prior)
 
 
 _RIGHT = {"left": "right", "l": "r", "fl": "fr", "rl": "rr", "hl": "hr", "bl": "br"}

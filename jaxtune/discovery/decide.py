@@ -5,7 +5,7 @@ effect: what chance gains on null logs. A model is believed in the share of resa
 model with the weight exp(-cost / 2): pseudo-Bayesian model averaging with a bootstrap (Yao et al., 2018).
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,6 +18,9 @@ from jaxtune.discovery.result import Settings, Suspect
 
 _ABLATION_ROUNDS = 3
 _FAR = 1e9  # sum of squares
+
+Measure = Callable[[np.ndarray], np.ndarray]
+"""Mean squares [components] from those of all segments, [segments, components]."""
 
 
 @dataclass(frozen=True)
@@ -102,6 +105,11 @@ def squares(at: Floor, candidate: Candidate) -> np.ndarray:
     return (at.unflatten(both) ** 2).sum(axis=1)
 
 
+def measures(at: Floor) -> tuple[Measure, Measure]:
+    """How far off a model is in all segments but a few (`Counts.usual`), and in typical ones (`Counts.variances`)."""
+    return at.counts.usual, at.counts.variances
+
+
 def total_cost(at: Floor, candidate: Candidate, price: float) -> float:
     """Returns the cost of a candidate on `train` and `select`, with its prior and a price for every effect."""
     of_segments = squares(at, candidate)
@@ -122,7 +130,7 @@ def posterior(problem: Problem, at: Floor, candidates: Sequence[Candidate], pric
     times = times_drawn(units_of(problem, at, all_squares[0]), seed=seed)
     costs = []
     for candidate, mine in zip(candidates, all_squares, strict=True):
-        of_segments = at.counts.cost(_finite(mine) / at.counts.bins)
+        of_segments = at.counts.cost(finite(mine) / at.counts.bins)
         costs.append(times @ of_segments + candidate.fit.penalty + candidate.price(price))
     weights = np.exp(-0.5 * (np.array(costs) - np.min(costs, axis=0)))
     return (weights / weights.sum(axis=0)).mean(axis=1)
@@ -165,9 +173,9 @@ def weigh_evidence(
     distance = np.where((hypothesis.probes != 0).any(axis=0), np.abs(values) / errors, 0.0)
     clearest = int(distance.argmax())
     relief = ablated.fit.penalty - candidate.fit.penalty
-    mean_squares = [_finite(one) / at.counts.bins for one in (before, now)]
-    measures = [[measure(one) for one in mean_squares] for measure in (at.counts.usual, at.counts.variances)]
-    floors, left = max((_largest_fall(*pair) for pair in measures), key=lambda pair: pair[0] / pair[1])
+    mean_squares = [finite(one) / at.counts.bins for one in (before, now)]
+    falls = (_largest_fall(*(measure(one) for one in mean_squares)) for measure in measures(at))
+    floors, left = max(falls, key=lambda pair: pair[0] / pair[1])
     evidence = Evidence(
         gain=total_cost(at, ablated, 0.0) - total_cost(at, candidate, 0.0),
         confirmed=_cost(at, before[held_out:]) - _cost(at, now[held_out:]) + relief,
@@ -304,7 +312,7 @@ def _largest_fall(before: np.ndarray, now: np.ndarray) -> tuple[float, float]:
     return float(np.sqrt(max(before[where] - now[where], 0.0))), float(np.sqrt(now[where]))
 
 
-def _finite(of_segments: np.ndarray) -> np.ndarray:
+def finite(of_segments: np.ndarray) -> np.ndarray:
     """Lets a segment whose simulation broke count as one that is far off."""
     return np.nan_to_num(of_segments, nan=_FAR, posinf=_FAR)
 

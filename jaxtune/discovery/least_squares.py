@@ -16,8 +16,7 @@ what the others and the prior say. Around a point the cost is least squares with
     L(u) = w |r + J u|^2 + |(c + u) / s|^2,   w = (n + f) / (f v + n m) a,
 
 with the share a of rows that count as independent (`Counts`). They are computed anew after every step (iteratively
-reweighted least squares). Many small changes of a model are compared in the limit of many degrees of freedom
-(`pooled_cost`), in which a component needs no more than its mean square.
+reweighted least squares).
 """
 
 from collections.abc import Callable
@@ -42,8 +41,8 @@ class Counts:
     """Share of the rows that count as independent."""
 
     def mean_squares(self, residual: np.ndarray) -> np.ndarray:
-        """Computes the mean squares [segments, components] of residuals [features]."""
-        return (residual.reshape(-1, self.bins, self.components) ** 2).mean(axis=1)
+        """Computes the mean squares [..., segments, components] of residuals [..., features]."""
+        return (residual.reshape(*residual.shape[:-1], -1, self.bins, self.components) ** 2).mean(axis=-2)
 
     @staticmethod
     def usual(mean_squares: np.ndarray) -> np.ndarray:
@@ -57,10 +56,11 @@ class Counts:
         return np.where(np.isfinite(mean_squares).all(axis=0), found, np.nan)
 
     def cost(self, mean_squares: np.ndarray) -> np.ndarray:
-        """Computes C without the prior from mean squares [segments, components]; returns what each segment adds."""
-        count, variance = self.bins * self.independent, self.variances(mean_squares)
+        """Computes C without the prior from mean squares [..., segments, components]; returns what each segment adds,
+        [..., segments]."""
+        count, variance = self.bins * self.independent, self.variances(mean_squares)[..., None, :]
         beyond = (count + _FREEDOM) * np.log1p(count * mean_squares / (_FREEDOM * variance))
-        return (count * np.log(variance) + beyond).sum(axis=1)
+        return (count * np.log(variance) + beyond).sum(axis=-1)
 
     def weights(self, residual: np.ndarray) -> np.ndarray:
         """Computes w for every feature, [features]."""
@@ -69,24 +69,20 @@ class Counts:
         weight = self.independent * self._shares(mean_squares, variance) / variance
         return np.repeat(weight, self.bins, axis=0).ravel()
 
-    def pooled_cost(self, mean_squares: np.ndarray, rows: int) -> np.ndarray:
-        """Computes the limit of C for many degrees of freedom, from mean squares [..., components] over all `rows`."""
-        near, beyond = np.minimum(mean_squares, 1.0), np.log(np.maximum(mean_squares, 1.0))
-        return rows * self.independent * (near + beyond).sum(axis=-1)
-
-    def pooled_weights(self, mean_squares: np.ndarray) -> np.ndarray:
-        """Computes w in that limit; of the shape of the mean squares."""
-        return self.independent / np.maximum(mean_squares, 1.0)
+    def shares(self, residual: np.ndarray) -> np.ndarray:
+        """Computes how far each segment of residuals [features] counts, [segments, components]: w v / a."""
+        mean_squares = self.mean_squares(residual)
+        return self._shares(mean_squares, self.variances(mean_squares))
 
     def variances(self, mean_squares: np.ndarray) -> np.ndarray:
-        """Computes the v at which C is least, [components], from mean squares [segments, components].
+        """Computes the v at which C is least, [..., components], from mean squares [..., segments, components].
 
         A few segments hardly move it. Source: Lange, Little and Taylor (1989).
         """
-        variance = np.maximum(mean_squares.mean(axis=0), 1.0)
+        variance = np.maximum(mean_squares.mean(axis=-2), 1.0)
         for _ in range(_ROUNDS):
-            before, weighed = variance, self._shares(mean_squares, variance) * mean_squares
-            variance = np.maximum(weighed.mean(axis=0), 1.0)
+            before, weighed = variance, self._shares(mean_squares, variance[..., None, :]) * mean_squares
+            variance = np.maximum(weighed.mean(axis=-2), 1.0)
             if (np.abs(variance - before) < _SETTLED * before).all():
                 break
         return variance

@@ -49,6 +49,8 @@ class Hypothesis:
     form: str = ""
     """Empty for an effect. Else the hypothesis is that the effect of this name, at the same places, has this form: it
     frees one parameter more, is tried only beside the effect, and is no name of its own."""
+    screened: bool = False
+    """True for a form without which its effect may not be seen: the screen tries both together as well."""
 
     @property
     def key(self) -> str:

@@ -6,8 +6,10 @@ coordinates that answers it is
 
     u = argmin C(r + D'w + J u),
 
-with the cost C of `least_squares`, prior included. The cost needs no more than the mean square of every component. So
-everything follows from the products of r, J and D with each other, which are summed once.
+with the cost C of `least_squares`, prior included. How far each segment counts is known roughly: those that are far off
+under the best model so far have little say in u, as few segments should not move a parameter. With that settled, u
+needs no more than the products of r, J and D with each other, which are summed once. The cost at u is computed from the
+residuals there, so that a change which explains the segments that are far off gets the credit for that.
 """
 
 from dataclasses import dataclass, replace
@@ -27,16 +29,26 @@ class Changes:
     which: np.ndarray
     weights: np.ndarray
 
+    def of(self, library: np.ndarray) -> np.ndarray:
+        """Sums the changes of a library [library, features]; returns [n, features]."""
+        return self.weights @ library[self.which]
+
 
 @dataclass(frozen=True, kw_only=True)
 class Profile:
     """A model near a fit, as sums over the rows of every component; see `profile_of`."""
 
     counts: Counts
+    residual: np.ndarray
+    """[features] r"""
+    jacobian: np.ndarray
+    """[features, coordinates] J"""
+    library: np.ndarray
+    """[library, features] D"""
     rows: int
     """Residuals of every component."""
     square: np.ndarray
-    """[components] r'r"""
+    """[components] r'r; in this sum and in those that follow every segment counts by its share."""
     pull: np.ndarray
     """[components, coordinates] J'r"""
     normal: np.ndarray
@@ -59,6 +71,7 @@ class Profile:
         which, (weights,) = change.which, change.weights
         return replace(
             self,
+            residual=self.residual + change.of(self.library)[0],
             square=self.square
             + 2 * self.of_residual[:, which] @ weights
             + np.einsum("s,pst,t->p", weights, self.gram[:, which[:, None], which], weights),
@@ -75,6 +88,7 @@ class Profile:
         none = np.zeros(len(weights))
         return replace(
             self,
+            jacobian=np.concatenate([self.jacobian, changes.of(self.library).T], axis=1),
             pull=np.concatenate([self.pull, self.of_residual[:, which] @ weights.T], axis=1),
             normal=np.block([[self.normal, mixed], [np.swapaxes(mixed, 1, 2), own]]),
             of_slopes=np.concatenate([self.of_slopes, of_library], axis=1),
@@ -104,7 +118,7 @@ class Profile:
         least = square
         for _ in range(reweighted):
             mean = np.maximum(least, 0.0) / self.rows
-            weight = self.counts.pooled_weights(mean)
+            weight = self.counts.independent / np.maximum(mean, 1.0)
             normal = (weight @ self.normal.reshape(parts, -1)).reshape(-1, count, count) + np.diag(self.precision)
             diagonal = np.einsum("nii->ni", normal)
             normal = normal + np.eye(count) * (1e-6 * np.maximum(diagonal, 1e-9))[:, None]
@@ -114,26 +128,33 @@ class Profile:
             bent = np.einsum("npi,ni->np", (step @ self.normal.reshape(parts, count, count)).swapaxes(0, 1), step)
             least = np.maximum(square + 2 * np.einsum("npi,ni->np", pull, step) + bent, 0.0)
         at = self.offset + step
-        return self.counts.pooled_cost(least / self.rows, self.rows) + (self.precision * at**2).sum(axis=1), at
+        left = self.residual + changes.of(self.library) + step @ self.jacobian.T
+        costs = self.counts.cost(self.counts.mean_squares(left)).sum(axis=-1)
+        return costs + (self.precision * at**2).sum(axis=1), at
 
 
-def profile_of(fit: Fit, library: np.ndarray) -> Profile:
+def profile_of(fit: Fit, library: np.ndarray, shares: np.ndarray) -> Profile:
     """Sums over the rows of a fit.
 
     Args:
       fit: the model, whose coordinates answer.
       library: [library, features] changes of the residuals.
+      shares: [segments, components] how far each segment counts, about one for a usual one.
     """
     parts, count = fit.counts.components, len(fit.coordinates)
     by_part = lambda values: values.reshape(len(values), -1, parts)  # noqa: E731
     columns = [by_part(fit.residual[None]), by_part(fit.jacobian.T), by_part(library)]
+    root = np.repeat(np.sqrt(shares), fit.counts.bins, axis=0)
     sums = []
     for part in range(parts):
-        one = np.concatenate([values[..., part] for values in columns]).astype(float)
+        one = np.concatenate([values[..., part] for values in columns]) * root[:, part]
         sums.append(one @ one.T)
     total, slopes, changes = np.stack(sums), slice(1, 1 + count), slice(1 + count, None)
     return Profile(
         counts=fit.counts,
+        residual=fit.residual,
+        jacobian=fit.jacobian,
+        library=library,
         rows=len(fit.residual) // parts,
         square=total[:, 0, 0],
         pull=total[:, slopes, 0],

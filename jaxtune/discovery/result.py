@@ -121,7 +121,8 @@ class Result:
     more than form."""
     explained_share: float
     """Share that the reported effects explain on `train` and `select`, of what they and a learned torque explain
-    together: of the gap or of the cost, whichever is smaller."""
+    together: of the gap or of the cost, whichever is smaller. The gap is that of all segments but a few or of typical
+    ones, whichever speaks for the effects."""
     withdrawn: bool
     """True if `proposed` was worse on `sealed` than the better of the nominal model and the null; then `model` is that
     one."""

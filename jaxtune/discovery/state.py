@@ -15,7 +15,7 @@ from jaxtune.discovery.fit import Fit, Free, refine
 from jaxtune.discovery.noise_floor import NoiseFloor, with_systematic_share
 from jaxtune.discovery.problem import Problem
 from jaxtune.discovery.result import Settings
-from jaxtune.discovery.screen import Library, Screen
+from jaxtune.discovery.screen import Library
 
 _NULL_ROUNDS = 8
 
@@ -70,16 +70,14 @@ class State:
                 found[one.key] = one
         return replace(self, candidates=tuple(found.values()))
 
-    def with_screen(self, settings: Settings, problem: Problem, found: Screen) -> "State":
-        """Settles what holds for all steps: what these logs cannot show, and what chance gains."""
-        if self.screened:
-            return self
+    def with_seen(self, settings: Settings, problem: Problem, testable: frozenset[str], chances: np.ndarray) -> "State":
+        """Settles what holds for all steps: what these logs cannot show, and what chance gains (`screen.seen`)."""
         names = dict.fromkeys(hypothesis.name for hypothesis in problem.hypotheses)
-        chance = float(np.quantile(found.chance, 1.0 - settings.level, method="higher"))
+        chance = float(np.quantile(chances, 1.0 - settings.level, method="higher"))
         return replace(
             self,
             screened=True,
-            not_testable=tuple(name for name in names if name not in found.testable),
+            not_testable=tuple(name for name in names if name not in testable),
             # Of many hypotheses one is better by chance, however few null logs there are to show it.
             price=max(chance, 2.0 * float(np.log(max(len(problem.hypotheses), 1)))),
         )

@@ -20,12 +20,15 @@ from jaxtune.discovery.noise_floor import Floor, NoiseFloor, Say
 from jaxtune.discovery.problem import Hypothesis, Problem, are_distinct
 from jaxtune.discovery.result import Settings
 from jaxtune.discovery.screen import (
+    Group,
     Lead,
     Library,
     Screen,
+    groups_of,
     on_segments,
     promising,
     screen,
+    seen,
     simulate_library,
     spread_segments,
 )
@@ -82,13 +85,18 @@ def step(
         state = localise(problem, at, state.replaced(base, fresh), fit)
     # Nominal parameters of the null have moved to imitate what is missing.
     base, best = fresh if state.screened else replace(fresh, fit=state.nominal), state.best
-    library = state.library or simulate_library(at, state.nominal, problem.hypotheses, say)
+    every = groups_of(problem.hypotheses, problem.forms)
+    library = state.library or simulate_library(at, state.nominal, every, say)
     state = replace(state, library=library)
+    # A form may be another one of an effect that is there.
+    forms = [form for form in problem.forms if all(are_distinct(form, other) for other in base.hypotheses)]
     if state.screened:
-        found = screen(at, base.fit, _again(settings, at, base.fit, free, library), pairs=0, say=say)
+        found = screen(at, base.fit, _again(settings, at, base.fit, free, forms, library), pairs=0, say=say)
     else:
-        found = screen(at, base.fit, free, pairs=settings.firsts, library=library, say=say)
-    state = state.with_screen(settings, problem, found)
+        found = screen(
+            at, base.fit, groups_of(free, forms), fitted=fit, pairs=settings.firsts, library=library, say=say
+        )
+        state = state.with_seen(settings, problem, *seen(at, state.nominal, every, library))
     leads = shortlist(settings, found, state.price)
     leads = leads[: settings.swaps] if swapping else leads + shaped(_unfree(problem, at), free, leads, settings.shaped)
     if base.fit is state.nominal:
@@ -137,11 +145,19 @@ def _free(settings: Settings, problem: Problem, at: Floor, base: Candidate, stat
     ]
 
 
-def _again(settings: Settings, at: Floor, base: Fit, free: Sequence[Hypothesis], library: Library) -> list[Hypothesis]:
-    """Picks what is screened again beside a model that has effects: all forms, and the other effects that would lower
-    its cost most if they changed it as they change the nominal model."""
-    forms, effects = ([h for h in free if bool(h.form) == shaping] for shaping in (True, False))
-    return forms + (promising(at, base, effects, library, settings.again) if effects else [])
+def _again(
+    settings: Settings,
+    at: Floor,
+    base: Fit,
+    free: Sequence[Hypothesis],
+    forms: Sequence[Hypothesis],
+    library: Library,
+) -> list[Group]:
+    """Picks what is screened again beside a model that has effects: all forms of these, and the other effects that
+    would lower its cost most if they changed it as they change the nominal model."""
+    own, effects = ([h for h in free if bool(h.form) == shaping] for shaping in (True, False))
+    more = promising(at, base, groups_of(effects, forms), library, settings.again) if effects else []
+    return groups_of([*own, *more], forms)
 
 
 def shortlist(settings: Settings, found: Screen, price: float) -> list[Lead]:
@@ -150,7 +166,7 @@ def shortlist(settings: Settings, found: Screen, price: float) -> list[Lead]:
     families, names = set(), {}
     # A fit finds more than the screen does, but not many times as much.
     for lead in (one for one in found.leads if found.cost - one.cost > settings.promising * price):
-        (hypothesis,) = lead.hypotheses
+        hypothesis = lead.hypotheses[0]
         if names.get(hypothesis.name, 0) >= _MOST_PLACES:
             continue
         if len(chosen) < settings.shortlist or hypothesis.family not in families:
@@ -168,7 +184,8 @@ def _unfree(problem: Problem, at: Floor) -> list[Hypothesis]:
 
 
 def shaped(forms: Sequence[Hypothesis], free: Sequence[Hypothesis], leads: Sequence[Lead], count: int) -> list[Lead]:
-    """Adds to the first leads each of the forms that they may have, and what such a form is without them.
+    """Adds to the first leads each further form that they may have, what such a form is without them, and to those that
+    the screen saw in a form what they are without it.
 
     Else what another form of the right effect leaves would be explained by a second effect. And play with a spring
     that turns out to have no play is a spring: a form that is an effect of its own is fitted alone too.
@@ -179,10 +196,17 @@ def shaped(forms: Sequence[Hypothesis], free: Sequence[Hypothesis], leads: Seque
       leads: best first.
       count: leads of one effect that get their forms.
     """
-    known = {lead.hypotheses[0].key for lead in leads if len(lead.hypotheses) == 1}
-    found = []
+    single = [lead for lead in leads if sum(not one.form for one in lead.hypotheses) == 1]
+    known = {lead.hypotheses[0].key for lead in single}
+    found = [
+        replace(lead, hypotheses=(effect,), point=lead.point[: len(effect.directions)])
+        for lead in single
+        for effect, *has in [lead.hypotheses]
+        if has
+    ]
     for lead in leads[:count]:
-        for form in (form for form in forms if form.shapes(lead.hypotheses[0])):
+        there = {one.key for one in lead.hypotheses}
+        for form in (form for form in forms if form.shapes(lead.hypotheses[0]) and form.key not in there):
             # The least size may be too small to have a slope.
             point = form.probes[1]
             found.append(Lead((*lead.hypotheses, form), np.concatenate([lead.point, point]), lead.start, lead.cost))

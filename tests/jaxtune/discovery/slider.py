@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxtune.discovery.problem import Hypothesis, Problem, Segments
 
-AXES = ("mass", "damping", "coulomb", "push", "nothing", "cubic", "wild")
+AXES = ("mass", "damping", "coulomb", "push", "nothing", "cubic", "wild", "held")
 HORIZONS = (0.1, 0.2, 0.4)
 DT, NOISE = 0.01, 0.002
 DRAWS = np.random.default_rng(5).standard_normal((12, 2)).clip(-2, 2)
@@ -18,11 +18,12 @@ DRAWS = np.random.default_rng(5).standard_normal((12, 2)).clip(-2, 2)
 def simulate(system, vector, segment, steps):
     """A slider of `system` kg and 1 N s/m pushed by a force [steps]; coordinates are what is added to them."""
     del steps
-    mass, damping, coulomb, push, _, cubic, wild = vector
+    mass, damping, coulomb, push, _, cubic, wild, held = vector
 
     def step(state, force):
         x, v = state
-        rub = coulomb * jnp.tanh(v / 0.02) + cubic * x**3
+        # Held, the slider is pulled back to the middle by what else would brake it.
+        rub = coulomb * jnp.tanh(jnp.where(held > 0, x, v) / 0.02) + cubic * x**3
         # A hypothesis that breaks the simulation wherever it is tried.
         broken = jnp.where(wild > 0, jnp.nan, 0.0)
         v = v + DT * (force + push - (1.0 + damping) * v - rub) / (system * jnp.exp(mass)) + broken
@@ -90,6 +91,8 @@ def measured(truth, seed, split=0, count=40, motion=None):
 DIRECTION = replace(HYPOTHESES[3], name="coulomb", family="friction", form="direction_dependent")
 # Friction that grows away from the middle of the slide, as of a warped rail.
 WARPED = replace(hypothesis("cubic", (0.0, 30.0), [1.0, 10.0]), name="coulomb", form="warped")
+# A form without which the effect is not seen.
+HELD = replace(hypothesis("held", (0.0, 1.0), [0.5, 1.0]), name="coulomb", form="held", screened=True)
 
 
 # Stands for a learned torque, which explains what no hypothesis does.
@@ -98,7 +101,7 @@ LEARNED = hypothesis("cubic", (-30.0, 30.0), [1.0])
 
 def problem(truth, seed=0, hypotheses=HYPOTHESES, forms=(), residual=None, sealed=None):
     truths = {"train": truth, "select": truth, "sealed": truth if sealed is None else sealed}
-    prior = np.array([0.1, 0.1, 0.0, 0.0, 0.0, 0.0, 0.0])
+    prior = np.array([0.1, 0.1, *np.zeros(len(AXES) - 2)])
     # Nobody knows the nominal parameters better than to a tenth.
     drawn = [{"mass": 0.1 * m, "damping": 0.1 * d} for m, d in DRAWS]
     splits = ("train", "select", "sealed")

@@ -80,10 +80,11 @@ def test_weights_are_the_slope_of_the_cost():
         assert (costs[1] - costs[0]) / 2e-4 == pytest.approx(slope, rel=1e-3)
 
 
-def test_the_pooled_cost_is_that_of_the_floor_below_it_and_logarithmic_above():
-    # 10 rows; mean squares 0.6 and e^2: 10 * 0.5 (0.6 + 1 + 2).
-    assert COUNTS.pooled_cost(np.array([0.6, np.e**2]), 10) == pytest.approx(18.0)
-    np.testing.assert_allclose(COUNTS.pooled_weights(np.array([0.6, 9.0])), [0.5, 0.5 / 9.0])
+def test_costs_of_many_models_are_those_of_each_alone():
+    residual = np.random.default_rng(0).normal(size=(3, 6 * COUNTS.bins * COUNTS.components)) * [[0.5], [2.0], [9.0]]
+    together = COUNTS.cost(COUNTS.mean_squares(residual))
+    alone = [COUNTS.cost(COUNTS.mean_squares(one)) for one in residual]
+    np.testing.assert_allclose(together, alone, rtol=1e-3)
 
 
 def test_a_rare_segment_is_left_out_of_the_usual_and_a_common_one_is_not():

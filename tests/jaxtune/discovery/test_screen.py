@@ -4,20 +4,22 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from slider import AXES, HYPOTHESES, problem
+from slider import AXES, HELD, HYPOTHESES, problem
 
 from jaxtune.discovery import fit, noise_floor, state
 from jaxtune.discovery.fit import Fit, Free
 from jaxtune.discovery.least_squares import Counts
 from jaxtune.discovery.profile import Changes, profile_of
-from jaxtune.discovery.screen import promising, screen, simulate_library
+from jaxtune.discovery.screen import groups_of, promising, screen, simulate_library
 
 
-def screened(truth, pairs=0):
-    asked = problem(truth)
+def screened(truth, pairs=0, forms=(), unknowns=None):
+    asked = problem(truth, forms=forms)
+    if unknowns is not None:
+        asked = replace(asked, unknowns=unknowns, unknown_bounds=np.tile([0.0, 2.0], (len(unknowns), 1)))
     floor, begun = state.begin(asked, noise_floor.measure(asked, lambda text: None))
     at = floor[asked.main_horizon]
-    return screen(at, begun.nominal, HYPOTHESES, pairs=pairs, say=lambda text: None)
+    return screen(at, begun.nominal, groups_of(HYPOTHESES, forms), pairs=pairs, say=lambda text: None)
 
 
 def test_the_best_lead_is_what_is_hidden_at_about_its_size():
@@ -28,6 +30,25 @@ def test_the_best_lead_is_what_is_hidden_at_about_its_size():
     # The nominal parameters answer it near where they are: a tenth is one prior deviation.
     np.testing.assert_allclose(lead.start, [0.8, -1.0], atol=0.8)
     assert lead.cost < found.cost
+
+
+def test_an_effect_that_shows_in_one_form_alone_is_screened_in_that_form():
+    truth = {"coulomb": 0.6, "held": 0.5}
+    lead = screened(truth, forms=(HELD,)).leads[0]
+    assert [one.key for one in lead.hypotheses] == ["coulomb@slider", "coulomb(held)@slider"]
+    np.testing.assert_allclose(lead.point, [0.6, 0.5], rtol=0.4)
+    unseen = screened(truth, forms=(replace(HELD, screened=False),))
+    assert unseen.leads[0].hypotheses[0].name != "coulomb"
+    assert unseen.leads[0].cost > lead.cost + 50.0
+    # In its first form it is a lead without the other one.
+    assert len(screened({"coulomb": 0.6}, forms=(HELD,)).leads[0].hypotheses) == 1
+
+
+def test_a_form_that_is_free_anyway_is_where_a_lead_begins():
+    lead = screened({"coulomb": 0.6, "held": 0.5}, forms=(HELD,), unknowns=0.25 * HELD.directions).leads[0]
+    assert [one.key for one in lead.hypotheses] == ["coulomb@slider"]
+    assert lead.point == pytest.approx([0.6], rel=0.4)
+    assert lead.start[-1] == pytest.approx(2.0, abs=0.5)
 
 
 def test_two_that_hide_each_other_are_found_as_a_pair():
@@ -41,10 +62,13 @@ def test_the_changes_of_the_nominal_model_find_what_to_screen_beside_another_mod
     floor, begun = state.begin(asked, noise_floor.measure(asked, lambda text: None))
     at, (coulomb,) = floor[asked.main_horizon], [h for h in HYPOTHESES if h.name == "coulomb"]
     base = fit.begin(begun.nominal, [(coulomb,)], [np.array([0.8])], [begun.nominal.coordinates], at.residuals["train"])
-    library = simulate_library(at, begun.nominal, HYPOTHESES, lambda text: None)
-    others = [h for h in HYPOTHESES if h is not coulomb]
+    library = simulate_library(at, begun.nominal, groups_of(HYPOTHESES, ()), lambda text: None)
+    others = groups_of([h for h in HYPOTHESES if h is not coulomb], ())
     assert [h.name for h in promising(at, base[0], others, library, 1)] == ["push"]
     assert len(promising(at, base[0], others, library, 3)) == 3
+
+
+EVEN = np.ones((1, 2))
 
 
 def fit_of(rng, count=3, rows=60, parts=2):
@@ -59,16 +83,32 @@ def test_a_profile_is_no_dearer_than_any_answer_within_bounds(seed):
     rng = np.random.default_rng(seed)
     fit = fit_of(rng)
     change = 3.0 * rng.normal(size=(1, len(fit.residual)))
-    (cost,), (at,) = profile_of(fit, change).costs(Changes(np.arange(1), np.ones((1, 1))))
+    (cost,), (at,) = profile_of(fit, change, EVEN).costs(Changes(np.arange(1), np.ones((1, 1))))
 
     def cost_at(coordinates):
         residual = fit.residual + change[0] + fit.jacobian @ (coordinates - fit.coordinates)
-        rows = len(residual) // fit.counts.components
-        mean_squares = (residual.reshape(rows, -1) ** 2).mean(axis=0)
-        return fit.counts.pooled_cost(mean_squares, rows) + (coordinates**2).sum()
+        return fit.counts.cost(fit.counts.mean_squares(residual)).sum() + (coordinates**2).sum()
 
     assert cost == pytest.approx(cost_at(at), rel=1e-4)
     assert cost <= min(cost_at(at + 0.3 * rng.normal(size=3)) for _ in range(200)) + 1e-3
+
+
+def test_few_segments_do_not_move_a_parameter_but_count_where_a_change_explains_them():
+    rng = np.random.default_rng(0)
+    slope = rng.normal(size=(20, 30, 1))
+    bump = np.zeros((20, 30, 1))
+    bump[:2] = 40.0 * (slope[:2] + rng.normal(size=(2, 30, 1)))
+    free = Free(np.eye(1), np.full(1, 10.0), np.array([[-50.0, 50]]), np.ones(1, bool))
+    counts = Counts(components=1, bins=30, independent=0.3)
+    residual = (rng.normal(size=(20, 30, 1)) + slope + bump).ravel()
+    fit = Fit(free, np.zeros(1), residual, slope.reshape(-1, 1), counts)
+    profile = profile_of(fit, -bump.reshape(1, -1), counts.shares(residual))
+    (without, explained), at = profile.costs(Changes(np.arange(1), np.array([[0.0], [1.0]])))
+    even = profile_of(fit, -bump.reshape(1, -1), np.ones((20, 1)))
+    # The parameter is 1 off. The two segments that lack the bump would move it to -5.
+    np.testing.assert_allclose(at[:, 0], -1.0, atol=0.3)
+    assert abs(even.costs(Changes(np.arange(1), np.zeros((1, 1))))[1][0, 0] + 1.0) > 2.0
+    assert without - explained > 50.0
 
 
 def test_a_moved_profile_is_the_profile_of_the_moved_model():
@@ -85,8 +125,8 @@ def test_a_moved_profile_is_the_profile_of_the_moved_model():
         residual=fit.residual + 0.5 * library[0] - library[2],
         jacobian=np.column_stack([fit.jacobian, library[1]]),
     )
-    found = profile_of(fit, library).moved(change).with_directions(direction).costs(other)
-    for mine, want in zip(found, profile_of(grown, library).costs(other), strict=True):
+    found = profile_of(fit, library, EVEN).moved(change).with_directions(direction).costs(other)
+    for mine, want in zip(found, profile_of(grown, library, EVEN).costs(other), strict=True):
         np.testing.assert_allclose(mine, want, rtol=1e-5, atol=1e-6)
 
 
@@ -94,7 +134,7 @@ def test_a_profile_keeps_bounds():
     fit = fit_of(np.random.default_rng(0))
     fit = replace(fit, free=replace(fit.free, sd=np.full(3, 100.0)))
     change = -50.0 * fit.jacobian[:, :1].T
-    _, at = profile_of(fit, change).costs(Changes(np.arange(1), np.ones((1, 1))))
+    _, at = profile_of(fit, change, EVEN).costs(Changes(np.arange(1), np.ones((1, 1))))
     assert (np.abs(at) <= 3.0 + 1e-6).all()
     assert at[0, 0] == pytest.approx(3.0)
 

@@ -320,6 +320,11 @@ def test_a_form_that_is_an_effect_of_its_own_is_fitted_alone_too():
     known = step.Lead((push,), np.array([0.3]), np.zeros(2), 12.0)
     assert len(step.shaped([DIRECTION, WARPED], HYPOTHESES, [first, second, known], 1)) == 2
     assert step.shaped([DIRECTION], HYPOTHESES, [second, first], 1) == []
+    # One that the screen saw in a form is fitted without it too.
+    both = step.Lead((coulomb, DIRECTION), np.array([0.8, 0.3]), np.zeros(2), 10.0)
+    (plain,) = step.shaped([DIRECTION], (), [both], 1)
+    assert [h.key for h in plain.hypotheses] == ["coulomb@slider"]
+    assert plain.point == pytest.approx([0.8])
 
 
 def test_the_larger_part_gives_the_name_where_two_effects_are_forms_of_each_other():
