@@ -206,7 +206,7 @@ class PPO:
         data = devices.gather(data)
         # As in Brax's own training, the loss already reads observations with the updated statistics.
         normalizer = running_statistics.update(state.normalizer, data.observation)
-        normalizer = _choose(_finite(normalizer), normalizer, state.normalizer)
+        normalizer = optax.tree.where(_finite(normalizer), normalizer, state.normalizer)
         (params, opt_state), learned = jax.lax.scan(
             lambda carry, key: self._pass(key, carry, normalizer, data),
             (state.params, state.opt_state),
@@ -282,7 +282,7 @@ class PPO:
             "learning_rate": learning_rate,
             "skipped": 1.0 - sane,
         }
-        return _choose(sane, (optax.apply_updates(params, updates), opt_state), carry), metrics
+        return optax.tree.where(sane, (optax.apply_updates(params, updates), opt_state), carry), metrics
 
     def _steer(self, learning_rate: jax.Array, kl: jax.Array) -> jax.Array:
         """Adapts the step size to the divergence, within its range (Rudin et al., CoRL 2021).
@@ -302,7 +302,3 @@ class PPO:
 def _finite(values: Any) -> jax.Array:
     """Tells whether all numbers of a pytree are finite; whole numbers are."""
     return jnp.all(jnp.stack([jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(values)]))
-
-
-def _choose(condition: jax.Array, then: Any, otherwise: Any) -> Any:
-    return jax.tree.map(lambda one, other: jnp.where(condition, one, other), then, otherwise)

@@ -75,6 +75,7 @@ from typing import Any
 import chex
 import jax
 import jax.numpy as jnp
+import optax
 
 from jaxtune import dist as dists
 from jaxtune.checks import check_measured, check_simulated
@@ -325,7 +326,7 @@ class Tuner:
             "left": jnp.where(goes_on, carry["left"], 0),
             "calls": calls + 1,
             "tested": dist,
-            "dist": _choose(verdict == Verdict.WIDEN, wider, dist),
+            "dist": optax.tree.where(verdict == Verdict.WIDEN, wider, dist),
             "verdict": verdict,
             "verdicts": carry["verdicts"].at[calls].set(verdict),
             "radius": carry["radius"].at[calls].set(dists.ravel(dist.radius).max()),
@@ -370,9 +371,11 @@ class Tuner:
         verdict = jnp.where(unexplained, Verdict.UNEXPLAINED, carry["verdict"])
         return carry | {
             "left": jnp.where(changed.any() & ~misfits & ~unexplained, carry["left"] - 1, 0),
-            "dist": _choose(unexplained, tested, _choose(misfits, dist.replace(radius=carry["wider"]), moved)),
+            "dist": optax.tree.where(
+                unexplained, tested, optax.tree.where(misfits, dist.replace(radius=carry["wider"]), moved)
+            ),
             "wider": dist.radius,
-            "update": _choose(unexplained, nothing, _choose(misfits, back, update)),
+            "update": optax.tree.where(unexplained, nothing, optax.tree.where(misfits, back, update)),
             "verdict": verdict,
             "verdicts": carry["verdicts"].at[carry["calls"] - 1].set(verdict),
         }
@@ -434,8 +437,3 @@ class Tuner:
             ],
             Verdict.WIDEN,
         )
-
-
-def _choose(condition: jax.Array, one: Any, other: Any) -> Any:
-    """One of two pytrees of the same structure."""
-    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), one, other)

@@ -14,7 +14,7 @@ from rich.progress import Progress
 
 from experiments.common import checkpoint, hosts
 from experiments.common.checkpoint import write_json
-from experiments.common.cli import bars
+from experiments.common.cli import bars, console
 from experiments.walking.learner import Learner, Policy
 from experiments.walking.robots import Kind
 from jaxtune import devices
@@ -50,8 +50,8 @@ def walk(
       The policy, and a line of metrics (means over the chunk) for every chunk of updates.
 
     Raises:
-      ValueError: the folder's checkpoint is damaged, or of a training with another config or more updates; or the
-        policy is not finite when it is kept.
+      ValueError: the folder's checkpoint is damaged, or of a training with another config or more updates; the policy
+        is not finite when it is kept; or a whole chunk of updates took no gradient step.
     """
     key_init, key_train = jax.random.split(key)
     policy = learner.init(key_init)
@@ -78,6 +78,11 @@ def walk(
         policy, metrics = train(jax.random.fold_in(key_train, index), policy)
         line = {name: float(jnp.mean(value)) for name, value in metrics.items()}
         steps = (index + 1) * chunk * learner.preset.ppo.steps_per_update
+        if line["skipped"] == 1.0:
+            raise ValueError(
+                f"training: no gradient step was taken in the updates before step {steps:,}: rewards or observations "
+                "were not finite in each of them; check the environment"
+            )
         curve.append({"steps": steps, "seconds": time.monotonic() - start, **line})
         if progress:
             rate = line["reward"] / learner.kind.control_s
@@ -103,12 +108,16 @@ def trained(key: jax.Array, learner: Learner, updates: int, out: Path) -> tuple[
       As `walk`.
 
     Raises:
-      ValueError: nothing can be written there, another process trains there, or the policy is not finite.
+      ValueError: nothing can be written there, another process trains there, the policy is not finite, or a whole
+        chunk of updates took no gradient step.
     """
     checkpoint.check_writable(out)
     kept = out / "training"
     with checkpoint.lock(kept), bars() as progress:
         policy, curve = walk(key, learner, updates, progress, kept)
+        skipped = sum(line["skipped"] for line in curve) / len(curve)
+        if skipped > 0:
+            console.print(f"{skipped:.2%} of the gradient steps were not taken, since a number was not finite")
         checkpoint.check_finite("policy", policy.learner)
         checkpoint.save(out, policy.learner, policy_config(learner))
         write_json(out / "curve.json", {"curve": curve})

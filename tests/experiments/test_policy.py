@@ -10,7 +10,7 @@ import pytest
 from experiments.common import checkpoint
 from experiments.common.config import PRESETS, WALK
 from experiments.walking.learner import Learner
-from experiments.walking.policies import policy_config
+from experiments.walking.policies import policy_config, trained, walk
 from experiments.walking.robots import BITENO
 from jaxtune.mjx import parameters
 
@@ -53,6 +53,25 @@ def test_robots_train_within_the_policy_radius_and_with_hidden_parameters(learne
         spread = np.abs(np.log(params["foot_friction"]))
         assert 0.5 * radius < spread.max() <= radius + 1e-6
     assert train._cache_size() == 1
+
+
+def leave_out(monkeypatch, shares):
+    """Lets chunks of a training leave out these shares of their gradient steps, without the training."""
+    left = iter(shares)
+    chunk = lambda key, policy: (policy, {"reward": 1.0, "skipped": next(left)})  # noqa: E731
+    monkeypatch.setattr("experiments.walking.policies.devices.on_all", lambda train: chunk)
+
+
+def test_a_training_that_takes_no_step_is_no_success(learner, monkeypatch):
+    leave_out(monkeypatch, [0.0, 1.0, 0.0])
+    with pytest.raises(ValueError, match=r"no gradient step was taken .* not finite"):
+        walk(jax.random.PRNGKey(0), learner, 3 * learner.preset.chunk)
+
+
+def test_a_training_says_how_many_steps_it_did_not_take(learner, monkeypatch, tmp_path, capsys):
+    leave_out(monkeypatch, [0.0, 0.5])
+    trained(jax.random.PRNGKey(0), learner, 2 * learner.preset.chunk, tmp_path / "policy")
+    assert "25.00% of the gradient steps were not taken" in capsys.readouterr().out
 
 
 def test_policy_of_another_config_is_refused(learner, tmp_path):
