@@ -255,12 +255,14 @@ def simulate_curves(at: Floor, some: Fit, chosen: np.ndarray, groups: Sequence[G
     moves = np.zeros((len(keys), len(some.vector)))
     for move, ((axis, *of_form), size) in zip(moves, keys, strict=True):
         move[axis], move[of_form] = size, [smallest[one] for one in of_form]
-    moved, changes = (moves != 0).any(axis=1), np.zeros((len(keys), len(some.residual)), np.float32)
+    # Curves of one form begin alike, and others where nothing moves.
+    moves, which = np.unique(moves, axis=0, return_inverse=True)
+    moved, changes = (moves != 0).any(axis=1), np.zeros((len(moves), len(some.residual)), np.float32)
     (changes[moved],) = at.on_some(chosen).changes(
         [some.vector], [some.residual], [moves[moved]], lambda done, count: say(f"screen {done}/{count}")
     )
     firsts = np.cumsum([0, *(len(values) for values in nodes.values())]).tolist()
-    return Curves(nodes, dict(zip(nodes, firsts, strict=False)), changes)
+    return Curves(nodes, dict(zip(nodes, firsts, strict=False)), changes[which.ravel()])
 
 
 def _cost_now(profile: Profile) -> float:
