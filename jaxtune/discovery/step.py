@@ -184,8 +184,8 @@ def _unfree(problem: Problem, at: Floor) -> list[Hypothesis]:
 
 
 def shaped(forms: Sequence[Hypothesis], free: Sequence[Hypothesis], leads: Sequence[Lead], count: int) -> list[Lead]:
-    """Adds to the first leads each further form that they may have, what such a form is without them, and to those that
-    the screen saw in a form what they are without it.
+    """Adds to the first leads what they are without the form that the screen saw them in, each further form that they
+    may have, and what such a form is without them.
 
     Else what another form of the right effect leaves would be explained by a second effect. And play with a spring
     that turns out to have no play is a spring: a form that is an effect of its own is fitted alone too.
@@ -196,17 +196,14 @@ def shaped(forms: Sequence[Hypothesis], free: Sequence[Hypothesis], leads: Seque
       leads: best first.
       count: leads of one effect that get their forms.
     """
-    single = [lead for lead in leads if sum(not one.form for one in lead.hypotheses) == 1]
-    known = {lead.hypotheses[0].key for lead in single}
-    found = [
-        replace(lead, hypotheses=(effect,), point=lead.point[: len(effect.directions)])
-        for lead in single
-        for effect, *has in [lead.hypotheses]
-        if has
-    ]
+    known = {lead.hypotheses[0].key for lead in leads if sum(not one.form for one in lead.hypotheses) == 1}
+    found = []
     for lead in leads[:count]:
-        there = {one.key for one in lead.hypotheses}
-        for form in (form for form in forms if form.shapes(lead.hypotheses[0]) and form.key not in there):
+        effect, *others = lead.hypotheses
+        if others and all(one.form for one in others):
+            found.append(replace(lead, hypotheses=(effect,), point=lead.point[: len(effect.directions)]))
+        there = {one.key for one in others}
+        for form in (form for form in forms if form.shapes(effect) and form.key not in there):
             # The least size may be too small to have a slope.
             point = form.probes[1]
             found.append(Lead((*lead.hypotheses, form), np.concatenate([lead.point, point]), lead.start, lead.cost))
