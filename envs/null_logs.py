@@ -135,7 +135,9 @@ def play(pairs: Sequence[tuple[Robot, Run]], joints: Sequence[str]) -> list[Moti
     times = np.array([run.time[0] + phases[id(robot)] + looks for robot, run in pairs])
     drive = _Drive([run for _, run in pairs], times, [robot.goes_straight(run) for robot, run in pairs])
     size = mujoco.mj_stateSize(first, mujoco.mjtState.mjSTATE_FULLPHYSICS)
-    state = np.stack([_first_state(robot.model, run, qpos, dof) for robot, run in pairs])
+    # Many robots begin a run alike; smoothed, so that noise there does not become an error of the start.
+    begins = {number: smoothed(run)[0] for number, run in {id(run): run for _, run in pairs}.items()}
+    state = np.stack([_state_of(robot.model, *begins[id(run)], qpos, dof) for robot, run in pairs])
     found = np.empty((len(looks), len(pairs), 2, len(joints)))
     torques = np.empty((len(looks), len(pairs), len(joints)))
     held, control = np.zeros((len(pairs), len(joints))), np.zeros((len(pairs), steps + 1, first.nv))
@@ -167,11 +169,11 @@ def play(pairs: Sequence[tuple[Robot, Run]], joints: Sequence[str]) -> list[Moti
     return [Motion(times[index], found[:, index], torques[:, index]) for index in range(len(pairs))]
 
 
-def _first_state(model: mujoco.MjModel, run: Run, qpos: np.ndarray, dof: np.ndarray) -> np.ndarray:
-    """The state of a model at a run's first row; smoothed, so that noise there does not become an error of the
-    start."""
+def _state_of(
+    model: mujoco.MjModel, position: np.ndarray, velocity: np.ndarray, qpos: np.ndarray, dof: np.ndarray
+) -> np.ndarray:
+    """The state of a model whose joints have these positions and velocities."""
     data = mujoco.MjData(model)
-    position, velocity = smoothed(run)[0]
     data.qpos[qpos], data.qvel[dof] = position + 0.5 * model.opt.timestep * velocity, velocity
     state = np.empty(mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS))
     mujoco.mj_getState(model, data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)

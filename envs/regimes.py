@@ -6,7 +6,6 @@ Effects show in different regimes: dry friction near a reversal, a torque limit 
 import numpy as np
 
 from envs.logs import Run
-from envs.segments import smoothed
 
 REGIMES = ("steady", "fast", "loaded", "reversal", "saturated", "motor off")
 """Names of the regimes; where two apply to a row, it gets the later one."""
@@ -16,7 +15,7 @@ _FAST, _LOADED, _STILL = 1.5, 1.5, 0.15
 _SATURATED = 0.98  # share of the controller's limit
 
 
-def regimes(run: Run) -> np.ndarray:
+def regimes(run: Run, states: np.ndarray) -> np.ndarray:
     """Assigns a regime to every joint at every row.
 
     `fast` and `loaded` are 1.5 times the joint's own rms of speed and of commanded torque, `reversal` is below 0.15 of
@@ -24,11 +23,12 @@ def regimes(run: Run) -> np.ndarray:
 
     Args:
       run: with positions, and targets or torques.
+      states: [rows, 2, joints] rad and rad/s, of `smoothing.smoothed`.
 
     Returns:
       Indices into `REGIMES`, [rows, joints].
     """
-    position, speed = np.moveaxis(smoothed(run), 1, 0)
+    position, speed = np.moveaxis(states, 1, 0)
     torque, limit = control_torque(run, position, speed)
     found = np.zeros(position.shape, int)
     found[np.abs(speed) > _FAST * _rms(speed)] = REGIMES.index("fast")

@@ -75,11 +75,11 @@ def _fit_window(
         designs.append(np.stack(terms, axis=-1) / width**derivative / sd)
         values.append(read[near] / sd)
     design, value = np.concatenate(designs, axis=1), np.concatenate(values, axis=1)
-    normal = np.einsum("rki,rkj->rij", design, design) + 1e-9 * np.eye(order + 1)
-    fit = np.linalg.solve(normal, np.einsum("rki,rk->ri", design, value)[..., None])[..., 0]
-    left = value - np.einsum("rki,ri->rk", design, fit)
+    across = np.swapaxes(design, 1, 2)
+    fit = np.linalg.solve(across @ design + 1e-9 * np.eye(order + 1), across @ value[..., None])
+    left = value - (design @ fit)[..., 0]
     misfit = (left**2).sum(axis=1) / max(value.shape[1] - order - 1, 1)
-    return np.stack([fit[:, 0], fit[:, 1] / width], axis=1), misfit
+    return np.concatenate([fit[:, 0], fit[:, 1] / width], axis=1), misfit
 
 
 def _window(time: np.ndarray) -> tuple[int, int, float]:
@@ -110,12 +110,12 @@ def velocity_lag(run: Run) -> float:
       run: with `q` and `dq`.
     """
     # Slopes of the positions alone: with `dq` among the signals the fit would follow it.
-    own = smoothed(replace(run, signals={"q": run.signals["q"]}))[:, 1]
+    own, read = smoothed(replace(run, signals={"q": run.signals["q"]}))[:, 1], aligned(run, "dq")
     lags = np.arange(-0.01, 0.051, 0.001)
     misfit = [
         sum(
             ((np.interp(run.time - lag, run.time, mine) - theirs) ** 2).mean()
-            for mine, theirs in zip(own.T, aligned(run, "dq").T, strict=True)
+            for mine, theirs in zip(own.T, read.T, strict=True)
         )
         for lag in lags
     ]

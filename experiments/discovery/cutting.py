@@ -156,8 +156,8 @@ def cut_log(log: Log, dt: float, signals: Sequence[str], horizons: Sequence[floa
       ValueError: a split has too few segments of a length.
     """
     names = {split: {run.name for run in runs} for split, runs in splits(log).items()}
-    labels = [regimes(run) for run in log.runs]
     estimates = [segments.estimate(run) for run in log.runs]
+    labels = [regimes(run, one.states) for run, one in zip(log.runs, estimates, strict=True)]
     data: dict[str, dict[float, Segments]] = {split: {} for split in names}
     for horizon in horizons:
         # All runs at once, so that segments have one shape and programs compile once.
@@ -194,10 +194,11 @@ def _repeats(log: Log, run: np.ndarray, row: np.ndarray) -> np.ndarray:
       row: [segments, rows] of that run.
     """
     told: dict[tuple, list[int]] = {}
+    conditions = [(one.condition, str(one.controller)) for one in log.runs]
     for number, (mine, rows) in enumerate(zip(run, row, strict=True)):
         one = log.runs[mine]
         target = one.signals["target"][rows] if "target" in one.signals else one.signals["tau"][rows]
-        told.setdefault((one.condition, str(one.controller), rows[0], target.round(6).tobytes()), []).append(number)
+        told.setdefault((*conditions[mine], rows[0], target.round(6).tobytes()), []).append(number)
     groups = np.full(len(run), -1)
     for group, numbers in enumerate(numbers for numbers in told.values() if len(numbers) > 1):
         groups[numbers] = group
