@@ -212,7 +212,10 @@ def passes(evidence: Evidence, thresholds: Thresholds) -> dict[str, bool]:
 
 
 def ablate(at: Floor, candidate: Candidate, hypothesis: Hypothesis, fitted: Mapping[str, Candidate]) -> Candidate:
-    """Takes an effect with its forms out of a candidate and fits the rest again, unless that model was fitted already.
+    """Takes an effect with its forms out of a candidate and fits the rest again.
+
+    Where that model was fitted already, the one that costs less counts: a fit that was not finished would be evidence
+    for the effect.
 
     Args:
       at: the floor at the main horizon.
@@ -222,13 +225,14 @@ def ablate(at: Floor, candidate: Candidate, hypothesis: Hypothesis, fitted: Mapp
     """
     gone = [hypothesis, *candidate.forms_of(hypothesis)]
     others = tuple(other for other in candidate.hypotheses if all(other is not one for one in gone))
-    if key_of(others) in fitted:
-        return fitted[key_of(others)]
     start, evaluate = candidate.fit, at.residuals["train"]
     for one in gone:
         start = without(start, one, at.prior, at.slopes)
     start = replace(start, residual=evaluate(start.vector[None])[0])
     (fit,) = refine([start], evaluate, _ABLATION_ROUNDS)
+    known = fitted.get(key_of(others))
+    if known and known.fit.cost <= fit.cost:
+        return known
     return Candidate(others, fit, at.residuals["select"](fit.vector[None])[0])
 
 

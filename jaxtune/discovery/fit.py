@@ -208,7 +208,8 @@ def begin(
 
 
 def without(fit: Fit, hypothesis: Hypothesis, prior: Free, slopes: np.ndarray) -> Fit:
-    """Takes an effect out of a model; the nominal parameters that it had taken over are free again, at zero.
+    """Takes an effect out of a model; nominal parameters that it had taken over are free again, and stand where it had
+    them or at their bounds.
 
     Residuals are still those of the model with it.
 
@@ -221,10 +222,12 @@ def without(fit: Fit, hypothesis: Hypothesis, prior: Free, slopes: np.ndarray) -
     own = fit.along(hypothesis)
     kept = fit.free.only(~own)
     mine = taken_over(prior, hypothesis)
+    back, moved = prior.only(mine), fit.coordinates[own] @ fit.free.directions[own]
+    at = np.clip(back.directions @ moved / (back.directions**2).sum(axis=1), *back.bounds.T)
     return replace(
         fit,
-        free=prior.only(mine).and_then(kept),
-        coordinates=np.concatenate([np.zeros(mine.sum()), fit.coordinates[~own]]),
+        free=back.and_then(kept),
+        coordinates=np.concatenate([at, fit.coordinates[~own]]),
         jacobian=np.concatenate([slopes[:, mine], fit.jacobian[:, ~own]], axis=1),
     )
 
