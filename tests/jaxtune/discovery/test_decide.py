@@ -7,7 +7,18 @@ import pytest
 from slider import HYPOTHESES, problem
 
 from jaxtune.discovery import noise_floor, state, step
-from jaxtune.discovery.decide import Evidence, Thresholds, believed, passes, posterior, rivals, weigh_evidence
+from jaxtune.discovery.decide import (
+    Candidate,
+    Evidence,
+    Thresholds,
+    ablate,
+    believed,
+    passes,
+    posterior,
+    rivals,
+    weigh_evidence,
+)
+from jaxtune.discovery.fit import begin, polish, without
 from jaxtune.discovery.resample import correlation_length, times_drawn, units
 from jaxtune.discovery.result import Settings
 
@@ -42,6 +53,37 @@ def test_every_test_can_fail_alone(test, change):
     assert all(passes(GOOD, thresholds).values())
     failed = [name for name, passed in passes(replace(GOOD, **change), thresholds).items() if not passed]
     assert failed == [test]
+
+
+def test_a_fit_that_was_not_finished_is_no_evidence(stepped):
+    asked, floor, found = stepped
+    at, (mass, coulomb) = floor[asked.main_horizon], (HYPOTHESES[0], HYPOTHESES[2])
+    evaluate = at.residuals["train"]
+    candidates = []
+    for group, point in (((coulomb, mass), [0.5, 0.02]), ((coulomb,), [0.3])):
+        fits = begin(found.nominal, [group], [np.array(point)], [found.nominal.coordinates], evaluate)
+        (fit,) = polish(fits, evaluate, 6 * (len(group) - 1))
+        candidates.append(Candidate(group, fit, at.residuals["select"](fit.vector[None])[0]))
+    both, unfinished = candidates
+    fitted = {unfinished.key: unfinished}
+    assert unfinished.fit.cost > both.fit.cost + 20.0
+    evidence, ablated = weigh_evidence(asked, floor, both, mass, fitted)
+    # The nominal mass says the same, and costs nearly as much as that of the hypothesis.
+    assert abs(evidence.gain) < 2.0
+    assert ablated.fit.vector[0] == pytest.approx(both.fit.vector[0], abs=0.02)
+    assert ablate(at, both, mass, {unfinished.key: ablated}) is ablated
+
+
+@pytest.mark.parametrize(("mass", "kept"), [(-0.2, -2.0), (0.7, 3.0)])
+def test_a_nominal_parameter_stands_where_the_hypothesis_about_it_left_it(stepped, mass, kept):
+    asked, floor, found = stepped
+    at = floor[asked.main_horizon]
+    start = [np.zeros(len(at.prior.sd))]
+    (fit,) = begin(found.nominal, [(HYPOTHESES[0],)], [np.array([mass])], start, at.residuals["train"])
+    # A deviation is a tenth, and three of them are the most.
+    back = without(fit, HYPOTHESES[0], at.prior, at.slopes)
+    np.testing.assert_allclose(back.coordinates, [kept, 0.0])
+    np.testing.assert_allclose(back.vector[0], 0.1 * kept)
 
 
 def test_models_that_are_equal_are_believed_alike(stepped):
