@@ -131,8 +131,8 @@ def promising(at: Floor, base: Fit, groups: Sequence[Group], library: Library, c
     """
     some = on_segments(at, base, library.segments)
     profile = profile_of(some, library.curves.changes, _shares(at, base, library.segments))
-    leads = sorted((_best(profile, group, library.curves) for group in groups), key=lambda lead: lead.cost)
-    return list({lead.hypotheses[0].key: lead.hypotheses[0] for lead in leads}.values())[:count]
+    leads = _once([_best(profile, group, library.curves) for group in groups])
+    return [lead.hypotheses[0] for lead in leads[:count]]
 
 
 def seen(at: Floor, nominal: Fit, groups: Sequence[Group], library: Library) -> tuple[frozenset[str], np.ndarray]:
@@ -195,8 +195,7 @@ def screen(
     some = on_segments(at, base, chosen)
     say("answers of the nominal parameters")
     profile = profile_of(some, curves.changes, _shares(at, fitted or base, chosen))
-    leads = sorted((_best(profile, group, curves) for group in groups), key=lambda lead: lead.cost)
-    firsts = _once(leads)
+    firsts = _once([_best(profile, group, curves) for group in groups])
     # Partners come in the form in which they alone are best.
     partners = [lead.hypotheses for lead in firsts]
     couples = [pair for lead in firsts[:pairs] for pair in _pairs_with(profile, lead, partners, curves)]
