@@ -74,6 +74,8 @@ class Args(hosts.HostArgs):
     update: str = "posterior"
     """How ours moves the distribution: posterior (move to the estimate, narrow to its interval) or vote (the paper's
     steps)."""
+    states: bool = False
+    """Whether ours estimates last from measured states, which only a simulated target gives: more exact by far."""
     step_size: float = 0.5
     """Step of the paper's update, in radii per unit of vote; for spm, and for ours with --update vote."""
     widen_factor: float = 2.0
@@ -220,7 +222,7 @@ def main(args: Args) -> None:
     for option in ("out", "methods", "seeds", *hosts.OPTIONS):
         del identity[option]
     hidden = parameters.select(robot.entries, [name for name in case.hidden if name not in entries])
-    learner = Learner(sizes, entries, hidden, kind=robot)
+    learner = Learner(sizes, entries, hidden, kind=robot, states=args.states)
     memory.check(learner)
     checkpoint.open_run(args.out, identity)
     target = robot.engines[case.target](learner.robot, case.true_params(entries, args.start))

@@ -42,7 +42,7 @@ def open_gate(
 def voting(tuner: Tuner) -> Tuner:
     """Gives a tuner the paper's update, whose steps are meant for one measured set each."""
     config = dataclasses.replace(tuner.config, refinements=0)
-    return dataclasses.replace(tuner, config=config, update=vote_update)
+    return dataclasses.replace(tuner, config=config, update=vote_update, replay=None)
 
 
 def spm(tuner: Tuner) -> Tuner:

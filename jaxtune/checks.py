@@ -1,5 +1,7 @@
 """Checks of the episodes that a user's functions return: by shape, so they run before anything is compiled."""
 
+from collections.abc import Mapping
+
 import jax
 import numpy as np
 
@@ -70,6 +72,37 @@ def _check_motion(simulated: Trajectory) -> None:
         raise ValueError(
             f"simulate, obs: got {seen.shape[-1]} numbers that are the same in every step of every episode, expected "
             "some that show how the robot moves"
+        )
+
+
+def check_states(measured: Trajectory, simulated: Trajectory, config: TunerConfig) -> None:
+    """Checks that a set can be simulated again from its states (`jaxtune.replay`).
+
+    Args:
+      measured: the measured set, [episodes, time], or its shapes.
+      simulated: what `simulate` returns, or its shapes.
+      config: sizes of the tuning.
+
+    Raises:
+      ValueError: one of them has no states, a measured state has a name or a shape that simulated ones have not, or
+        episodes are no longer than a piece.
+    """
+    for source, episodes in (("measured", measured), ("simulate", simulated)):
+        if not isinstance(episodes.state, Mapping):
+            raise ValueError(f"{source}, state: got none, expected arrays by name, since the tuner has a replay")
+    unknown = sorted(set(measured.state) - set(simulated.state))
+    if unknown:
+        raise ValueError(f"measured, state: got '{unknown[0]}', expected some of {', '.join(simulated.state)}")
+    for name, values in measured.state.items():
+        for got, expected in zip(jax.tree.leaves(values), jax.tree.leaves(simulated.state[name]), strict=True):
+            shape = (*np.shape(measured.alive), *np.shape(expected)[np.ndim(simulated.alive) :])
+            if np.shape(got) != shape:
+                raise ValueError(f"measured, state, {name}: got shape {np.shape(got)}, expected {shape}")
+    steps = np.shape(measured.alive)[1]
+    if steps <= config.replay.window:
+        raise ValueError(
+            f"measured: got episodes of {steps} steps, expected more than {config.replay.window}, the length of a "
+            "piece (ReplayConfig.window)"
         )
 
 

@@ -131,6 +131,11 @@ def explain(info) -> str:
         fit = float(info.update.p_value)
         if fit <= _MISFIT:
             lines.append(f"  fits badly in the distribution that was read last (p {fit:.2f})")
+        replay = float(info.update.p_replay)
+        if info.update.replayed:
+            lines.append(f"  estimated from measured states, which fit (p {replay:.2f})")
+        elif not np.isnan(replay):
+            lines.append(f"  measured states give no better estimate (their fit: p {replay:.2f})")
         moved = dists.move(info.dist, info.update.step).centre
         interval = np.asarray(dists.ravel(info.dist.radius) * info.update.interval)
         vague = weak(info)

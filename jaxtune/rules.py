@@ -32,6 +32,7 @@ from jaxtune import devices, dvm, regression, spm, surface, windows
 from jaxtune import dist as dists
 from jaxtune.dvm import DVMConfig
 from jaxtune.regression import RegressionConfig
+from jaxtune.replay import ReplayConfig
 from jaxtune.spm import SPMConfig
 from jaxtune.types import ParamDist, Trajectory
 
@@ -77,6 +78,8 @@ class TunerConfig:
     """Sizes of the search-parameter model, which the vote update trains."""
     dvm: DVMConfig = field(default_factory=DVMConfig)
     """Sizes of the verification model."""
+    replay: ReplayConfig = field(default_factory=ReplayConfig)
+    """Sizes of the estimate from measured states, of a tuner that has a `replay`."""
 
     @property
     def longest_window(self) -> int:
@@ -178,6 +181,8 @@ class UpdateInfo:
     p_value: jax.Array = math.nan  # scalar: as the gate's, of misfit and beyond alone
     p_misfit: jax.Array = math.nan  # scalar: of misfit alone
     errors: jax.Array = math.nan  # [coords, coords] mean product of the errors of held-out estimates, in radii
+    p_replay: jax.Array = math.nan  # scalar: of what the simulator misses from measured states at the estimate
+    replayed: jax.Array = False  # scalar: whether the estimate is that from measured states (`jaxtune.replay`)
 
 
 Verify = Callable[[jax.Array, TunerConfig, Collected, Trajectory, Knobs], GateInfo]
@@ -473,4 +478,6 @@ def no_update(dist: ParamDist) -> UpdateInfo:
         p_value=nan,
         p_misfit=nan,
         errors=jnp.full((len(zeros), len(zeros)), jnp.nan),
+        p_replay=nan,
+        replayed=jnp.asarray(False),
     )

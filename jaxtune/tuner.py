@@ -35,6 +35,9 @@ Departures from the paper, besides those of gate and update (`jaxtune.rules`):
   not fit there (`UpdateInfo.p_value` <= 1 - level), the radius before is taken back. If it does not whatever the
   coordinates when it is read again for the first time (`p_misfit` <= 0.01), the verdict becomes `unexplained`: in a
   wide distribution, parameters can absorb what is missing.
+- Where the robot's states are measured (`Tuner.replay`), the accepted set is read a last time, by simulating short
+  pieces of it from measured states (`jaxtune.replay`). That estimate is taken if it errs less on simulated sets than
+  the one before, and if the measured set fits it (`UpdateInfo.p_replay` > 1 - level).
 - A tuning ends with training the policy, where the paper's begins with it. The last tuning therefore leaves a policy
   that was trained in the last distribution.
 - The radius grows only after a failed check (in print it grows before each), is capped by the bounds, and the loop ends
@@ -78,8 +81,10 @@ import jax.numpy as jnp
 import optax
 
 from jaxtune import dist as dists
-from jaxtune.checks import check_measured, check_simulated
+from jaxtune import replay as replays
+from jaxtune.checks import check_measured, check_simulated, check_states
 from jaxtune.explain import explain
+from jaxtune.replay import Replay
 from jaxtune.rules import (
     Collected,
     GateInfo,
@@ -203,6 +208,8 @@ class Tuner:
         `tune` then.
       verify: scores a measured set against simulated ones (`rules.Verify`).
       update: moves the distribution after an accepted set (`rules.Update`).
+      replay: simulates pieces of episodes from measured states (`jaxtune.replay`), for a last, more exact estimate.
+        Simulated and measured episodes must hold states then (`Trajectory.state`).
     """
 
     config: TunerConfig
@@ -211,6 +218,7 @@ class Tuner:
     measure: Measure | None = None
     verify: Verify = calibrated_gate
     update: Update = posterior_update
+    replay: Replay | None = None
 
     def init(self, policy: Policy, dist: ParamDist, knobs: Knobs) -> TunerState:
         """Makes the state before the first tuning.
@@ -265,6 +273,8 @@ class Tuner:
         # Only shapes: nothing is simulated here.
         shapes = jax.eval_shape(self.collect, key, state.policy, state.dist)
         check_measured(measured, shapes.trajectory, self.config)
+        if self.replay is not None:
+            check_states(measured, shapes.held_out, self.config)
 
         def body(carry):
             # Every round simulates new robots and trains its models anew, because the distribution has changed.
@@ -290,6 +300,12 @@ class Tuner:
             )
 
         carry = jax.lax.while_loop(lambda carry: carry["left"] > 0, body, self.before(state.dist))
+        if self.replay is not None:
+            carry = jax.lax.cond(
+                carry["verdict"] == Verdict.ACCEPT,
+                lambda: self.sharpen(jax.random.fold_in(key, carry["rounds"]), carry, state, measured),
+                lambda: carry,
+            )
         return state.replace(dist=carry["dist"]), make_info(carry, measured)
 
     def before(self, dist: ParamDist) -> dict:
@@ -379,6 +395,49 @@ class Tuner:
             "verdict": verdict,
             "verdicts": carry["verdicts"].at[carry["calls"] - 1].set(verdict),
         }
+
+    def sharpen(self, key: jax.Array, carry: dict, state: TunerState, measured: Trajectory) -> dict:
+        """Estimates once more, from the states of an accepted set (`replay.estimate`).
+
+        Args:
+          key: random key.
+          carry: from `refine`.
+          state: whose policy produced the measured set, and whose level the estimate must fit at.
+          measured: the measured set, with states.
+
+        Returns:
+          What is carried on. The centre is the new estimate if, on simulated sets, its errors (rms, in radii) are
+          smaller than those of the estimate before, and if the measured set fits it. Radii only narrow.
+        """
+        dist, tested, before = carry["dist"], carry["tested"], carry["update"]
+        size = self.config.replay.sets
+        key_coords, key_simulate = jax.random.split(key)
+        truth = dists.sample(key_coords, dist, size)
+        each = {name: jnp.repeat(values, self.config.set_episodes) for name, values in truth.items()}
+        simulated = jax.tree.map(
+            lambda leaf: leaf.reshape(size, -1, *leaf.shape[1:]), self.simulate(key_simulate, state.policy, each)
+        )
+        found = replays.estimate(
+            self.config.replay, self.replay, simulated, truth, measured, dist, self.config.coverage
+        )
+        radius, unit = dists.ravel(dist.radius), dists.ravel(tested.radius)
+        errors = found.errors * jnp.outer(radius / unit, radius / unit)
+        # An update that gives no errors gives no reason to keep its estimate.
+        closer = ~(jnp.trace(errors) >= jnp.trace(before.errors))
+        fits = found.p_value > 1.0 - state.knobs.level
+        taken = closer & fits & jnp.isfinite(found.estimate).all()
+        moved = dists.move(dist, found.estimate)
+        narrowed = jnp.clip(radius * found.interval, jnp.minimum(self.config.min_radius, radius), radius)
+        moved = moved.replace(radius=dists.unravel(dists.names(dist), narrowed))
+        update = before.replace(
+            step=(dists.ravel(moved.centre) - dists.ravel(tested.centre)) / unit,
+            interval=found.interval * radius / unit,
+            identifiable=before.identifiable | (found.interval < 1.0),
+            errors=errors,
+            replayed=jnp.asarray(True),
+        )
+        update = optax.tree.where(taken, update, before).replace(p_replay=found.p_value)
+        return carry | {"dist": optax.tree.where(taken, moved, dist), "update": update}
 
     def collect(self, key: jax.Array, policy: Policy, dist: ParamDist) -> Collected:
         """Simulates D_q and the held-out sets under one policy, with coordinates drawn from one distribution.

@@ -45,6 +45,9 @@ class Trajectory:
     score: jax.Array  # [episodes, time], reward of each step, zero where not alive
     fell: jax.Array  # [episodes], True where the episode ended early
     not_finite: jax.Array  # [episodes], True where it ended because the simulation broke
+    # [episodes, time, ...] on every leaf: the robot's whole state at the beginning of each step, from which a simulator
+    # can go on (`jaxtune.replay`); None where it is not known. Gate and update never read it.
+    state: Any = None
 
     @classmethod
     def from_episodes(cls, episodes: Sequence[Mapping[str, Any]], *, steps: int | None = None) -> "Trajectory":

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtune import dist as dists
 from jaxtune import dvm, spm
 from jaxtune.dvm import DVMConfig
+from jaxtune.replay import Replay
 from jaxtune.spm import SPMConfig
 from jaxtune.tuner import Collected, TunerConfig
 from jaxtune.types import ParamDist, Trajectory
@@ -83,24 +84,35 @@ class Slider:
         key_start, key_noise = jax.random.split(key)
         time = self.dt * jnp.arange(self.steps)
         force = policy["amplitude"] * jnp.sin(jnp.outer(time, jnp.array(self.tones))).sum(axis=-1)
-        mass, friction, wind = jnp.exp(coords["mass"]), jnp.exp(coords["friction"]), coords.get("wind", 0.0)
-
-        def step(state, force):
-            position, velocity = state
-            push = force + wind - friction * velocity - self.stiffness * position
-            velocity = velocity + self.dt * push / mass
-            return (position + self.dt * velocity, velocity), jnp.stack(state)
-
         start = 0.05 * jax.random.normal(key_start, (2,))
-        _, clean = jax.lax.scan(step, (start[0], start[1]), force)
+        _, clean = jax.lax.scan(lambda state, force: (self.move(state, force, coords), state), start, force)
+        read = clean + self.noise * jax.random.normal(key_noise, clean.shape)
         return Trajectory(
-            obs=clean + self.noise * jax.random.normal(key_noise, clean.shape),
+            obs=read,
             action=force[:, None],
             alive=jnp.ones(self.steps, bool),
             score=1.0 - clean[:, 0] ** 2,
             fell=jnp.asarray(False),
             not_finite=jnp.asarray(False),
+            state={"slider": read},
         )
+
+    def move(self, state, force, coords):
+        """One step from a state, position and velocity, under a force."""
+        mass, friction, wind = jnp.exp(coords["mass"]), jnp.exp(coords["friction"]), coords.get("wind", 0.0)
+        position, velocity = state
+        push = force + wind - friction * velocity - self.stiffness * position
+        velocity = velocity + self.dt * push / mass
+        return jnp.stack([position + self.dt * velocity, velocity])
+
+    def replay(self) -> Replay:
+        """Pieces of an episode from measured positions and velocities."""
+
+        def play(state, actions, coords):
+            move = lambda now, force: (self.move(now, force[0], coords), None)  # noqa: E731
+            return jax.lax.scan(move, state["slider"], actions)[0]
+
+        return Replay(play=play, read=lambda state: state["slider"])
 
 
 def policy() -> dict:

@@ -9,6 +9,7 @@ The sum of Table I can be negative, and then an early fall earns more than a wal
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -29,6 +30,7 @@ _MIN_HEIGHT_M = 0.35
 _MAX_TILT_COS = np.cos(np.pi / 4)
 
 _BASES = ("stand", "raibert")
+_KEPT = ("qpos", "qvel", "qacc_warmstart", "command", "phase", "action", "joint_error", "memory")
 _EXPLODED = 1e4  # m, rad or either per second
 # Time step in s, steps in a policy step, solver iterations, line-search iterations. At 1 ms, three iterations agree
 # with more of them to five decimals after 0.3 s; one is off by up to 0.023 rad.
@@ -159,6 +161,14 @@ class Biteno:
         drive = self.drive(params, state, action)
         motion = self.simulate(params, state, drive)
         return self.settle(state, drive, motion), motion
+
+    def kept(self, state: State) -> dict[str, Any]:
+        """Takes what the next steps depend on out of a state, by name; see `jaxtune.mjx.Robot`."""
+        return {name: getattr(state, name) for name in _KEPT}
+
+    def resumed(self, params: parameters.Params, kept: Mapping[str, Any]) -> State:
+        """Makes a state of what was kept of one. Rewards and the observation are those of a fresh start."""
+        return self.reset(params, jax.random.PRNGKey(0)).replace(**kept)
 
     def drive(self, params: parameters.Params, state: State, action: jax.Array) -> Drive:
         """Turns an action [6] into joint targets for every sub-step.

@@ -59,19 +59,19 @@ class HostTarget:
         if isinstance(robot, CorrectedBiteno):
             raise ValueError("target: got a corrected robot, expected the nominal one: other engines lack its effects")
         self.params = params
-        self._engine = engine
+        self._engine, self._kept = engine, robot.kept
         self._reset = jax.jit(jax.vmap(lambda key: robot.reset({}, key)))
         self._with_command = jax.jit(jax.vmap(robot.with_command))
         self._drive = jax.jit(jax.vmap(lambda state, action: robot.drive(params, state, action)))
         self._choose = jax.jit(lambda act, obs, keys: jax.vmap(act)(obs, keys))
         self._settle = jax.jit(jax.vmap(robot.settle))
 
-    def episodes(self, key: jax.Array, act: Act, count: int, steps: int) -> Trajectory:
+    def episodes(self, key: jax.Array, act: Act, count: int, steps: int, states: bool = False) -> Trajectory:
         """Measures episodes under a policy, on the host; `envs.targets.protocol.Target` describes arguments and result.
 
         It cannot be jitted, so the tuner is given its episodes through `Tuner.tune`.
         """
-        return self.record(key, act, count, steps)[0]
+        return self._play(key, act, count, steps, None, states)[0]
 
     def record(
         self, key: jax.Array, act: Act, count: int, steps: int, commands: Commands | None = None
@@ -80,6 +80,9 @@ class HostTarget:
 
         Robots that fell or broke are simulated on to the last step, masked.
         """
+        return self._play(key, act, count, steps, commands, False)
+
+    def _play(self, key, act, count, steps, commands, states) -> tuple[Trajectory, Recording]:
         # As a pytree a policy is an argument of one compiled program, not a constant of a new one.
         act = act if isinstance(act, jax.tree_util.Partial) else jax.tree_util.Partial(act)
         # The same keys as in `envs.targets.mjx.rollout`, so that episodes in all engines start alike.
@@ -102,14 +105,15 @@ class HostTarget:
             broke = alive & (np.asarray(following.not_finite) > 0)
             valid = alive & ~broke
             score = np.where(valid, following.score, 0.0)
-            record = (state.obs, action, valid, score), watch(state, following, motion)
+            kept = self._kept(state) if states else None
+            record = (state.obs, action, valid, score, kept), watch(state, following, motion)
             records.append(jax.tree.map(np.asarray, record))
             alive &= np.asarray(following.done) == 0
             not_finite |= broke
             # Also after a fall: masked steps cost little, and the batch keeps its shape.
             state = following
         stacked = jax.tree.map(lambda *leaves: np.stack(leaves, axis=1), *records)
-        (obs, action, valid, score), recording = jax.tree.map(jnp.asarray, stacked)
+        (obs, action, valid, score, kept), recording = jax.tree.map(jnp.asarray, stacked)
         fell, not_finite = jnp.asarray(~alive), jnp.asarray(not_finite)
-        trajectory = Trajectory(obs=obs, action=action, alive=valid, score=score, fell=fell, not_finite=not_finite)
-        return trajectory, recording
+        ended = {"fell": fell, "not_finite": not_finite}
+        return Trajectory(obs=obs, action=action, alive=valid, score=score, state=kept, **ended), recording

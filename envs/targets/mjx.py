@@ -25,6 +25,7 @@ def rollout(
     steps: int,
     commands: Commands | None = None,
     watch: Callable[..., Any] = lambda before, after, motion: (),
+    states: bool = False,
 ) -> tuple[Trajectory, Any]:
     """Simulates one episode for every draw of the parameters (`jaxtune.mjx.rollout`).
 
@@ -36,18 +37,19 @@ def rollout(
       steps: length of an episode in policy steps.
       commands: commands and starts of the gait clock, in place of those that the task would draw.
       watch: what is recorded of a step, `(state before, state after, motion) -> pytree`.
+      states: True to keep the robot's states (`Trajectory.state`).
 
     Returns:
       The episodes, and what was recorded of them, [episodes, time, ...].
     """
     if commands is None:
-        return mjx.rollout(robot, key, act, params, steps, watch=watch)
+        return mjx.rollout(robot, key, act, params, steps, watch=watch, states=states)
 
     def prepare(state, commands, step):
         phase = state.phase if commands.phase is None else jnp.where(step == 0, commands.phase, state.phase)
         return robot.with_command(state, commands.command[step], phase)
 
-    return mjx.rollout(robot, key, act, params, steps, given=commands, prepare=prepare, watch=watch)
+    return mjx.rollout(robot, key, act, params, steps, given=commands, prepare=prepare, watch=watch, states=states)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,12 +60,12 @@ class MjxTarget:
     params: Mapping[str, float]
     """True physical values by name; only tests and reports may read them."""
 
-    def episodes(self, key: jax.Array, act: Act, count: int, steps: int) -> Trajectory:
+    def episodes(self, key: jax.Array, act: Act, count: int, steps: int, states: bool = False) -> Trajectory:
         """Measures episodes under a policy; `envs.targets.protocol.Target` describes arguments and result.
 
         It can be traced, so it may serve as the `measure` of a tuner.
         """
-        return rollout(self.robot, key, act, self._params(count), steps)[0]
+        return rollout(self.robot, key, act, self._params(count), steps, states=states)[0]
 
     def record(
         self, key: jax.Array, act: Act, count: int, steps: int, commands: Commands | None = None
@@ -79,7 +81,13 @@ class MjxTarget:
 
 
 def simulate(
-    robot: Biteno, key: jax.Array, act: Act, coords: Coords, steps: int, commands: Commands | None = None
+    robot: Biteno,
+    key: jax.Array,
+    act: Act,
+    coords: Coords,
+    steps: int,
+    commands: Commands | None = None,
+    states: bool = False,
 ) -> Trajectory:
     """Simulates one episode for every draw of the tuner's distribution: the `simulate` that a tuner is given.
 
@@ -90,5 +98,7 @@ def simulate(
       coords: draws in search coordinates by name, each [episodes].
       steps: length of an episode in policy steps.
       commands: in place of those that the task would draw.
+      states: True to keep the robots' states.
     """
-    return rollout(robot, key, act, parameters.from_coords(robot.entries, coords), steps, commands)[0]
+    params = parameters.from_coords(robot.entries, coords)
+    return rollout(robot, key, act, params, steps, commands, states=states)[0]

@@ -63,7 +63,7 @@ class Target(Protocol):
     params: Mapping[str, float]
     """True physical values by name, where they are known."""
 
-    def episodes(self, key: jax.Array, act: Act, count: int, steps: int) -> Trajectory:
+    def episodes(self, key: jax.Array, act: Act, count: int, steps: int, states: bool = False) -> Trajectory:
         """Measures episodes under a policy.
 
         Args:
@@ -71,6 +71,7 @@ class Target(Protocol):
           act: the policy.
           count: number of episodes.
           steps: length of an episode in policy steps of 10 ms.
+          states: True to measure the robot's states too (`Trajectory.state`).
 
         Returns:
           The episodes; steps after a fall are masked.

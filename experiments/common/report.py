@@ -42,8 +42,9 @@ def tuning(info: Info) -> dict:
     Returns:
       `verdicts`, `radius` and the gate's numbers as lists over its calls; the update's `step` and `interval` by
       parameter, in radii, and whether the parameter was `identifiable`; those that are `weak`, and the
-      combinations that are known `together`; the p-values of the update's fit; the number of falls and of episodes with
-      values that are not finite; and means of the training metrics.
+      combinations that are known `together`; the p-values of the update's fit; whether the estimate was `replayed` from
+      measured states; the number of falls and of episodes with values that are not finite; and means of the training
+      metrics.
     """
     calls = int(info.calls)
     order = dists.names(info.dist)
@@ -63,6 +64,8 @@ def tuning(info: Info) -> dict:
         "update_loss": float(info.update.loss),
         "fit_p_value": float(info.update.p_value),
         "misfit_p_value": float(info.update.p_misfit),
+        "replay_p_value": float(info.update.p_replay),
+        "replayed": bool(info.update.replayed),
         "measured_falls": int(info.measured_falls),
         "not_finite": int(info.not_finite),
         "training": {name: float(np.mean(value)) for name, value in info.train.items()},

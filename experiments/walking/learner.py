@@ -20,7 +20,7 @@ from envs.targets.mjx import MjxTarget, rollout, simulate
 from envs.targets.protocol import Act, Commands, Target
 from experiments.common.config import Preset
 from experiments.walking.robots import BITENO, Kind
-from jaxtune import devices
+from jaxtune import devices, mjx
 from jaxtune import dist as dists
 from jaxtune.baselines import Untuned
 from jaxtune.mjx import Entry, TrainingBatch, parameters
@@ -56,6 +56,7 @@ class Learner:
       hidden: parameters that are not tuned, but may differ from nominal in training. `oracle` uses them.
       correction: a corrected model that discovery wrote; None means the nominal model.
       kind: the robot.
+      states: True to measure and simulate the robot's states too, from which its tuner estimates last (`replay`).
 
     Raises:
       ValueError: the robot's episodes are shorter than a window of the tuner, or it cannot be made of the correction.
@@ -68,6 +69,7 @@ class Learner:
         hidden: Mapping[str, Entry] = MappingProxyType({}),
         correction: Correction | None = None,
         kind: Kind = BITENO,
+        states: bool = False,
     ):
         window = preset.tuner.longest_window
         if kind.episode_steps < window:
@@ -79,6 +81,7 @@ class Learner:
         self.correction = correction
         self.entries = entries
         self._hidden = hidden
+        self._states = states
         self.robot = kind.make(preset, {**entries, **hidden}, correction)
         self.longest = round(preset.task.episode_s / kind.control_s)
         """Control steps of an episode of the full time limit."""
@@ -170,7 +173,7 @@ class Learner:
         count, steps = len(next(iter(coords.values()))), self.preset.episode_steps
         commands = jax.tree.map(lambda leaf: leaf[jnp.arange(count) % len(leaf)], policy.asked)
         length = steps if commands is None else commands.command.shape[1]
-        whole = simulate(self.robot, key, self.act(policy), coords, length, commands)
+        whole = simulate(self.robot, key, self.act(policy), coords, length, commands, self._states)
         return jax.tree.map(lambda leaf: leaf[:, -steps:] if leaf.ndim > 1 else leaf, whole)
 
     def play(self, target: Target) -> Callable[..., Trajectory]:
@@ -184,7 +187,7 @@ class Learner:
         """
 
         def play(key, policy, count, steps):
-            return target.episodes(key, self.act(policy), count, steps)
+            return target.episodes(key, self.act(policy), count, steps, self._states)
 
         return devices.on_all(jax.jit(play, static_argnums=(2, 3))) if isinstance(target, MjxTarget) else play
 
@@ -241,7 +244,8 @@ class Learner:
             config=self.preset.tuner,
             train_policy=lambda key, policy, dist: self.train(key, policy, dist, self.preset.epochs),
             simulate=self.simulate,
-            measure=target and (lambda key, policy: target.episodes(key, self.act(policy), count, steps)),
+            measure=target and (lambda key, policy: target.episodes(key, self.act(policy), count, steps, self._states)),
+            replay=mjx.replay(self.robot, self.entries) if self._states else None,
         )
 
     def channels(self) -> list[str]:

@@ -17,7 +17,7 @@ This package is the only one in jaxtune that imports MuJoCo; the tuner does with
 
 from jaxtune.mjx.derived_fields import set_const
 from jaxtune.mjx.entry import Entry
-from jaxtune.mjx.episodes import Robot, rollout
+from jaxtune.mjx.episodes import Robot, replay, rollout
 from jaxtune.mjx.parameters import (
     Params,
     apply,
@@ -51,6 +51,7 @@ __all__ = [
     "model_of",
     "nominal",
     "parameters_of",
+    "replay",
     "rollout",
     "select",
     "set_const",

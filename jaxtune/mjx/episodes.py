@@ -1,6 +1,6 @@
 """Simulated episodes of any robot whose physical parameters are an argument, batched and compiled."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
 import jax
@@ -8,7 +8,10 @@ import jax.numpy as jnp
 from jax.tree_util import Partial
 
 from jaxtune import devices
+from jaxtune.mjx import parameters
+from jaxtune.mjx.entry import Entry
 from jaxtune.mjx.parameters import Params
+from jaxtune.replay import Replay
 from jaxtune.types import Trajectory
 
 _CHUNK = {"cpu": 256, "other": 8192}  # robots side by side on a device: small batches stay in a CPU's cache
@@ -42,6 +45,12 @@ class Robot(Protocol):
     def move(self, params: Params, state: State, action: jax.Array) -> tuple[State, Any]:
         """Moves the robot by one control step; returns its state, and anything that a `watch` may want to see."""
 
+    def kept(self, state: State) -> Mapping[str, Any]:
+        """Takes what the next steps depend on out of a state: `qpos`, `qvel` and whatever else, by name."""
+
+    def resumed(self, params: Params, kept: Mapping[str, Any]) -> State:
+        """Makes a state of what was kept of one, or measured."""
+
 
 def rollout(
     robot: Robot,
@@ -53,6 +62,7 @@ def rollout(
     given: Any = None,
     prepare: Callable[[State, Any, jax.Array], State] = lambda state, given, step: state,
     watch: Callable[[State, State, Any], Any] = lambda before, after, motion: (),
+    states: bool = False,
 ) -> tuple[Trajectory, Any]:
     """Simulates one episode for every draw of the parameters.
 
@@ -69,6 +79,7 @@ def rollout(
       given: pytree, [episodes, ...], of what else differs between episodes, such as commands.
       prepare: changes a state before a step, `(state, given, number of the step) -> state`.
       watch: what else is recorded of a step, `(state before, state after, motion) -> pytree`.
+      states: True to keep the robot's states (`Trajectory.state`), for a `replay`.
 
     Returns:
       The episodes, and what was watched of them, [episodes, time, ...].
@@ -91,19 +102,41 @@ def rollout(
             broke = alive & (following.not_finite > 0)
             lives = alive & ~broke
             record = robot.observed(state.obs), action, lives, jnp.where(lives, following.score, 0.0), broke
-            return (following, alive & (following.done == 0)), (record, watch(state, following, motion))
+            kept = robot.kept(state) if states else None
+            return (following, alive & (following.done == 0)), (record, kept, watch(state, following, motion))
 
         start = robot.reset(params, key_reset)
         during = jax.random.split(key_act, steps), jnp.arange(steps)
-        (_, alive), (record, watched) = jax.lax.scan(step, (start, jnp.asarray(True)), during)
+        (_, alive), (record, kept, watched) = jax.lax.scan(step, (start, jnp.asarray(True)), during)
         obs, action, lives, score, broke = record
-        episodes = Trajectory(obs=obs, action=action, alive=lives, score=score, fell=~alive, not_finite=broke.any())
-        return episodes, watched
+        ended = {"fell": ~alive, "not_finite": broke.any()}
+        return Trajectory(obs=obs, action=action, alive=lives, score=score, state=kept, **ended), watched
 
     keys = jax.random.split(key, len(next(iter(params.values()))))
     # A partial's arguments are what a policy depends on.
     act = act if isinstance(act, Partial) else Partial(act)
     return devices.in_chunks(episode, (keys, params, given), _CHUNK, shared=(act,))
+
+
+def replay(robot: Robot, table: Mapping[str, Entry]) -> Replay:
+    """Makes the `replay` of a tuner: pieces of an episode, simulated from measured states.
+
+    Their ends are compared by positions and velocities. A quaternion must have the sign that simulation gives it.
+
+    Args:
+      robot: robot and task.
+      table: of the parameters that are tuned.
+    """
+
+    def read(kept: Mapping[str, Any]) -> jax.Array:
+        return jnp.concatenate([kept["qpos"], kept["qvel"]])
+
+    def play(kept, actions, coords):
+        params = jax.lax.optimization_barrier(parameters.from_coords(table, coords))
+        move = lambda state, action: (robot.move(params, state, action)[0], None)  # noqa: E731
+        return read(robot.kept(jax.lax.scan(move, robot.resumed(params, kept), actions)[0]))
+
+    return Replay(play=play, read=read)
 
 
 def _checked(action: Any, size: int) -> jax.Array:

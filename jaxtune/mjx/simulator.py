@@ -13,6 +13,7 @@ beforehand how many contacts all robots have room for (Playground's `naconmax`).
 """
 
 import copy
+import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -31,12 +32,14 @@ from jaxtune import dist as dists
 from jaxtune.mjx import parameters
 from jaxtune.mjx.derived_fields import DERIVED
 from jaxtune.mjx.entry import Entry
-from jaxtune.mjx.episodes import rollout
+from jaxtune.mjx.episodes import replay, rollout
 from jaxtune.mjx.parameters import Params
+from jaxtune.replay import Replay
 from jaxtune.types import Coords, ParamDist, Trajectory
 
 Act = Callable[[Any, Any, jax.Array], jax.Array]
 """A policy: `(policy, observation of one environment, key) -> action [act]`. The policy is a pytree of arrays."""
+_DATA = ("data", "pipeline_state")
 WithModel = Callable[[Any, mjx.Model], Any]
 """`(env, model) -> env`: a copy of an environment that simulates this model."""
 
@@ -192,8 +195,12 @@ class Simulator:
         names = parameters.select(self.parameters, tuple(dist.centre))
         return {name: {end: float(values[name]) for end, values in found.items()} for name in names}
 
-    def simulate(self, act: Act) -> Callable[[jax.Array, Any, Coords], Trajectory]:
+    def simulate(self, act: Act, *, states: bool = False) -> Callable[[jax.Array, Any, Coords], Trajectory]:
         """Makes the `simulate` of a tuner: one episode for every draw of the coordinates, compiled.
+
+        Args:
+          act: the policy.
+          states: True to give the robots' states as well, for a tuner with a `replay`.
 
         Raises:
           ValueError: the policy is no function.
@@ -201,18 +208,25 @@ class Simulator:
         _check_act(act)
 
         def simulate(key: jax.Array, policy: Any, coords: Coords) -> Trajectory:
-            return self.rollout(key, act, policy, parameters.from_coords(self.parameters, coords))
+            return self.rollout(key, act, policy, parameters.from_coords(self.parameters, coords), states)
 
         # A tuner traces it several times, and the trace of an environment takes seconds.
         return jax.jit(simulate)
 
-    def measure(self, act: Act, params: Params, episodes: int) -> Callable[[jax.Array, Any], Trajectory]:
+    def replay(self) -> Replay:
+        """Makes the `replay` of a tuner, for robots whose states are measured (`jaxtune.mjx.replay`)."""
+        return replay(self, self.parameters)
+
+    def measure(
+        self, act: Act, params: Params, episodes: int, *, states: bool = False
+    ) -> Callable[[jax.Array, Any], Trajectory]:
         """Makes a `measure` that stands in for a robot: the same environment with parameters that are hidden.
 
         Args:
           act: the policy.
           params: true physical values by name; those that are left out are nominal.
           episodes: in a measured set, as in `TunerConfig.set_episodes`.
+          states: True to measure the robot's states as well.
 
         Raises:
           ValueError: the policy is no function, a name is not in the table, a value is out of bounds, or there are no
@@ -225,17 +239,18 @@ class Simulator:
         truth = parameters.nominal(self.parameters) | dict(params)
 
         def measure(key: jax.Array, policy: Any) -> Trajectory:
-            return self.rollout(key, act, policy, {name: jnp.full(episodes, value) for name, value in truth.items()})
+            params = {name: jnp.full(episodes, value) for name, value in truth.items()}
+            return self.rollout(key, act, policy, params, states)
 
         return jax.jit(measure)
 
-    def rollout(self, key: jax.Array, act: Act, policy: Any, params: Params) -> Trajectory:
+    def rollout(self, key: jax.Array, act: Act, policy: Any, params: Params, states: bool = False) -> Trajectory:
         """Simulates one episode for every draw of the parameters, [draws] physical values by name.
 
         Parameters that are left out stay nominal. An episode ends where the environment is done or a number is not
         finite; the latter is counted in `not_finite`.
         """
-        return rollout(self, key, Partial(act, policy), params, self.steps)[0]
+        return rollout(self, key, Partial(act, policy), params, self.steps, states=states)[0]
 
     def reset(self, params: Params, key: jax.Array) -> State:
         """Starts an episode of one robot with these parameters; those that are left out are nominal."""
@@ -273,6 +288,25 @@ class Simulator:
             key=jax.random.split(state.key, 1)[0],
         )
         return state, following
+
+    def kept(self, state: State) -> dict[str, Any]:
+        """Takes what the next steps depend on out of a state: positions, velocities and past actions.
+
+        What else an environment remembers, such as a command, is not among it.
+        """
+        data = _data_of(state.env)
+        found = {name: getattr(data, name) for name in ("qpos", "qvel", "act", "qacc_warmstart")}
+        return found | {"past": state.past, "steps": state.steps}
+
+    def resumed(self, params: Params, kept: Mapping[str, Any]) -> State:
+        """Makes a state of what was kept of one, or measured: `qpos` and `qvel` at least.
+
+        Without `past`, an action that the robot's delay had not let through yet is taken to be the next one.
+        """
+        start = self.reset(params, jax.random.PRNGKey(0))
+        own = {name: value for name, value in kept.items() if name not in ("past", "steps")}
+        known = {name: kept[name] for name in ("past", "steps") if name in kept}
+        return start.replace(env=_with_data(start.env, _data_of(start.env).replace(**own)), **known)
 
     @cached_property
     def action_size(self) -> int:
@@ -426,6 +460,18 @@ def model_of(env: Any) -> mjx.Model:
         f"env: got {type(env).__name__}, which has no MJX model in 'mjx_model' (MuJoCo Playground) or 'sys' (Brax with "
         "backend='mjx'); hand over model= and with_model="
     )
+
+
+def _data_of(state: Any) -> Any:
+    """Finds MuJoCo's data in the state of an environment of Playground (`data`) or of Brax (`pipeline_state`)."""
+    for name in _DATA:
+        if hasattr(state, name):
+            return getattr(state, name)
+    raise ValueError(f"env: got a state without {' or '.join(_DATA)}, which holds the robot's positions")
+
+
+def _with_data(state: Any, data: Any) -> Any:
+    return dataclasses.replace(state, **{next(name for name in _DATA if hasattr(state, name)): data})
 
 
 def _check_act(act: Any) -> None:

@@ -1,0 +1,169 @@
+import dataclasses
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import toys
+
+from jaxtune import dist as dists
+from jaxtune import replay, tuner
+from jaxtune.replay import ReplayConfig
+from jaxtune.tuner import Tuner
+
+EPISODES, SETS = 3, 19
+NAMES = ("friction", "mass")
+EXACT, NOISY = toys.Slider(noise=0.0), toys.Slider()
+SIZES = {EXACT: ReplayConfig(sets=SETS), NOISY: ReplayConfig(window=20, sets=SETS)}
+
+
+@pytest.fixture(scope="module")
+def dist():
+    return toys.uniform(dict.fromkeys(NAMES, 0.0), radius=0.2)
+
+
+@partial(jax.jit, static_argnums=0)
+def calibration(slider, dist):
+    """Simulated sets, and their coordinates."""
+    truth = dists.sample(jax.random.key(5), dist, SETS)
+    each = {name: jnp.repeat(values, EPISODES) for name, values in truth.items()}
+    sets = slider.simulate(jax.random.key(6), toys.policy(), each)
+    return jax.tree.map(lambda leaf: leaf.reshape(SETS, EPISODES, *leaf.shape[1:]), sets), truth
+
+
+@partial(jax.jit, static_argnums=0)
+def estimate(slider, dist, measured):
+    return replay.estimate(SIZES[slider], slider.replay(), *calibration(slider, dist), measured, dist, 0.9)
+
+
+def measured(slider, seed=3, **truth):
+    return slider.measure(truth, EPISODES)(jax.random.key(seed), toys.policy())
+
+
+@pytest.mark.parametrize("friction, mass", [(0.13, -0.18), (0.0, 0.0)])
+def test_exact_states_give_exact_coordinates(dist, friction, mass):
+    found = estimate(EXACT, dist, measured(EXACT, friction=friction, mass=mass))
+    np.testing.assert_allclose(0.2 * found.estimate, [friction, mass], atol=2e-4)
+    assert found.p_value > 0.05
+    assert (found.interval < 0.05).all()
+
+
+def test_a_truth_outside_the_distribution_is_found(dist):
+    found = estimate(EXACT, dist, measured(EXACT, friction=-0.5, mass=0.6))
+    np.testing.assert_allclose(0.2 * found.estimate, [-0.5, 0.6], atol=2e-3)
+
+
+def test_an_estimate_stays_within_its_bounds():
+    narrow = toys.uniform(dict.fromkeys(NAMES, 0.0), radius=0.2, bound=0.3)
+    found = estimate(EXACT, narrow, measured(EXACT, friction=0.0, mass=0.6))
+    assert (jnp.abs(0.2 * found.estimate) <= 0.3 + 1e-6).all()
+
+
+def test_intervals_of_noisy_states_hold_together_as_often_as_they_say(dist):
+    truths = dists.sample(jax.random.key(8), dist, 40)
+    held, errors = 0, []
+    for number in range(40):
+        truth = {name: float(values[number]) for name, values in truths.items()}
+        found = estimate(NOISY, dist, measured(NOISY, seed=100 + number, **truth))
+        error = np.abs(found.estimate - dists.normalise(dist, truth))
+        held += bool((error <= found.interval).all())
+        errors.append(error)
+    # 0.9 of 40, less three standard deviations.
+    assert held >= 30
+    # Staying at the centre would err by half a radius in the mean.
+    assert np.mean(errors) < 0.3
+
+
+def test_what_no_coordinates_explain_does_not_fit(dist):
+    found = estimate(EXACT, dist, measured(EXACT, friction=0.0, mass=0.0, wind=0.5))
+    assert found.p_value == pytest.approx(1 / (SETS + 1))
+
+
+def test_pieces_after_a_fall_do_not_count(dist):
+    whole = measured(EXACT, friction=0.1, mass=0.1)
+    spoilt = whole.replace(
+        alive=whole.alive.at[1, 30:].set(False), state={"slider": whole.state["slider"].at[1, 30:].set(jnp.nan)}
+    )
+    np.testing.assert_allclose(0.2 * estimate(EXACT, dist, spoilt).estimate, [0.1, 0.1], atol=2e-4)
+
+
+def test_pieces_that_break_do_not_spoil_the_others(dist):
+    broken = measured(EXACT, friction=0.1, mass=0.1)
+    # Of one step alone: the piece that begins there cannot be simulated.
+    broken = broken.replace(state={"slider": broken.state["slider"].at[0, 10].set(jnp.inf)})
+    np.testing.assert_allclose(0.2 * estimate(EXACT, dist, broken).estimate, [0.1, 0.1], atol=2e-3)
+
+
+def machine(slider, **changes):
+    return Tuner(
+        config=dataclasses.replace(toys.TINY, set_episodes=EPISODES, replay=SIZES[slider], min_radius=0.01),
+        train_policy=toys.train_policy,
+        simulate=slider.simulate,
+        replay=slider.replay(),
+        **changes,
+    )
+
+
+def accept(key, config, collected, measured, knobs):
+    return tuner.GateInfo(novelty=jnp.zeros(()), threshold=jnp.ones(()))
+
+
+def stay(errors, key, config, collected, measured, dist, knobs):
+    """An update that moves nothing, and says how far it errs."""
+    none = jnp.zeros(len(NAMES))
+    info = tuner.UpdateInfo(step=none, interval=none + 1.0, identifiable=none > 0, loss=jnp.zeros(()))
+    return dist, info.replace(errors=errors * jnp.eye(len(NAMES)))
+
+
+@pytest.mark.parametrize(
+    "slider, errors, extra, replayed",
+    [
+        (EXACT, 0.1, {}, True),
+        (NOISY, 1e-9, {}, False),  # the estimate before errs less
+        (EXACT, 0.1, {"wind": 0.5}, False),  # the states do not fit
+    ],
+)
+def test_the_tuner_takes_the_better_estimate(dist, slider, errors, extra, replayed):
+    one = machine(slider, verify=accept, update=partial(stay, errors))
+    state = one.init(toys.policy(), dist, tuner.knobs())
+    truth = {"friction": 0.1, "mass": -0.15}
+    after, info = jax.jit(one.tune)(jax.random.key(0), state, measured(slider, **truth, **extra))
+    assert bool(info.update.replayed) == replayed
+    assert np.isfinite(info.update.p_replay)
+    if replayed:
+        np.testing.assert_allclose(dists.ravel(after.dist.centre), [0.1, -0.15], atol=1e-3)
+        assert (dists.ravel(after.dist.radius) < 0.2).all()
+        assert info.update.identifiable.all()
+        assert "estimated from measured states" in tuner.explain(info)
+    else:
+        jax.tree.map(np.testing.assert_array_equal, after.dist, dist)
+        assert "measured states give no better estimate" in tuner.explain(info)
+
+
+def test_a_rejected_set_is_not_replayed(dist):
+    reject = lambda *args: accept(*args).replace(novelty=jnp.full((), 2.0))  # noqa: E731
+    one = machine(EXACT, verify=reject, update=partial(stay, 0.1))
+    _, info = jax.jit(one.tune)(
+        jax.random.key(0), one.init(toys.policy(), dist, tuner.knobs()), measured(EXACT, friction=0.0, mass=0.0)
+    )
+    assert np.isnan(info.update.p_replay)
+    assert not info.update.replayed
+
+
+def test_states_that_are_missing_or_of_another_robot_are_refused(dist):
+    one = machine(EXACT)
+    state, whole = one.init(toys.policy(), dist, tuner.knobs()), measured(EXACT, friction=0.0, mass=0.0)
+    for changed, message in (
+        (whole.replace(state=None), "measured, state: got none"),
+        (whole.replace(state={"cart": whole.state["slider"]}), "measured, state: got 'cart', expected some of slider"),
+        (whole.replace(state={"slider": whole.state["slider"][..., :1]}), "measured, state, slider: got shape"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            one.tune(jax.random.key(0), state, changed)
+    without = dataclasses.replace(one, simulate=lambda *args: EXACT.simulate(*args).replace(state=None))
+    with pytest.raises(ValueError, match="simulate, state: got none"):
+        without.tune(jax.random.key(0), state, whole)
+    long = dataclasses.replace(one, config=dataclasses.replace(one.config, replay=ReplayConfig(window=60)))
+    with pytest.raises(ValueError, match="expected more than 60"):
+        long.tune(jax.random.key(0), state, whole)
