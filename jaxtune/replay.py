@@ -25,6 +25,7 @@ from typing import Any
 import chex
 import jax
 import jax.numpy as jnp
+import optax
 from jaxtyping import Array, Float
 
 from jaxtune import devices
@@ -36,7 +37,7 @@ _EXACT = 1e-3  # least error of a feature, as a share of what the distribution's
 # Radii: of the first secants, and of the shortest. Whether a foot slips or sticks changes in steps, across which a
 # short secant is steep and wrong.
 _SECANT, _SHORTEST = 0.5, 0.03
-_CLOSEST = 0.01  # radii: least standard error; where nothing is noisy a fit ends before it is exact
+_CLOSEST = 0.002  # radii: least error; where nothing is noisy a fit ends before it is exact
 _FURTHEST = 1.0  # radii that one step may move
 _SHORTER = 0.3  # share of a step that is tried after one that did not lower the cost
 _BROKEN = 1e3  # whitened error of a piece whose simulation is not finite
@@ -94,6 +95,16 @@ class _Whitening:
     inverse: jax.Array  # L^-1 of what is left, [features, features]
 
 
+@chex.dataclass(frozen=True)
+class _Fit:
+    """Where the fit of one set stands."""
+
+    best: jax.Array  # [coords]
+    energy: jax.Array  # [pieces] |z|^2 / k there; infinite before the first step
+    step: jax.Array  # [coords] that is tried from there
+    normal: jax.Array  # [coords, coords] there, of Gauss-Newton
+
+
 def estimate(
     config: ReplayConfig,
     replay: Replay,
@@ -106,7 +117,7 @@ def estimate(
     """Estimates the coordinates of a measured set, and how far the estimate may be off.
 
     Each set is fitted by itself, from the centre of the distribution. With Q the conformal quantile over simulated
-    sets and e the standard errors of a fit,
+    sets and e the standard errors of a fit, joined with the median error of simulated sets,
 
         interval = e(measured) Q(max over coordinates of |estimate - truth| / e).
 
@@ -122,45 +133,60 @@ def estimate(
     # What the measured states lack, the simulated ones must do without.
     lean = simulated.replace(state={name: simulated.state[name] for name in measured.state})
     every = jax.tree.map(lambda sets, one: jnp.concatenate([sets, one[None]]), lean, measured)
-    truth = dists.normalise(dist, truth)
-    names, low, high = dists.names(dist), *(dists.normalise(dist, end) for end in (dist.lower, dist.upper))
-    centre, radius = dists.ravel(dist.centre), dists.ravel(dist.radius)
+    pieces = jax.vmap(lambda episodes: _cut(config, replay, episodes))(every)
+    truth, names = dists.normalise(dist, truth), dists.names(dist)
+    low, high = (dists.normalise(dist, end) for end in (dist.lower, dist.upper))
+    count, coords = len(truth), truth.shape[-1]
 
     def misses(centre, radius, pieces: _Pieces, points: Float[Array, "points coords"]) -> jax.Array:
         def piece(point, start, action, end):
             return replay.play(start, action, dists.unravel(names, centre + radius * point)) - end
 
         many = jax.vmap(piece, (None, 0, 0, 0))
-        # In turn: pieces are as many as suit a cache, and one more is as fast as two halves elsewhere.
+        # In turn: pieces are as many as suit a cache.
         found = jax.lax.map(lambda point: many(point, pieces.start, pieces.action, pieces.end), points)
         return jnp.where(pieces.valid[:, None], found, 0.0)
 
-    def first(centre, radius, episodes, truth):
-        pieces = _cut(config, replay, episodes)
-        return misses(centre, radius, pieces, jnp.stack([jnp.zeros_like(truth), truth])), pieces.valid
+    def improve(carry, number):
+        # The first round learns how features err. It is one of these rounds, so that simulation is compiled once.
+        whitening, fits = carry
+        tried = jax.vmap(lambda fit: jnp.clip(fit.best + fit.step, low, high))(fits)
+        secants = jax.vmap(lambda fit, trial: _secants(fit, trial, low, high))(fits, tried)
+        around = tried[:, None] + jnp.concatenate([jnp.zeros_like(secants[:, :1]), secants], axis=1)
+        points = jnp.where(number == 0, probes, around)
+        left = devices.in_chunks(
+            misses, (pieces, points), _SETS, shared=(dists.ravel(dist.centre), dists.ravel(dist.radius))
+        )
+        learn = lambda: _whitening(left[:-1, 0], left[:-1, 1], pieces.valid[:-1])  # noqa: E731
+        whitening = jax.lax.cond(number == 0, learn, lambda: whitening)
+        white = left / whitening.size @ whitening.inverse.T
+        white = jnp.where(jnp.isfinite(white).all(axis=-1, keepdims=True), white, _BROKEN)
+        better = jax.vmap(_improved)(fits, tried, jnp.diagonal(secants, axis1=1, axis2=2), white, pieces.valid)
+        return (whitening, optax.tree.where(number == 0, fits, better)), None
 
-    at, valid = devices.in_chunks(first, (lean, truth), _SETS, shared=(centre, radius))
-    whitening = _whitening(at[:, 0], at[:, 1], valid)
-
-    def fit(centre, radius, low, high, whitening, episodes):
-        pieces = _cut(config, replay, episodes)
-
-        def whitened(points):
-            left = misses(centre, radius, pieces, points) / whitening.size @ whitening.inverse.T
-            broken = ~jnp.isfinite(left).all(axis=-1, keepdims=True)
-            return jnp.where(broken, _BROKEN, left)
-
-        return _fit(config, whitened, pieces.valid, low, high)
-
-    points, deviations, misfit = devices.in_chunks(fit, (every,), _SETS, shared=(centre, radius, low, high, whitening))
-    error = points[:-1] - truth
+    probes = jnp.zeros((count + 1, coords + 1, coords)).at[:-1, 1].set(truth)
+    fits = _Fit(
+        best=jnp.zeros((count + 1, coords)),
+        energy=jnp.full(pieces.valid.shape, jnp.inf),
+        step=jnp.zeros((count + 1, coords)),
+        normal=jnp.broadcast_to(jnp.eye(coords), (count + 1, coords, coords)),
+    )
+    size = pieces.end.shape[-1]
+    start = _Whitening(size=jnp.ones(size), inverse=jnp.eye(size)), fits
+    (_, fits), _ = jax.lax.scan(improve, start, jnp.arange(config.iterations + 2))
+    error = fits.best[:-1] - truth
+    deviations = jax.vmap(lambda normal: jnp.sqrt(jnp.diag(jnp.linalg.inv(normal))))(fits.normal)
+    # Slopes that jump make some standard errors far too small.
+    deviations = jnp.hypot(deviations, jnp.maximum(jnp.median(jnp.abs(error), axis=0), _CLOSEST))
     scaled = (jnp.abs(error) / deviations[:-1]).max(axis=-1)
-    rank = jnp.ceil((len(scaled) + 1) * coverage).astype(int) - 1
+    rank = jnp.ceil((count + 1) * coverage).astype(int) - 1
+    logs = jnp.where(pieces.valid, jnp.log1p(fits.energy), 0.0).sum(axis=-1)
+    misfit = logs / jnp.maximum(pieces.valid.sum(axis=-1), 1)
     return Replayed(
-        estimate=points[-1],
-        interval=deviations[-1] * jnp.sort(scaled)[jnp.minimum(rank, len(scaled) - 1)],
-        errors=error.T @ error / len(error),
-        p_value=(1 + jnp.sum(misfit[:-1] >= misfit[-1])) / len(misfit),
+        estimate=fits.best[-1],
+        interval=deviations[-1] * jnp.sort(scaled)[jnp.minimum(rank, count - 1)],
+        errors=error.T @ error / count,
+        p_value=(1 + jnp.sum(misfit[:-1] >= misfit[-1])) / (count + 1),
     )
 
 
@@ -204,58 +230,40 @@ def _whitening(centre: jax.Array, truth: jax.Array, valid: jax.Array) -> _Whiten
     return _Whitening(size=size, inverse=jax.scipy.linalg.solve_triangular(root, jnp.eye(len(size)), lower=True))
 
 
-def _fit(
-    config: ReplayConfig,
-    whitened: Callable[[jax.Array], jax.Array],
-    valid: jax.Array,
-    low: jax.Array,
-    high: jax.Array,
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Fits one set by Gauss-Newton, with the slopes by secants.
+def _secants(fit: _Fit, trial: jax.Array, low: jax.Array, high: jax.Array) -> jax.Array:
+    """Secants [coords, coords] from a point, along one coordinate each: as long as the last step, and onwards."""
+    size = jnp.where(jnp.isfinite(fit.energy).all(), jnp.clip(jnp.abs(fit.step), _SHORTEST, _SECANT), _SECANT)
+    size = jnp.where(fit.step < 0, -size, size)
+    return jnp.diag(jnp.where((trial + size < low) | (trial + size > high), -size, size))
+
+
+def _improved(fit: _Fit, trial: jax.Array, secants: jax.Array, white: jax.Array, valid: jax.Array) -> _Fit:
+    """Takes a trial if it costs less, and a Gauss-Newton step from there; else a shorter step from where the fit was.
 
     Args:
-      config: sizes.
-      whitened: errors [points, pieces, features] at points [points, coords].
+      fit: before.
+      trial: [coords] that was simulated.
+      secants: [coords] how far from it each coordinate was simulated too.
+      white: whitened errors [1 + coords, pieces, features], first of the trial, then along each secant.
       valid: [pieces]
-      low: [coords] bounds.
-      high: [coords]
-
-    Returns:
-      The estimate [coords], its standard errors [coords], and the misfit, mean log(1 + |z|^2 / k) of its pieces.
     """
-    count = len(low)
-    pieces = jnp.maximum(valid.sum(), 1)
-
-    def energies(errors):
-        return jnp.where(valid, (errors**2).mean(axis=-1), 0.0)
+    here, there = white[0], white[1:]
+    features, now = here.shape[-1], jnp.where(valid, (here**2).mean(axis=-1), 0.0)
 
     def scale(energy):
         return jnp.maximum(jnp.nanmedian(jnp.where(valid, energy, jnp.nan)), 1.0)
 
-    def improve(carry, _):
-        best, energy, step, normal, trial = carry
-        # As long as the last step, and towards where it led.
-        secants = jnp.where(step < 0, -1.0, 1.0) * jnp.clip(jnp.abs(step), _SHORTEST, _SECANT)
-        secants = jnp.where((trial + secants < low) | (trial + secants > high), -secants, secants)
-        here, *there = whitened(jnp.concatenate([trial[None], trial + jnp.diag(secants)]))
-        features, now = here.shape[-1], energies(here)
-        # Both under the scale of the better one so far; before the first step any is better than none.
-        unit = jnp.where(jnp.isfinite(energy).all(), scale(energy), scale(now))
-        cost = lambda energy, point: (  # noqa: E731
-            (_FREEDOM + features) * jnp.log1p(features * energy / (_FREEDOM * unit)).sum() + point @ point
-        )
-        better = ~(cost(now, trial) >= cost(energy, best))
-        slopes = jnp.stack([one - here for one in there], axis=-1) / secants
-        weight = valid * (_FREEDOM + features) / (_FREEDOM + features * now / scale(now)) / scale(now)
-        hessian = jnp.einsum("p,pfi,pfj->ij", weight, slopes, slopes) + jnp.eye(count)
-        pull = jnp.einsum("p,pfi,pf->i", weight, slopes, here) + trial
-        newton = jnp.clip(-jnp.linalg.solve(hessian, pull), -_FURTHEST, _FURTHEST)
-        best, energy = jnp.where(better, trial, best), jnp.where(better, now, energy)
-        step, normal = jnp.where(better, newton, _SHORTER * step), jnp.where(better, hessian, normal)
-        return (best, energy, step, normal, jnp.clip(best + step, low, high)), None
+    # Both under the scale of the better one so far; before the first step any is better than none.
+    unit = jnp.where(jnp.isfinite(fit.energy).all(), scale(fit.energy), scale(now))
 
-    start, nothing = jnp.clip(jnp.zeros(count), low, high), jnp.full(valid.shape, jnp.inf)
-    carry = (start, nothing, jnp.full(count, _SECANT), jnp.eye(count), start)
-    (best, energy, _, normal, _), _ = jax.lax.scan(improve, carry, length=config.iterations + 1)
-    deviations = jnp.sqrt(jnp.diag(jnp.linalg.inv(normal)))
-    return best, jnp.maximum(deviations, _CLOSEST), jnp.where(valid, jnp.log1p(energy), 0.0).sum() / pieces
+    def cost(energy, point):
+        return (_FREEDOM + features) * jnp.log1p(features * energy / (_FREEDOM * unit)).sum() + point @ point
+
+    better = ~(cost(now, trial) >= cost(fit.energy, fit.best))
+    slopes = jnp.moveaxis(there - here, 0, -1) / secants
+    weight = valid * (_FREEDOM + features) / (_FREEDOM + features * now / scale(now)) / scale(now)
+    normal = jnp.einsum("p,pfi,pfj->ij", weight, slopes, slopes) + jnp.eye(len(trial))
+    pull = jnp.einsum("p,pfi,pf->i", weight, slopes, here) + trial
+    newton = jnp.clip(-jnp.linalg.solve(normal, pull), -_FURTHEST, _FURTHEST)
+    found = _Fit(best=trial, energy=now, step=newton, normal=normal)
+    return optax.tree.where(better, found, fit.replace(step=_SHORTER * fit.step))

@@ -280,7 +280,7 @@ class Tuner:
             # Every round simulates new robots and trains its models anew, because the distribution has changed.
             key_collect, key_verify, key_update = jax.random.split(jax.random.fold_in(key, carry["rounds"]), 3)
             collected = self.collect(key_collect, state.policy, carry["dist"])
-            carry = counted(carry, collected)
+            carry, last = counted(carry, collected), carry["left"] <= 0
             # Branches, so that (unless vmapped) no model is trained that is not needed.
             carry = jax.lax.cond(
                 carry["verdict"] == Verdict.WIDEN,
@@ -289,8 +289,8 @@ class Tuner:
                 ),
                 lambda: carry,
             )
-            return jax.lax.cond(
-                carry["verdict"] == Verdict.ACCEPT,
+            carry = jax.lax.cond(
+                (carry["verdict"] == Verdict.ACCEPT) & ~last,
                 lambda: self.refine(
                     carry,
                     *self.update(key_update, self.config, collected, measured, carry["dist"], state.knobs),
@@ -298,14 +298,14 @@ class Tuner:
                 ),
                 lambda: carry,
             )
+            if self.replay is None:
+                return carry
+            return jax.lax.cond(last, lambda: self.sharpen(carry, collected, measured, state.knobs), lambda: carry)
 
-        carry = jax.lax.while_loop(lambda carry: carry["left"] > 0, body, self.before(state.dist))
-        if self.replay is not None:
-            carry = jax.lax.cond(
-                carry["verdict"] == Verdict.ACCEPT,
-                lambda: self.sharpen(jax.random.fold_in(key, carry["rounds"]), carry, state, measured),
-                lambda: carry,
-            )
+        def goes_on(carry):
+            return (carry["left"] > 0) | ((carry["verdict"] == Verdict.ACCEPT) & ~carry["sharpened"])
+
+        carry = jax.lax.while_loop(goes_on, body, self.before(state.dist))
         return state.replace(dist=carry["dist"]), make_info(carry, measured)
 
     def before(self, dist: ParamDist) -> dict:
@@ -320,6 +320,7 @@ class Tuner:
             "update": no_update(dist),
             "verdict": jnp.asarray(Verdict.WIDEN, int),
             "not_finite": jnp.zeros((), int),
+            "sharpened": jnp.asarray(self.replay is None),
             **no_gate_log(self.config),
         }
 
@@ -396,35 +397,28 @@ class Tuner:
             "verdicts": carry["verdicts"].at[carry["calls"] - 1].set(verdict),
         }
 
-    def sharpen(self, key: jax.Array, carry: dict, state: TunerState, measured: Trajectory) -> dict:
+    def sharpen(self, carry: dict, collected: Collected, measured: Trajectory, knobs: Knobs) -> dict:
         """Estimates once more, from the states of an accepted set (`replay.estimate`).
 
         Args:
-          key: random key.
           carry: from `refine`.
-          state: whose policy produced the measured set, and whose level the estimate must fit at.
+          collected: of the distribution that it left.
           measured: the measured set, with states.
+          knobs: for the level that the measured set must fit at.
 
         Returns:
-          What is carried on. The centre is the new estimate if, on simulated sets, its errors (rms, in radii) are
-          smaller than those of the estimate before, and if the measured set fits it. Radii only narrow.
+          What the loop carries on; it ends. The centre is the new estimate if, on simulated sets, its errors (rms, in
+          radii) are smaller than those of the estimate before, and if the measured set fits it. Radii only narrow.
         """
         dist, tested, before = carry["dist"], carry["tested"], carry["update"]
-        size = self.config.replay.sets
-        key_coords, key_simulate = jax.random.split(key)
-        truth = dists.sample(key_coords, dist, size)
-        each = {name: jnp.repeat(values, self.config.set_episodes) for name, values in truth.items()}
-        simulated = jax.tree.map(
-            lambda leaf: leaf.reshape(size, -1, *leaf.shape[1:]), self.simulate(key_simulate, state.policy, each)
-        )
-        found = replays.estimate(
-            self.config.replay, self.replay, simulated, truth, measured, dist, self.config.coverage
-        )
+        sizes = self.config.replay
+        sets = jax.tree.map(lambda leaf: leaf[: sizes.sets], (collected.held_out, collected.held_out_coords))
+        found = replays.estimate(sizes, self.replay, *sets, measured, dist, self.config.coverage)
         radius, unit = dists.ravel(dist.radius), dists.ravel(tested.radius)
         errors = found.errors * jnp.outer(radius / unit, radius / unit)
         # An update that gives no errors gives no reason to keep its estimate.
         closer = ~(jnp.trace(errors) >= jnp.trace(before.errors))
-        fits = found.p_value > 1.0 - state.knobs.level
+        fits = found.p_value > 1.0 - knobs.level
         taken = closer & fits & jnp.isfinite(found.estimate).all()
         moved = dists.move(dist, found.estimate)
         narrowed = jnp.clip(radius * found.interval, jnp.minimum(self.config.min_radius, radius), radius)
@@ -437,7 +431,11 @@ class Tuner:
             replayed=jnp.asarray(True),
         )
         update = optax.tree.where(taken, update, before).replace(p_replay=found.p_value)
-        return carry | {"dist": optax.tree.where(taken, moved, dist), "update": update}
+        return carry | {
+            "dist": optax.tree.where(taken, moved, dist),
+            "update": update,
+            "sharpened": jnp.asarray(True),
+        }
 
     def collect(self, key: jax.Array, policy: Policy, dist: ParamDist) -> Collected:
         """Simulates D_q and the held-out sets under one policy, with coordinates drawn from one distribution.
@@ -454,7 +452,7 @@ class Tuner:
         trajectory = self.simulate(key_simulate, policy, every)
         check_simulated(trajectory, self.config.episodes + sets * each, self.config)
         return Collected(
-            trajectory=jax.tree.map(lambda leaf: leaf[: self.config.episodes], trajectory),
+            trajectory=jax.tree.map(lambda leaf: leaf[: self.config.episodes], trajectory.replace(state=None)),
             sampled_coords=coords,
             held_out=jax.tree.map(
                 lambda leaf: leaf[self.config.episodes :].reshape(sets, each, *leaf.shape[1:]), trajectory

@@ -81,7 +81,7 @@ class Learner:
         self.correction = correction
         self.entries = entries
         self._hidden = hidden
-        self._states = states
+        self.states = states
         self.robot = kind.make(preset, {**entries, **hidden}, correction)
         self.longest = round(preset.task.episode_s / kind.control_s)
         """Control steps of an episode of the full time limit."""
@@ -173,7 +173,7 @@ class Learner:
         count, steps = len(next(iter(coords.values()))), self.preset.episode_steps
         commands = jax.tree.map(lambda leaf: leaf[jnp.arange(count) % len(leaf)], policy.asked)
         length = steps if commands is None else commands.command.shape[1]
-        whole = simulate(self.robot, key, self.act(policy), coords, length, commands, self._states)
+        whole = simulate(self.robot, key, self.act(policy), coords, length, commands, self.states)
         return jax.tree.map(lambda leaf: leaf[:, -steps:] if leaf.ndim > 1 else leaf, whole)
 
     def play(self, target: Target) -> Callable[..., Trajectory]:
@@ -187,7 +187,7 @@ class Learner:
         """
 
         def play(key, policy, count, steps):
-            return target.episodes(key, self.act(policy), count, steps, self._states)
+            return target.episodes(key, self.act(policy), count, steps, self.states)
 
         return devices.on_all(jax.jit(play, static_argnums=(2, 3))) if isinstance(target, MjxTarget) else play
 
@@ -244,8 +244,8 @@ class Learner:
             config=self.preset.tuner,
             train_policy=lambda key, policy, dist: self.train(key, policy, dist, self.preset.epochs),
             simulate=self.simulate,
-            measure=target and (lambda key, policy: target.episodes(key, self.act(policy), count, steps, self._states)),
-            replay=mjx.replay(self.robot, self.entries) if self._states else None,
+            measure=target and (lambda key, policy: target.episodes(key, self.act(policy), count, steps, self.states)),
+            replay=mjx.replay(self.robot, self.entries) if self.states else None,
         )
 
     def channels(self) -> list[str]:

@@ -29,6 +29,9 @@ def needed(learner: Learner) -> dict[str, float]:
     sizes, tuner = learner.preset, learner.preset.tuner
     step = 4.0 * (learner.robot.observation_size + learner.robot.action_size)
     rollout = step * sizes.ppo.steps_per_update
+    if learner.states:
+        kept = jax.eval_shape(lambda key: learner.robot.kept(learner.robot.reset({}, key)), jax.random.PRNGKey(0))
+        step += 4.0 * sum(leaf.size for leaf in jax.tree.leaves(kept))
     episodes = step * sizes.episode_steps * (tuner.episodes + tuner.held_out_sets * tuner.set_episodes)
     return {"training": _TRAINING * rollout, "tuning": _TUNING * episodes + _MODELS}
 

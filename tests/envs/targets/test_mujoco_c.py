@@ -46,6 +46,17 @@ def test_episodes_are_those_of_mjx(recorded):
     np.testing.assert_allclose(motion.phase, expected.phase, atol=1e-6)
 
 
+def test_a_measured_state_goes_on_in_mjx_as_it_did_in_the_engine(robot):
+    target = mujoco_c.target(robot, VALUES, threads=2)
+    episodes = target.episodes(KEY, restless, COUNT, 5, states=True)
+    step = jax.jit(lambda kept, action: robot.step(VALUES, robot.resumed(VALUES, kept), action))
+    for episode, index in ((0, 0), (2, 3)):
+        kept = jax.tree.map(lambda leaf, at=(episode, index): leaf[at], episodes.state)
+        after = step(kept, episodes.action[episode, index])
+        np.testing.assert_allclose(after.qpos, episodes.state["qpos"][episode, index + 1], atol=1e-5)
+        np.testing.assert_allclose(after.qvel, episodes.state["qvel"][episode, index + 1], atol=1e-3)
+
+
 def test_forces_of_the_floor_push_up_alike(recorded):
     (_, motion), (_, expected) = recorded
     # Up to a first bounce, whose moment is a matter of micrometres.

@@ -1,4 +1,6 @@
+import dataclasses
 import functools
+import types
 import warnings
 
 import jax
@@ -13,7 +15,7 @@ from sled import SUBSTEPS, TABLE, Keyed, Sled
 
 from jaxtune import dist as dists
 from jaxtune import tuner
-from jaxtune.mjx import Simulator, action_delay, apply_mujoco, field, from_coords, mass
+from jaxtune.mjx import Simulator, action_delay, apply_mujoco, field, from_coords, mass, to_coords
 
 STEPS = 60
 
@@ -109,6 +111,42 @@ def test_simulate_takes_coordinates_and_measure_hides_parameters(sim, play):
     expected = play(mass=1.3, delay=0.02)
     for episodes in (sim.simulate(act)(key, 3.0, coords), sim.measure(act, {"mass": 1.3, "delay": 0.02}, 1)(key, 3.0)):
         np.testing.assert_allclose(episodes.obs, expected.obs, rtol=1e-4, atol=1e-5)
+
+
+def test_a_replay_goes_on_from_any_state_as_the_episode_did(sim):
+    truth = {"mass": 1.3, "damping": 2.0, "strength": 0.8, "delay": 0.03}
+    episodes = sim.measure(act, truth, 2, states=True)(jax.random.key(7), 3.0)
+    np.testing.assert_array_equal(episodes.state["qpos"][..., 0], episodes.obs[..., 0])
+    replay, steps = sim.replay(), 7
+    coords = {name: jnp.float32(value) for name, value in to_coords(TABLE, truth).items()}
+
+    @jax.jit
+    def end(state, actions, coords):
+        return replay.play(state, actions, coords)
+
+    for episode, begin in ((0, 0), (1, 1), (1, 2), (0, 40)):
+        at = lambda step, episode=episode: jax.tree.map(lambda leaf: leaf[episode, step], episodes.state)  # noqa: E731
+        actions, reached = episodes.action[episode, begin : begin + steps], replay.read(at(begin + steps))
+        np.testing.assert_allclose(end(at(begin), actions, coords), reached, rtol=1e-5, atol=1e-6)
+        for name in coords:
+            other = end(at(begin), actions, coords | {name: coords[name] + 0.2})
+            assert np.abs(other - reached).max() > 1e-4, name
+        # Measured states may lack what a simulator alone knows.
+        bare = {name: at(begin)[name] for name in ("qpos", "qvel", "past", "steps")}
+        np.testing.assert_allclose(end(bare, actions, coords), reached, rtol=1e-4, atol=1e-5)
+
+
+def test_states_are_kept_where_they_are_asked_for_alone(sim):
+    coords = {"mass": jnp.zeros(2)}
+    assert sim.simulate(act)(jax.random.key(7), 3.0, coords).state is None
+    kept = sim.simulate(act, states=True)(jax.random.key(7), 3.0, coords).state
+    assert kept["qvel"].shape == (2, STEPS, 1)
+
+
+def test_an_environment_without_mujocos_data_cannot_be_replayed(sim):
+    hidden = dataclasses.make_dataclass("Hidden", ["obs"])
+    with pytest.raises(ValueError, match="env: got a state without data or pipeline_state"):
+        sim.kept(types.SimpleNamespace(env=hidden(obs=0)))
 
 
 def test_chunks_change_nothing(sim, monkeypatch):
