@@ -98,7 +98,8 @@ class SelfTest:
     interval: dict[str, float]
     """Median half width of its interval, likewise."""
     covered: Rate
-    """Robots inside whose identifiable coordinates all lie in their intervals."""
+    """Robots inside whose identifiable coordinates all lie in their intervals; of those that have intervals, which
+    `vote_update` gives none."""
     tuned: dict[str, tuple[Tuned, ...]]
     """Whole tunings in their order, by case; empty where none was run."""
 
@@ -167,7 +168,7 @@ def run(
         identified={name: _count(column) for name, column in columns(known).items()},
         error=median(errors),
         interval=median(intervals),
-        covered=_count(((errors <= intervals) | ~known).all(axis=-1)),
+        covered=_told(_covers(errors, intervals, known)),
         tuned=tuned,
     )
 
@@ -252,7 +253,7 @@ def _ended(dist: ParamDist, info: Info, coords: Coords) -> dict:
     return {
         "verdict": verdict,
         "held": bool(_inside(dist, coords).all()),
-        "covered": bool(((errors <= radius * info.update.interval) | ~info.update.identifiable).all()),
+        "covered": float(_covers(errors, radius * info.update.interval, info.update.identifiable)),
         "errors": np.abs(np.asarray(dists.ravel(dist.centre)) - truth),
     }
 
@@ -263,9 +264,22 @@ def _tuned(rows: Sequence[Mapping], names: Sequence[str]) -> Tuned:
     return Tuned(
         verdicts=dict(Counter(row["verdict"].name.lower() for row in rows)),
         held=Rate(sum(row["held"] for row in accepted), len(accepted)),
-        covered=Rate(sum(row["covered"] for row in accepted), len(accepted)),
+        covered=_told(np.array([row["covered"] for row in accepted])),
         error=dict(zip(names, np.median([row["errors"] for row in rows], axis=0).tolist(), strict=True)),
     )
+
+
+def _covers(errors: np.ndarray, intervals: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Tells whether all identifiable coordinates [..., coords] lie in their intervals: 1, 0; nan where one has none."""
+    inside = ((errors <= intervals) | ~known).all(axis=-1)
+    return np.where((known & np.isnan(intervals)).any(axis=-1), np.nan, inside)
+
+
+def _told(covers: np.ndarray) -> Rate:
+    """Counts what is covered among what has intervals; by gate where all of [gates, robots] have some."""
+    if covers.ndim == 2 and not np.isnan(covers).any():
+        return _count(covers > 0)
+    return Rate(int(np.nansum(covers)), int(np.isfinite(covers).sum()))
 
 
 def _count(values: np.ndarray) -> Rate:

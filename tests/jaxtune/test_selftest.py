@@ -80,6 +80,17 @@ def test_a_tuning_is_counted_by_its_verdict_box_and_intervals():
     assert one.error == {"friction": 0.1, "mass": 0.3}
 
 
+def test_robots_without_intervals_are_not_counted_as_misses():
+    errors, known = np.array([[0.1, 0.3], [0.1, 0.3], [0.1, 0.3]]), np.array([True, True])
+    intervals = np.array([[0.2, 0.4], [0.2, 0.1], [0.2, np.nan]])
+    covers = selftest._covers(errors, intervals, known)
+    np.testing.assert_array_equal(covers, [1.0, 0.0, np.nan])
+    assert selftest._told(covers) == Rate(1, 2)
+    assert selftest._told(covers[None, :2]) == Rate(1, 2, (1,))
+    # A coordinate that is not identifiable needs none.
+    assert selftest._covers(errors[2], intervals[2], np.array([True, False])) == 1.0
+
+
 def test_gates_that_differ_count_for_fewer_robots():
     assert Rate(20, 40).independent == 40
     # As chance has it, or less.
