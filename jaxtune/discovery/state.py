@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
+from jaxtune.discovery.curves import Library
 from jaxtune.discovery.decide import Candidate
 from jaxtune.discovery.fit import Fit, Free, refine
 from jaxtune.discovery.noise_floor import NoiseFloor, with_systematic_share
 from jaxtune.discovery.problem import Problem
 from jaxtune.discovery.result import Settings
-from jaxtune.discovery.screen import Library
 
 _NULL_ROUNDS = 8
 

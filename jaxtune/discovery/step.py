@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from jaxtune.discovery.curves import Group, Library, groups_of, on_segments, simulate_library, spread_segments
 from jaxtune.discovery.decide import Candidate, ablate, key_of, total_cost
 from jaxtune.discovery.evaluate import usual
 from jaxtune.discovery.fit import Fit, begin, polish, refine, taken_over
@@ -19,19 +20,7 @@ from jaxtune.discovery.localise import localise
 from jaxtune.discovery.noise_floor import Floor, NoiseFloor, Say
 from jaxtune.discovery.problem import Hypothesis, Problem, are_distinct
 from jaxtune.discovery.result import Settings
-from jaxtune.discovery.screen import (
-    Group,
-    Lead,
-    Library,
-    Screen,
-    groups_of,
-    on_segments,
-    promising,
-    screen,
-    seen,
-    simulate_library,
-    spread_segments,
-)
+from jaxtune.discovery.screen import Lead, Screen, promising, screen, seen
 from jaxtune.discovery.state import State
 
 _MOST_PLACES = 3  # of one name among the leads that are fitted: they tell where; more would crowd out other names

@@ -7,10 +7,11 @@ import pytest
 from slider import AXES, HELD, HYPOTHESES, problem
 
 from jaxtune.discovery import fit, noise_floor, state
+from jaxtune.discovery.curves import groups_of, simulate_library
 from jaxtune.discovery.fit import Fit, Free
 from jaxtune.discovery.least_squares import Counts
 from jaxtune.discovery.profile import Changes, profile_of
-from jaxtune.discovery.screen import groups_of, promising, screen, simulate_library
+from jaxtune.discovery.screen import promising, screen
 
 
 def screened(truth, pairs=0, forms=(), unknowns=None):
