@@ -198,13 +198,14 @@ def test_the_same_key_asks_the_same_of_every_robot(play, biteno):
 def test_a_target_keeps_its_truth_and_answers_with_episodes(robot, monkeypatch):
     asked = {}
 
-    def rollout(robot, key, act, params, steps):
+    def rollout(robot, key, act, params, steps, states):
         asked.update(params)
-        return steps, ()
+        return (steps, states), ()
 
     monkeypatch.setattr(mjx, "rollout", rollout)
     target = MjxTarget(robot=robot, params={"trunk_mass": 1.5, "foot_friction": 0.7})
-    assert target.episodes(jax.random.PRNGKey(3), statue, 4, STEPS) == STEPS
+    assert target.episodes(jax.random.PRNGKey(3), statue, 4, STEPS) == (STEPS, False)
+    assert target.episodes(jax.random.PRNGKey(3), statue, 4, STEPS, states=True) == (STEPS, True)
     assert asked.keys() == {"trunk_mass", "foot_friction"}
     np.testing.assert_array_equal(asked["trunk_mass"], np.full(4, 1.5, np.float32))
     np.testing.assert_array_equal(asked["foot_friction"], np.full(4, 0.7, np.float32))
