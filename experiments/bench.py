@@ -27,7 +27,7 @@ from envs.logs.tables import WRITERS
 from envs.rig import Rig
 from experiments.common import checkpoint
 from experiments.common.cli import console, run
-from experiments.common.config import preset
+from experiments.common.config import Preset, preset
 from experiments.walking import costs, foreign, memory
 from experiments.walking.learner import Learner
 from experiments.walking.policies import starting_policy
@@ -66,6 +66,8 @@ class Args:
     """Random seeds of estimates; each is a tuning with episodes and models of its own."""
     radius: float = 0.2
     """Radius (half width) of the distribution in estimates, in log space: 0.2 spans 0.82 to 1.22."""
+    noise: float = 0.0
+    """Factor of the uniform noise of biteno's simulated sensors in estimates; sim2real has 0.2."""
 
 
 def speed(args: Args) -> dict:
@@ -200,6 +202,10 @@ def logs(args: Args) -> dict:
     return found
 
 
+def _noisy(sizes: Preset, args: Args) -> Preset:
+    return dataclasses.replace(sizes, task=dataclasses.replace(sizes.task, noise=args.noise))
+
+
 def tuner_programs(args: Args) -> dict:
     """Measures compiling and running of `Tuner.tune`, and of `Tuner.run` vmapped over four seeds.
 
@@ -246,7 +252,7 @@ MEASURES = {
     "speed": speed,
     "devices": lambda args: costs.on_devices(preset(args.preset), args.policy),
     "profile": lambda args: costs.profile(preset(args.preset), args.policy),
-    "estimates": lambda args: costs.estimates(preset(args.preset), args.policy, args.radius, args.seeds),
+    "estimates": lambda args: costs.estimates(_noisy(preset(args.preset), args), args.policy, args.radius, args.seeds),
     "memory": lambda args: costs.memory(preset(args.preset), args.policy),
     "targets": targets,
     "rig": rig,
