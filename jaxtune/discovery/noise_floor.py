@@ -110,6 +110,8 @@ def measure(problem: Problem, say: Say) -> NoiseFloor:
         # All logs where thresholds come from them too; for a scale a few are enough.
         logs = {split: len(fits) if (split, horizon) == ("train", main) else _FEW for split in problem.data}
         left = {split: _simulated(problem, split, horizon, fits[: logs[split]]) for split in problem.data}
+        sound = {split: _finite(values) for split, values in left.items()}
+        left = {split: values[sound[split]] for split, values in left.items()}
         shared = {split: _shared(values) for split, values in left.items()}
         left = {split: values - shared[split] for split, values in left.items()}
         scale = {split: _rms_floor(values) for split, values in left.items()}
@@ -131,7 +133,7 @@ def measure(problem: Problem, say: Say) -> NoiseFloor:
             on_some=partial(_on_some, problem, segments["train"], scale["train"], shared["train"]),
             prior=prior,
             null_residuals=in_units.reshape(len(in_units), -1),
-            null_coordinates=coordinates[: len(in_units)],
+            null_coordinates=coordinates[: len(sound["train"])][sound["train"]],
         )
     return found
 
@@ -185,9 +187,17 @@ def _fit_null_logs(problem: Problem, prior: Free) -> tuple[np.ndarray, np.ndarra
     slopes = np.moveaxis(found.reshape(len(found), len(measured.run), -1, len(problem.cells)), 0, -1)
     which = np.repeat(np.arange(logs), len(train.run) // logs)
     coordinates, share = np.zeros((logs, len(prior.sd))), 1.0
+    last, known = coordinates, None
     for number in range(_STEPS):
         raw = paired_residuals(problem, coordinates @ prior.directions, train, which, np.arange(len(which)))
         raw = raw.reshape(logs, -1, *raw.shape[1:])
+        if known is not None:
+            # A step may break the simulation of a log, which then stays where it was.
+            broken = ~np.isfinite(raw).all(axis=tuple(range(1, raw.ndim)))
+            raw, coordinates = np.where(_each(broken, raw), known, raw), np.where(broken[:, None], last, coordinates)
+        # What broke in the nominal model already says nothing.
+        raw = np.where(np.isfinite(raw), raw, 0.0)
+        last, known = coordinates, raw
         unit = np.sqrt((raw**2).mean(axis=(0, 1)))
         # The first unit holds what the nominal parameters are off, which the second no longer does.
         for _ in range(2 if number == 0 else 1):
@@ -200,6 +210,26 @@ def _fit_null_logs(problem: Problem, prior: Free) -> tuple[np.ndarray, np.ndarra
             share = independent_share((left / unit).reshape(-1, *unit.shape))
         coordinates = np.clip(coordinates + np.stack(steps), *prior.bounds.T)
     return coordinates, unit
+
+
+def _each(logs: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Spreads what is said of every log [logs] over the dimensions of values [logs, ...]."""
+    return logs.reshape(-1, *[1] * (values.ndim - 1))
+
+
+def _finite(left: np.ndarray) -> np.ndarray:
+    """Tells which null logs [logs, ...] their own models simulate: one that breaks a simulation decides nothing.
+
+    Raises:
+      ValueError: fewer than two.
+    """
+    found = np.isfinite(left).all(axis=tuple(range(1, left.ndim)))
+    if found.sum() < 2:
+        raise ValueError(
+            f"null logs: got {found.sum()} of {len(left)} that the nominal model simulates with finite values, "
+            "expected at least 2; the model may be unstable at the log's rate and gains"
+        )
+    return found
 
 
 def _step(prior: Free, point: np.ndarray, residual: np.ndarray, slopes: np.ndarray, share: float) -> np.ndarray:

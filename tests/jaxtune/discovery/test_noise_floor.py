@@ -36,6 +36,30 @@ def test_fits_to_null_logs_find_what_was_drawn(monkeypatch):
     np.testing.assert_allclose(found.null_coordinates, draws, atol=0.3)
 
 
+def spoilt(problem, logs):
+    """A problem of which some null logs hold a number in train that no simulation can be compared with."""
+    every = [dict(log) for log in problem.null_logs]
+    for number in logs:
+        segments = every[number]["train"][problem.main_horizon]
+        signals = {name: values.copy() for name, values in segments.signals.items()}
+        next(iter(signals.values()))[3, 0, 0] = np.inf
+        every[number]["train"] = {**every[number]["train"], problem.main_horizon: replace(segments, signals=signals)}
+    return replace(problem, null_logs=every)
+
+
+def test_a_null_log_that_breaks_decides_nothing():
+    problem = toy.problem({})
+    at = problem.main_horizon
+    whole = measure(problem, lambda text: None)[at]
+    found = measure(spoilt(problem, [1]), lambda text: None)[at]
+    count = len(whole.null_residuals)
+    assert len(found.null_residuals) == len(found.null_coordinates) == count - 1
+    np.testing.assert_allclose(found.scale["train"].mean(axis=0), whole.scale["train"].mean(axis=0), rtol=0.2)
+    assert np.isfinite(found.null_residuals).all()
+    with pytest.raises(ValueError, match=f"null logs: got 1 of {count}"):
+        measure(spoilt(problem, range(1, count)), lambda text: None)
+
+
 def floor_of_repeats(masses, told_alike=True):
     """Mean floor [components] where a motion of train was repeated by sliders whose masses are off by so much."""
     problem = toy.problem({})
