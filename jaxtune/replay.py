@@ -28,7 +28,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float
 
-from jaxtune import devices
+from jaxtune import conformal, devices
 from jaxtune import dist as dists
 from jaxtune.types import Coords, ParamDist, Trajectory
 
@@ -134,9 +134,34 @@ def estimate(
     lean = simulated.replace(state={name: simulated.state[name] for name in measured.state})
     every = jax.tree.map(lambda sets, one: jnp.concatenate([sets, one[None]]), lean, measured)
     pieces = jax.vmap(lambda episodes: _cut(config, replay, episodes))(every)
-    truth, names = dists.normalise(dist, truth), dists.names(dist)
+    truth = dists.normalise(dist, truth)
+    fits = _fit(config, replay, pieces, truth, dist)
+    error = fits.best[:-1] - truth
+    deviations = jax.vmap(lambda normal: jnp.sqrt(jnp.diag(jnp.linalg.inv(normal))))(fits.normal)
+    # Slopes that jump make some standard errors far too small.
+    deviations = jnp.hypot(deviations, jnp.maximum(jnp.median(jnp.abs(error), axis=0), _CLOSEST))
+    scaled = (jnp.abs(error) / deviations[:-1]).max(axis=-1)
+    logs = jnp.where(pieces.valid, jnp.log1p(fits.energy), 0.0).sum(axis=-1)
+    return Replayed(
+        estimate=fits.best[-1],
+        interval=deviations[-1] * conformal.quantile(scaled, coverage),
+        errors=error.T @ error / len(error),
+        p_value=conformal.p_value(logs / jnp.maximum(pieces.valid.sum(axis=-1), 1)),
+    )
+
+
+def _fit(config: ReplayConfig, replay: Replay, pieces: _Pieces, truth: jax.Array, dist: ParamDist) -> _Fit:
+    """Fits the pieces of all sets, each set by itself and all side by side.
+
+    Args:
+      config: sizes.
+      replay: simulates pieces.
+      pieces: of the simulated sets and, last, of the measured one, [sets + 1, pieces, ...].
+      truth: [sets, coords] of the simulated ones, in radii.
+      dist: whose radii and bounds are meant.
+    """
+    names, (count, coords) = dists.names(dist), truth.shape
     low, high = (dists.normalise(dist, end) for end in (dist.lower, dist.upper))
-    count, coords = len(truth), truth.shape[-1]
 
     def misses(centre, radius, pieces: _Pieces, points: Float[Array, "points coords"]) -> jax.Array:
         def piece(point, start, action, end):
@@ -152,7 +177,7 @@ def estimate(
         whitening, fits = carry
         tried = jax.vmap(lambda fit: jnp.clip(fit.best + fit.step, low, high))(fits)
         secants = jax.vmap(lambda fit, trial: _secants(fit, trial, low, high))(fits, tried)
-        around = tried[:, None] + jnp.concatenate([jnp.zeros_like(secants[:, :1]), secants], axis=1)
+        around = tried[:, None] + jnp.concatenate([jnp.zeros((1, coords)), jnp.eye(coords)]) * secants[:, None]
         points = jnp.where(number == 0, probes, around)
         left = devices.in_chunks(
             misses, (pieces, points), _SETS, shared=(dists.ravel(dist.centre), dists.ravel(dist.radius))
@@ -161,7 +186,7 @@ def estimate(
         whitening = jax.lax.cond(number == 0, learn, lambda: whitening)
         white = left / whitening.size @ whitening.inverse.T
         white = jnp.where(jnp.isfinite(white).all(axis=-1, keepdims=True), white, _BROKEN)
-        better = jax.vmap(_improved)(fits, tried, jnp.diagonal(secants, axis1=1, axis2=2), white, pieces.valid)
+        better = jax.vmap(_improved)(fits, tried, secants, white, pieces.valid)
         return (whitening, optax.tree.where(number == 0, fits, better)), None
 
     probes = jnp.zeros((count + 1, coords + 1, coords)).at[:-1, 1].set(truth)
@@ -174,20 +199,7 @@ def estimate(
     size = pieces.end.shape[-1]
     start = _Whitening(size=jnp.ones(size), inverse=jnp.eye(size)), fits
     (_, fits), _ = jax.lax.scan(improve, start, jnp.arange(config.iterations + 2))
-    error = fits.best[:-1] - truth
-    deviations = jax.vmap(lambda normal: jnp.sqrt(jnp.diag(jnp.linalg.inv(normal))))(fits.normal)
-    # Slopes that jump make some standard errors far too small.
-    deviations = jnp.hypot(deviations, jnp.maximum(jnp.median(jnp.abs(error), axis=0), _CLOSEST))
-    scaled = (jnp.abs(error) / deviations[:-1]).max(axis=-1)
-    rank = jnp.ceil((count + 1) * coverage).astype(int) - 1
-    logs = jnp.where(pieces.valid, jnp.log1p(fits.energy), 0.0).sum(axis=-1)
-    misfit = logs / jnp.maximum(pieces.valid.sum(axis=-1), 1)
-    return Replayed(
-        estimate=fits.best[-1],
-        interval=deviations[-1] * jnp.sort(scaled)[jnp.minimum(rank, count - 1)],
-        errors=error.T @ error / count,
-        p_value=(1 + jnp.sum(misfit[:-1] >= misfit[-1])) / (count + 1),
-    )
+    return fits
 
 
 def _cut(config: ReplayConfig, replay: Replay, episodes: Trajectory) -> _Pieces:
@@ -231,10 +243,10 @@ def _whitening(centre: jax.Array, truth: jax.Array, valid: jax.Array) -> _Whiten
 
 
 def _secants(fit: _Fit, trial: jax.Array, low: jax.Array, high: jax.Array) -> jax.Array:
-    """Secants [coords, coords] from a point, along one coordinate each: as long as the last step, and onwards."""
+    """How far secants go from a point along each coordinate, [coords]: as far as the last step, and onwards."""
     size = jnp.where(jnp.isfinite(fit.energy).all(), jnp.clip(jnp.abs(fit.step), _SHORTEST, _SECANT), _SECANT)
     size = jnp.where(fit.step < 0, -size, size)
-    return jnp.diag(jnp.where((trial + size < low) | (trial + size > high), -size, size))
+    return jnp.where((trial + size < low) | (trial + size > high), -size, size)
 
 
 def _improved(fit: _Fit, trial: jax.Array, secants: jax.Array, white: jax.Array, valid: jax.Array) -> _Fit:

@@ -28,7 +28,7 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from jaxtune import devices, dvm, regression, spm, surface, windows
+from jaxtune import conformal, devices, dvm, regression, spm, surface, windows
 from jaxtune import dist as dists
 from jaxtune.dvm import DVMConfig
 from jaxtune.regression import RegressionConfig
@@ -245,8 +245,8 @@ def calibrated_gate(
     enough = fixed | (usable[:-1].sum() >= jnp.floor(needed + 0.5))
     return GateInfo(
         novelty=value,
-        threshold=jnp.where(fixed, knobs.threshold, _conformal_quantile(calibration, knobs.level)),
-        p_value=_p_value(every),
+        threshold=jnp.where(fixed, knobs.threshold, conformal.quantile(calibration, knobs.level)),
+        p_value=conformal.p_value(every),
         comparable=usable[-1] & enough & _moves(measured) & ~_copied(measured, collected),
         uncovered=jnp.sum(valid[-1] & ~covered[-1]) / jnp.maximum(valid[-1].sum(), 1),
         elbo=elbo,
@@ -331,12 +331,6 @@ def _excess(name: str, values: jax.Array) -> jax.Array:
     return (values - median) / jnp.maximum(high - median, _LEAST_SPREAD[name])
 
 
-def _p_value(scores: jax.Array) -> jax.Array:
-    """The conformal p-value of the last score among all [sets + 1]; nan where it is."""
-    p_value = (1 + jnp.sum(scores[:-1] >= scores[-1])) / len(scores)
-    return jnp.where(jnp.isnan(scores[-1]), jnp.nan, p_value)
-
-
 def _moves(episodes: Trajectory) -> jax.Array:
     """Tells whether any observation changes within the living steps of an episode."""
     first = episodes.obs[:, :1]
@@ -348,16 +342,6 @@ def _copied(measured: Trajectory, collected: Collected) -> jax.Array:
     """Tells whether measured episodes are copies of one, where simulated episodes of one robot differ."""
     same = lambda obs: (obs == obs[:1]).all()  # noqa: E731
     return (len(measured.obs) > 1) & same(measured.obs) & ~jax.vmap(same)(collected.held_out.obs).any()
-
-
-def _conformal_quantile(values: jax.Array, level: jax.Array | float) -> jax.Array:
-    """Computes a bound that one more draw like `values` [n, ...] exceeds with probability at most `1 - level`.
-
-    It is the ceil((n + 1) level)-th smallest value. The guarantee needs n of at least `level / (1 - level)`; with
-    fewer, the largest value is returned.
-    """
-    rank = jnp.ceil((len(values) + 1) * level).astype(int) - 1
-    return jnp.sort(values, axis=0)[jnp.minimum(rank, len(values) - 1)]
 
 
 def vote_update(
@@ -421,9 +405,9 @@ def posterior_update(
     error = jnp.abs(held_out - truth)
     # What scales the errors must not come from the sets that calibrate them.
     scale = jnp.maximum(model.error, _LEAST_ERROR)
-    interval = scale * _conformal_quantile((error / scale).max(axis=-1), config.coverage)
-    ignorant = _conformal_quantile(jnp.abs((low + high) / 2 - truth), config.coverage)
-    identifiable = _conformal_quantile(error, config.coverage) < _IDENTIFIABLE * ignorant
+    interval = scale * conformal.quantile((error / scale).max(axis=-1), config.coverage)
+    ignorant = conformal.quantile(jnp.abs((low + high) / 2 - truth), config.coverage)
+    identifiable = conformal.quantile(error, config.coverage) < _IDENTIFIABLE * ignorant
     step = jnp.where(identifiable, estimate, 0.0)
     moved = dists.move(dist, step)
     radius = dists.ravel(dist.radius)
@@ -443,8 +427,8 @@ def posterior_update(
         interval=interval,
         identifiable=identifiable,
         loss=model.error.mean(),
-        p_value=_p_value(jnp.fmax(excess["misfit"], excess["beyond"])),
-        p_misfit=_p_value(excess["misfit"]),
+        p_value=conformal.p_value(jnp.fmax(excess["misfit"], excess["beyond"])),
+        p_misfit=conformal.p_value(excess["misfit"]),
         errors=(held_out - truth).T @ (held_out - truth) / len(truth),
     )
 

@@ -193,8 +193,9 @@ def _fit_null_logs(problem: Problem, prior: Free) -> tuple[np.ndarray, np.ndarra
         raw = raw.reshape(logs, -1, *raw.shape[1:])
         if known is not None:
             # A step may break the simulation of a log, which then stays where it was.
-            broken = ~np.isfinite(raw).all(axis=tuple(range(1, raw.ndim)))
-            raw, coordinates = np.where(_each(broken, raw), known, raw), np.where(broken[:, None], last, coordinates)
+            broken = ~np.isfinite(raw).all(axis=(1, 2, 3))
+            raw = np.where(broken[:, None, None, None], known, raw)
+            coordinates = np.where(broken[:, None], last, coordinates)
         # What broke in the nominal model already says nothing.
         raw = np.where(np.isfinite(raw), raw, 0.0)
         last, known = coordinates, raw
@@ -212,18 +213,13 @@ def _fit_null_logs(problem: Problem, prior: Free) -> tuple[np.ndarray, np.ndarra
     return coordinates, unit
 
 
-def _each(logs: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Spreads what is said of every log [logs] over the dimensions of values [logs, ...]."""
-    return logs.reshape(-1, *[1] * (values.ndim - 1))
-
-
 def _finite(left: np.ndarray) -> np.ndarray:
-    """Tells which null logs [logs, ...] their own models simulate: one that breaks a simulation decides nothing.
+    """Tells which null logs [logs, segments, bins, components] decide: those that their own models simulate.
 
     Raises:
       ValueError: fewer than two.
     """
-    found = np.isfinite(left).all(axis=tuple(range(1, left.ndim)))
+    found = np.isfinite(left).all(axis=(1, 2, 3))
     if found.sum() < 2:
         raise ValueError(
             f"null logs: got {found.sum()} of {len(left)} that the nominal model simulates with finite values, "

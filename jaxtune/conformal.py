@@ -1,0 +1,20 @@
+"""What held-out sets say of one more: conformal quantiles and p-values (Vovk, Gammerman and Shafer, 2005)."""
+
+import jax
+import jax.numpy as jnp
+
+
+def p_value(scores: jax.Array) -> jax.Array:
+    """The conformal p-value of the last score among all [sets + 1]; nan where it is."""
+    p_value = (1 + jnp.sum(scores[:-1] >= scores[-1])) / len(scores)
+    return jnp.where(jnp.isnan(scores[-1]), jnp.nan, p_value)
+
+
+def quantile(values: jax.Array, level: jax.Array | float) -> jax.Array:
+    """Computes a bound that one more draw like `values` [n, ...] exceeds with probability at most `1 - level`.
+
+    It is the ceil((n + 1) level)-th smallest value. The guarantee needs n of at least `level / (1 - level)`; with
+    fewer, the largest value is returned.
+    """
+    rank = jnp.ceil((len(values) + 1) * level).astype(int) - 1
+    return jnp.sort(values, axis=0)[jnp.minimum(rank, len(values) - 1)]
