@@ -113,6 +113,10 @@ class Tuning:
     """Conformal p-value of misfit and reach in the distribution that was read last."""
     misfit_p_value: float | None
     """That of misfit alone; at most 0.01 where the verdict is `unexplained`."""
+    replay_p_value: float | None
+    """Conformal p-value of misfit from measured states; None where a log does not hold them."""
+    replayed: bool
+    """Whether the estimate was found from measured states."""
     measured_falls: int
     """Number of falls in the part of the walks that was compared."""
     not_finite: int

@@ -131,6 +131,8 @@ def line(verdicts, measured, predicted, explained=0.5, cut_short=0, suspected=()
         "update_loss": 0.1,
         "fit_p_value": 0.4,
         "misfit_p_value": 0.5,
+        "replay_p_value": None,
+        "replayed": False,
         "measured_falls": 0,
         "not_finite": 0,
     }
