@@ -54,6 +54,12 @@ def clock(phase: jax.Array) -> jax.Array:
     return jnp.stack([jnp.sin(angle), jnp.cos(angle)], axis=-1).reshape(-1)
 
 
+def phase(obs: jax.Array) -> jax.Array:
+    """Reads the left foot's phase from observations [..., 40]: cycles, from 0 to 1."""
+    sine, cosine = obs[..., 36], obs[..., 37]
+    return jnp.mod(jnp.arctan2(sine, cosine) / (2.0 * jnp.pi), 1.0)
+
+
 def observe(
     *,
     velocity: jax.Array,

@@ -13,6 +13,7 @@ from experiments.common.cli import bars, console, run
 from experiments.discovery import gate, report
 from experiments.discovery.investigate import investigate
 from experiments.discovery.setup import read_logs
+from jaxtune.discovery.workflow import share_done
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,7 +61,13 @@ def main(args: Args) -> None:
     identity = {name: value for name, value in vars(args).items() if name not in ("out", "trust_log")}
     checkpoint.open_run(args.out, identity | {"logs": [str(path) for path in args.logs]})
     with checkpoint.lock(args.out / "summary.json"), bars() as progress:
-        task = progress.add_task("simulating null logs", total=None)
+        task = progress.add_task("simulating null logs", total=100)
+
+        def follow(line: str) -> None:
+            now = progress.tasks[task].completed
+            # A second effect repeats stages; the bar waits there.
+            progress.update(task, description=line[:100], completed=max(now, round(100 * (share_done(line) or 0.0))))
+
         answer = investigate(
             args.logs,
             args.out,
@@ -70,8 +77,9 @@ def main(args: Args) -> None:
             clear_flags=args.clear_flags,
             swap_halves=args.swap_halves,
             robot=args.robot,
-            say=lambda text: progress.update(task, description=text[:100]),
+            say=follow,
         )
+        progress.update(task, completed=100)
     report.show(console, answer.question, answer.summary, answer.free)
     report.write(args.out / "report.html", answer.log, answer.question, answer.result, answer.summary, answer.free)
 

@@ -24,7 +24,8 @@ import jax
 import numpy as np
 
 from jaxtune.checks import check_measured, check_set
-from jaxtune.rules import TunerConfig, Update, Verify, calibrated_gate, misfits, posterior_update
+from jaxtune.misfits import Misfits, Phase, misfits, share_of_episode
+from jaxtune.rules import TunerConfig, Update, Verify, calibrated_gate, posterior_update
 from jaxtune.tuner import Info, Measure, TrainPolicy, Tuner, TunerState, counted, keep, make_info
 from jaxtune.types import Trajectory, Verdict
 
@@ -58,7 +59,7 @@ class HostTuner:
     Attributes:
       config: sizes.
       simulate: simulates episodes of robots with given coordinates (`HostSimulate`).
-      train_policy, measure, verify, update: as in `Tuner`; the first two may be any Python as well.
+      train_policy, measure, verify, update, phase: as in `Tuner`; the first two may be any Python as well.
     """
 
     config: TunerConfig
@@ -67,6 +68,7 @@ class HostTuner:
     measure: Measure | None = None
     verify: Verify = calibrated_gate
     update: Update = posterior_update
+    phase: Phase = share_of_episode
 
     # The tuner's own functions; `step` calls the `tune` of this class.
     init, train, step = Tuner.init, Tuner.train, Tuner.step
@@ -100,8 +102,8 @@ class HostTuner:
                 carry = self._refine(carry, *updated, state.knobs)
         return state.replace(dist=carry["dist"]), make_info(carry, measured)
 
-    def misfits(self, key: jax.Array, state: TunerState, measured: Trajectory) -> jax.Array:
-        """Says which observations and actions no parameters explain, as `Tuner.misfits` does."""
+    def misfits(self, key: jax.Array, state: TunerState, measured: Trajectory) -> Misfits:
+        """Says which observations and actions no parameters explain, and in which phase, as `Tuner.misfits` does."""
         return self._misfits(self._tuner.collect(key, state.policy, state.dist), measured)
 
     @cached_property
@@ -121,7 +123,7 @@ class HostTuner:
 
     @cached_property
     def _misfits(self):
-        return jax.jit(partial(misfits, self.config))
+        return jax.jit(partial(misfits, self.config, phase=self.phase))
 
     @cached_property
     def _refine(self):

@@ -28,7 +28,7 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from jaxtune import conformal, devices, dvm, regression, spm, surface, windows
+from jaxtune import conformal, devices, dvm, regression, spm, surface
 from jaxtune import dist as dists
 from jaxtune.dvm import DVMConfig
 from jaxtune.regression import RegressionConfig
@@ -39,10 +39,12 @@ from jaxtune.types import ParamDist, Trajectory
 # An interval counts as informative if it is narrower than this share of the interval that ignores the data. The share
 # is below 1 because both are quantiles over a few dozen sets and differ by chance.
 _IDENTIFIABLE = 0.9
-_LEAST_ERROR = 1e-4  # radii; without noise a regression may be exact
 # Least distance of median and 0.9-quantile of each statistic, where all simulated sets are alike.
 _LEAST_SPREAD = {"cover": 0.02, "lost": 0.1, "misfit": 0.05, "beyond": 0.1}
 _SAME = 1e-6  # of an observation's size: it does not change
+LEAST_ERROR = 1e-4
+"""Radii; without noise a regression may be exact."""
+
 SETS = {"cpu": 1, "other": 64}
 """Held-out sets that are scored side by side on a device (`devices.in_chunks`)."""
 
@@ -231,7 +233,7 @@ def calibrated_gate(
       observation ever changes.
     """
     model, elbo = dvm.train(key, config.dvm, collected.trajectory)
-    novelty, valid, covered = _of_all_sets(partial(dvm.novelty, config.dvm), (model,), collected, measured)
+    novelty, valid, covered = of_all_sets(partial(dvm.novelty, config.dvm), (model,), collected, measured)
     sane = jnp.isfinite(jnp.where(valid, novelty, 0.0)).all(axis=-1)
     cover = _mean_ranks(jnp.where(covered, novelty, jnp.inf), valid)
     alive = jnp.concatenate([collected.held_out.alive, measured.alive[None]]).mean(axis=(1, 2))
@@ -254,13 +256,13 @@ def calibrated_gate(
     )
 
 
-def _of_all_sets(function: Callable, shared: tuple, collected: Collected, measured: Trajectory):
+def of_all_sets(function: Callable, shared: tuple, collected: Collected, measured: Trajectory):
     """What a function `(*shared, set)` returns for every held-out set and, last, for the measured one."""
     held_out = devices.in_chunks(function, (collected.held_out,), SETS, shared=shared)
     return jax.tree.map(lambda sets, one: jnp.concatenate([sets, one[None]]), held_out, function(*shared, measured))
 
 
-def _fit(config: TunerConfig, collected: Collected) -> tuple[regression.Regression, surface.Surface]:
+def fit(config: TunerConfig, collected: Collected) -> tuple[regression.Regression, surface.Surface]:
     """Fits the regression to D_q, and the way back."""
     model = regression.train(config.regression, collected.trajectory, collected.sampled_coords, collected.dist)
     return model, surface.train(model)
@@ -285,8 +287,8 @@ def _examined(
       The regression; estimates [sets + 1, coords] in radii, which may lie beyond the box; and `misfit` and `beyond`
       [sets + 1] by name, nan for a set without a valid window. The measured set is the last.
     """
-    model, ways = _fit(config, collected)
-    scale = jnp.maximum(model.error, _LEAST_ERROR)
+    model, ways = fit(config, collected)
+    scale = jnp.maximum(model.error, LEAST_ERROR)
 
     def one(model, ways, scale, episodes):
         answer, moments, count = regression.answers(config.regression, model, episodes)
@@ -295,34 +297,8 @@ def _examined(
         known = count > 0
         return answer, jnp.where(known, jnp.log(jnp.maximum(off, 1e-9)), jnp.nan), jnp.where(known, beyond, jnp.nan)
 
-    answers, misfit, beyond = _of_all_sets(one, (model, ways, scale), collected, measured)
+    answers, misfit, beyond = of_all_sets(one, (model, ways, scale), collected, measured)
     return model, answers, {"misfit": misfit, "beyond": beyond}
-
-
-def misfits(config: TunerConfig, collected: Collected, measured: Trajectory) -> jax.Array:
-    """Says which observations and actions no coordinates explain.
-
-    Args:
-      config: sizes.
-      collected: D_q and held-out sets of one distribution.
-      measured: the measured set, [set_episodes, time].
-
-    Returns:
-      [obs + act] for every channel the rms of what the response surface leaves of the moments that involve it, as a
-      multiple of the median over the held-out sets: 1 is usual.
-    """
-    model, ways = _fit(config, collected)
-    involved = windows.involved(measured.obs.shape[-1] + measured.action.shape[-1]) * model.varies
-    scatter = jnp.sqrt(jnp.mean(ways.residual**2, axis=0))
-    weight = jnp.where(model.varies > 0, 1.0 / jnp.maximum(scatter, _LEAST_ERROR), 0.0)
-
-    def one(model, ways, involved, weight, episodes):
-        answer, moments, _ = regression.answers(config.regression, model, episodes)
-        rest = weight * surface.unexplained(ways, moments, jnp.clip(answer, model.low, model.high))
-        return jnp.sqrt(involved @ rest**2 / jnp.maximum(involved.sum(axis=1), 1.0))
-
-    every = _of_all_sets(one, (model, ways, involved, weight), collected, measured)
-    return every[-1] / jnp.maximum(jnp.median(every[:-1], axis=0), _LEAST_ERROR)
 
 
 def _excess(name: str, values: jax.Array) -> jax.Array:
@@ -404,7 +380,7 @@ def posterior_update(
     truth = dists.normalise(dist, collected.held_out_coords)
     error = jnp.abs(held_out - truth)
     # What scales the errors must not come from the sets that calibrate them.
-    scale = jnp.maximum(model.error, _LEAST_ERROR)
+    scale = jnp.maximum(model.error, LEAST_ERROR)
     interval = scale * conformal.quantile((error / scale).max(axis=-1), config.coverage)
     ignorant = conformal.quantile(jnp.abs((low + high) / 2 - truth), config.coverage)
     identifiable = conformal.quantile(error, config.coverage) < _IDENTIFIABLE * ignorant

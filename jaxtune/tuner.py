@@ -84,6 +84,7 @@ from jaxtune import dist as dists
 from jaxtune import replay as replays
 from jaxtune.checks import check_measured, check_simulated, check_states
 from jaxtune.explain import explain
+from jaxtune.misfits import Misfits, Phase, misfits, share_of_episode
 from jaxtune.replay import Replay
 from jaxtune.rules import (
     Collected,
@@ -95,7 +96,6 @@ from jaxtune.rules import (
     Verify,
     calibrated_gate,
     knobs,
-    misfits,
     no_gate_log,
     no_update,
     posterior_update,
@@ -209,6 +209,8 @@ class Tuner:
       verify: scores a measured set against simulated ones (`rules.Verify`).
       update: moves the distribution after an accepted set (`rules.Update`).
       replay: simulates pieces of episodes from measured states (`jaxtune.replay`), for a last, more exact estimate.
+      phase: where in its cycle a step is, such as a gait's clock says; the share of its episode if not given. Only
+        `misfits` asks for it.
         Simulated and measured episodes must hold states then (`Trajectory.state`).
     """
 
@@ -219,6 +221,7 @@ class Tuner:
     verify: Verify = calibrated_gate
     update: Update = posterior_update
     replay: Replay | None = None
+    phase: Phase = share_of_episode
 
     def init(self, policy: Policy, dist: ParamDist, knobs: Knobs) -> TunerState:
         """Makes the state before the first tuning.
@@ -461,15 +464,12 @@ class Tuner:
             dist=dist,
         )
 
-    def misfits(self, key: jax.Array, state: TunerState, measured: Trajectory) -> jax.Array:
-        """Says which observations and actions no parameters explain (`rules.misfits`), after a set was rejected.
+    def misfits(self, key: jax.Array, state: TunerState, measured: Trajectory) -> Misfits:
+        """Says which observations and actions no parameters explain, and in which phase, after a set was rejected.
 
         It simulates anew, in the state's distribution.
-
-        Returns:
-          [obs + act] multiples of what is usual.
         """
-        return misfits(self.config, self.collect(key, state.policy, state.dist), measured)
+        return misfits(self.config, self.collect(key, state.policy, state.dist), measured, self.phase)
 
     def _verdict(self, gate: GateInfo, dist: ParamDist, calls: jax.Array) -> jax.Array:
         """Chooses the verdict of one gate call; the first condition that holds wins.

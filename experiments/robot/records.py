@@ -73,6 +73,16 @@ class Moved:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Misfit:
+    """How much of a signal no parameters explain, in multiples of what is usual."""
+
+    times: float
+    """Over the whole motion: `jaxtune.misfits.Misfits.channels`."""
+    phases: tuple[float | None, ...]
+    """Of its mean in each phase of the gait, from the beginning of the left foot's stance on."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Tuning:
     """What a round's tuning did: every call of the gate, the update, and the tuned simulator's own prediction."""
 
@@ -127,9 +137,8 @@ class Tuning:
     """Every parameter before and after."""
     compared_s: float
     """How many seconds of every walk were compared, from its start."""
-    misfits: dict[str, float]
-    """Signals that no parameters explain, the worst first, as multiples of what is usual; none unless the log was
-    rejected."""
+    misfits: dict[str, Misfit]
+    """Signals that no parameters explain, the worst first; none unless the log was rejected."""
     explained: Prediction
     """Prediction for the policy that walked, in the tuned simulator; it should agree with the measurement."""
 

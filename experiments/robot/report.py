@@ -64,6 +64,7 @@ def write(path: Path, history: Sequence[Round], terms: Terms) -> None:
         terms=terms,
         episodes=sum(one.measured.episodes for one in history),
         falls=sum(round(one.measured.episodes * one.measured.fall_rate) for one in history),
+        misfits=plots.embedded(plots.misfits(as_json(last.tuning.misfits))) if last.tuning.misfits else "",
         picture=plots.embedded(plots.rounds(as_json(list(history)))),
     )
     path.write_text(page)

@@ -32,7 +32,7 @@ from experiments.robot import policy_files
 from experiments.robot.checks import check_meaning, check_runs
 from experiments.robot.exchange import request, wait
 from experiments.robot.fall_risk import fall_risk, summarise_log
-from experiments.robot.records import Measured, Moved, Prediction, Round, Suspicion, Tuning
+from experiments.robot.records import Measured, Misfit, Moved, Prediction, Round, Suspicion, Tuning
 from experiments.walking.learner import Learner, Policy
 from experiments.walking.policies import policy_config
 from jaxtune import baselines, devices, tuner
@@ -253,15 +253,16 @@ class Rounds:
         # Written last, because a round with this file counts as learnt.
         write_json(place / "tuning.json", tuning)
 
-    def _misfits(self, index: int, state: TunerState, measured: Trajectory, info: tuner.Info) -> dict[str, float]:
+    def _misfits(self, index: int, state: TunerState, measured: Trajectory, info: tuner.Info) -> dict[str, Misfit]:
         """The signals that no parameters explain, the worst first; none unless the set was rejected."""
         rejected = (Verdict.UNEXPLAINED, Verdict.RADIUS_EXHAUSTED)
         if info.calls == 0 or info.verdicts[int(info.calls) - 1] not in rejected:
             return {}
         found = self._programs.misfits(self._key(index, 4), state, measured)
         names = self._learner.channels()
-        order = sorted(range(len(names)), key=lambda channel: -float(found[channel]))
-        return {names[channel]: float(found[channel]) for channel in order[:_WORST]}
+        times, phases = found.channels.tolist(), found.phases.T.tolist()
+        order = sorted(range(len(names)), key=lambda channel: -times[channel])
+        return {names[i]: Misfit(times=times[i], phases=tuple(phases[i])) for i in order[:_WORST]}
 
 
 def _read(kind: type, path: Path):

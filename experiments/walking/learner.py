@@ -246,6 +246,7 @@ class Learner:
             simulate=self.simulate,
             measure=target and (lambda key, policy: target.episodes(key, self.act(policy), count, steps, self.states)),
             replay=mjx.replay(self.robot, self.entries) if self.states else None,
+            phase=self.kind.phase,
         )
 
     def channels(self) -> list[str]:

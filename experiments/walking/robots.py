@@ -18,7 +18,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from envs import corrected, go2
+from envs import corrected, go2, sensing
 from envs.biteno import constants, gait, onboard, walks
 from envs.corrected import Correction
 from envs.diagnosis import Finding, diagnose_log, shared_findings
@@ -29,6 +29,7 @@ from envs.targets.protocol import Target
 from envs.targets.recorded import Recorded
 from experiments.common.config import WALK, Preset
 from experiments.walking.targets import TARGETS
+from jaxtune.misfits import Phase, share_of_episode
 from jaxtune.mjx import Entry, Robot, Simulator, model_of, parameters_of, select
 
 _IMPLEMENTATIONS = {"playground": "jax", "playground-warp": "warp"}  # of MJX, for environments of Playground
@@ -61,6 +62,8 @@ class Kind:
     """Makes episodes of as many control steps of a log."""
     findings: Callable[[Log], list[tuple[Finding, list[str]]]]
     """What the log doctor suspects, with the names of the runs that share it."""
+    phase: Phase = share_of_episode
+    """Where in its gait's cycle a step is."""
     trained: Callable[[Preset], Preset] = lambda preset: preset
     """Changes the preset of the robots that a policy trains on."""
     config: Callable[[Preset], dict] = lambda preset: {}
@@ -212,6 +215,7 @@ BITENO = Kind(
     engines=TARGETS,
     control_s=constants.POLICY_DT_S,
     power=lambda motion: gait.power(motion.torque, motion.qvel[6:]),
+    phase=lambda episodes: sensing.phase(episodes.obs),
     trained=lambda preset: replace(preset, task=replace(preset.task, push_mps=preset.push_mps)),
     config=lambda preset: {"base": preset.task.base, "action_scale": preset.task.action_scale},
     meta=lambda preset, robot: onboard.meta(preset.task),

@@ -22,6 +22,32 @@ Save = Callable[[dict[str, Any]], None]
 """Given the state after every step, as numbers, texts, lists and dictionaries of them."""
 
 
+# Share of a discovery's time that is over when a stage begins: six joints, six runs of 3 s, one effect.
+_STAGES = {
+    "noise floor": 0.0,
+    "null": 0.34,
+    "screen": 0.41,
+    "answers of": 0.58,
+    "fit": 0.63,
+    "evidence": 0.89,
+    "learned torque": 0.93,
+    "proof": 0.96,
+}
+
+
+def share_done(line: str) -> float | None:
+    """Estimates how much of a discovery is over, from what it says; a foretold time that is left needs it.
+
+    Args:
+      line: what `Say` received.
+
+    Returns:
+      Share of the whole time, from 0 to 1, where one effect is missing and named; None for a line that begins no stage.
+      Every further effect repeats the stages from `screen` to `fit`.
+    """
+    return next((share for stage, share in _STAGES.items() if line.startswith(stage)), None)
+
+
 def discover(
     problem: Problem,
     settings: Settings = DEFAULTS,

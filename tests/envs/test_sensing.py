@@ -51,6 +51,7 @@ def test_observation_index_by_index():
 
 def test_another_request_changes_its_channels_alone():
     obs = sensing.with_command(jnp.array(OBSERVATION), jnp.array([-0.4, 0.2, -0.6]), jnp.array([0.5, 0.75]))
+    np.testing.assert_allclose(sensing.phase(obs), 0.5, atol=1e-6)
     # Twice, twice and a quarter; sine and cosine of half a turn and of three quarters.
     clock = [0.0, -1.0, -1.0, 0.0]
     np.testing.assert_allclose(obs, [*OBSERVATION[:3], -0.8, 0.4, -0.15, *OBSERVATION[6:36], *clock], atol=1e-6)

@@ -110,6 +110,7 @@ def test_a_log_that_never_rests_is_refused(tmp_path, monkeypatch):
     assert len(looks) == 66
 
 
+MISFIT = {"times": 4.2, "phases": [1.0, None, 5.0]}
 EXCESSES = ("cover", "lost", "misfit", "beyond")
 
 
@@ -127,7 +128,9 @@ def line(verdicts, measured, predicted, explained=0.5, cut_short=0, suspected=()
         "step": {},
         "interval": {},
         "training": {},
-        "misfits": {} if verdicts and verdicts[-1] == "accept" else {"gyro[1]": 4.2},
+        "misfits": {}
+        if verdicts and verdicts[-1] == "accept"
+        else {"gyro[1]": {"times": 4.2, "phases": [1.0, None, 5.0]}},
         "update_loss": 0.1,
         "fit_p_value": 0.4,
         "misfit_p_value": 0.5,
@@ -229,9 +232,12 @@ def test_the_page_says_what_matters_and_runs_nothing_of_the_log(tmp_path):
     assert "0.800 to 1.000" in text
     assert "should not walk again" in text
     assert "experiments.discover" not in text
+    assert "by signal and phase" not in text
     report.write(page, [one, line(["unexplained"], 0.4, 0.1)], replace(TERMS, max_fall_rate=0.4))
     text = page.read_text()
     assert "experiments.excite" in text
+    assert "gyro[1] 4.2" in text
+    assert text.count('<img src="data:image/png') == 2
     assert "experiments.discover" in text
     assert "may walk again" in text
     assert "So far it has walked 10 times,\nand 4 of these walks ended in a fall" in text

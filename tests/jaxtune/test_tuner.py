@@ -13,6 +13,7 @@ import toys
 from jaxtune import baselines, dvm, explain, rules, spm
 from jaxtune import dist as dists
 from jaxtune import tuner as tuners
+from jaxtune.misfits import PHASES
 from jaxtune.tuner import GateInfo, Tuner, UpdateInfo, knobs
 from jaxtune.types import Trajectory, Verdict
 
@@ -426,12 +427,36 @@ def test_the_signal_that_no_parameters_explain_is_said(channel):
     misfits = jax.jit(tuner.misfits)
     state = start(tuner)
     sets = SLIDER.measure({"friction": 0.1, "mass": -0.1}, 3)(jax.random.key(1), toys.policy())
-    usual = misfits(jax.random.key(0), state, sets)
+    usual = misfits(jax.random.key(0), state, sets).channels
     # A sensor that is off by a fifth of what it reads at most.
-    wrong = misfits(jax.random.key(0), state, sets.replace(obs=sets.obs.at[..., channel].add(0.1)))
+    wrong = misfits(jax.random.key(0), state, sets.replace(obs=sets.obs.at[..., channel].add(0.1))).channels
     assert np.all(usual < 2.5)
     assert np.argmax(wrong) == channel
     assert wrong[channel] > 2.0 * usual[channel]
+
+
+def test_the_phase_that_no_parameters_explain_is_said():
+    # A clock of two cycles an episode that begins elsewhere in each, as a gait's does.
+    phase = lambda episodes: jnp.mod(episodes.obs[..., 2], 1.0)  # noqa: E731
+
+    def with_clock(episodes):
+        count, steps = episodes.alive.shape
+        clock = jnp.arange(count)[:, None] / count + 2.0 * jnp.arange(steps) / steps
+        return episodes.replace(obs=jnp.concatenate([episodes.obs, clock[..., None]], axis=-1))
+
+    simulate = lambda *args: with_clock(SLIDER.simulate(*args))  # noqa: E731
+    tuner = Tuner(config=toys.TUNER, train_policy=toys.train_policy, simulate=simulate, phase=phase)
+    misfits = jax.jit(tuner.misfits)
+    sets = with_clock(SLIDER.measure({"friction": 0.1, "mass": -0.1}, 3)(jax.random.key(1), toys.policy()))
+    usual = misfits(jax.random.key(0), start(tuner), sets).phases
+    in_third = (jnp.floor(PHASES * phase(sets)) == 2)[..., None] * jnp.array([0.1, 0.0, 0.0])
+    wrong = misfits(jax.random.key(0), start(tuner), sets.replace(obs=sets.obs + in_third)).phases
+    assert usual.shape == wrong.shape == (PHASES, 4)
+    assert np.argmax(wrong[:, 0]) == 2
+    assert wrong[2, 0] > 3.0 * np.max(usual[:, 0])
+    # An episode that ends before a phase says nothing of it.
+    short = sets.replace(alive=sets.alive & (jnp.arange(sets.alive.shape[1]) < 3))
+    assert np.isnan(misfits(jax.random.key(0), start(tuner), short).phases).any()
 
 
 def test_a_set_far_from_everything_is_novel(gate):

@@ -5,7 +5,7 @@ Functions that take a `path` write the file. The others return a figure, which `
 
 from experiments.common.plots.base import embedded
 from experiments.common.plots.discovery import accepted_terms, confusion, heat_map, suspicions, traces
-from experiments.common.plots.tuning import power, recovery, rounds, sim2sim, sweep, training, transfer
+from experiments.common.plots.tuning import misfits, power, recovery, rounds, sim2sim, sweep, training, transfer
 from experiments.common.plots.walking import gait, gaps
 
 __all__ = [
@@ -15,6 +15,7 @@ __all__ = [
     "gait",
     "gaps",
     "heat_map",
+    "misfits",
     "power",
     "recovery",
     "rounds",

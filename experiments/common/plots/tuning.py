@@ -144,6 +144,21 @@ def sweep(path: Path, grid: np.ndarray, rows: Sequence[str], columns: Sequence[s
     save(figure, path)
 
 
+def misfits(found: Mapping[str, dict]) -> plt.Figure:
+    """Draws what no parameters explain of each signal in each phase of the motion; bright is much.
+
+    Args:
+      found: `times` and `phases` by signal, as `tuning.json` has them.
+    """
+    values = np.array([one["phases"] for one in found.values()], float)
+    figure, axis = plt.subplots(figsize=(6, 1.0 + 0.4 * len(found)), layout="constrained")
+    ends = (0.0, 1.0, len(found) - 0.5, -0.5)
+    drawn = axis.imshow(values, aspect="auto", extent=ends, vmin=0.0, vmax=max(3.0, np.nanmax(values)), cmap="viridis")
+    axis.set(yticks=range(len(found)), yticklabels=list(found), xlabel="phase, cycles")
+    figure.colorbar(drawn, label="misfit, 1 is usual")
+    return figure
+
+
 def rounds(history: Sequence[dict]) -> plt.Figure:
     """Draws a robot's rounds: predicted and measured return, falls and power, and every parameter with its interval.
 

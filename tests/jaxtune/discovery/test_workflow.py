@@ -16,8 +16,8 @@ from jaxtune.discovery.result import AcceptedTerm, Settings
 from jaxtune.discovery.screen import Lead
 
 
-def discover(truth, seed=0, **kwargs):
-    return workflow.discover(problem(truth, seed, **kwargs))
+def discover(truth, seed=0, say=lambda line: None, **kwargs):
+    return workflow.discover(problem(truth, seed, **kwargs), say=say)
 
 
 def measured_floor(asked):
@@ -52,6 +52,18 @@ def test_a_parameter_far_from_its_prior_is_a_change_and_not_an_effect():
     assert result.verdict == "parameter_change"
     assert {term.hypothesis.name for term in result.terms} | {AXES[axis] for axis in result.changed} == {"damping"}
     assert result.fit.vector[AXES.index("damping")] == pytest.approx(1.5, abs=0.1)
+
+
+def test_every_stage_says_how_much_of_the_whole_is_over():
+    lines = []
+    discover({"coulomb": 0.5}, say=lines.append)
+    shares = [(line.split()[0], share) for line in lines if (share := workflow.share_done(line)) is not None]
+    assert {name for name, _ in shares} == {stage.split()[0] for stage in workflow._STAGES}
+    # Until the first effect has joined, and from the conclusion on, the bar goes up alone.
+    first = [share for _, share in shares[: [name for name, _ in shares].index("fit") + 1]]
+    last = [share for _, share in shares[-3:]]
+    assert [*first, *last] == sorted([*first, *last])
+    assert workflow.share_done("4602.3 before") is None
 
 
 def test_two_effects_are_named_one_after_the_other():
