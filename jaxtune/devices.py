@@ -17,7 +17,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
+from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec, Sharding, SingleDeviceSharding
 
 AXIS = "devices"
 """Name of the mesh's axis. A mesh of the user's own, with an axis of this name, does as well."""
@@ -138,12 +138,15 @@ def on_all(program: Callable[..., Any]) -> Callable[..., Any]:
 
     @wraps(program)
     def call(*args, **kwargs):
-        if len(jax.devices()) == 1 or not jax.sharding.get_abstract_mesh().empty:
+        if not jax.sharding.get_abstract_mesh().empty:
             return program(*args, **kwargs)
         here = mesh()
-        whole = NamedSharding(here, PartitionSpec())
-        # Arrays come from one device or, where an earlier call made them, from all: JAX would compile for each.
+        whole = NamedSharding(here, PartitionSpec()) if here.size > 1 else SingleDeviceSharding(jax.devices()[0])
+        # Arrays come from no device in particular, from one or, where an earlier call made them, from all: JAX would
+        # compile for each.
         args, kwargs = jax.tree.map(lambda leaf: _whole(leaf, whole), (args, kwargs))
+        if here.size == 1:
+            return program(*args, **kwargs)
         with jax.set_mesh(here):
             found = program(*args, **kwargs)
             if jax.process_count() == 1:
@@ -157,7 +160,7 @@ def on_all(program: Callable[..., Any]) -> Callable[..., Any]:
 _gathered = jax.jit(gather)
 
 
-def _whole(leaf: Any, sharding: NamedSharding) -> Any:
+def _whole(leaf: Any, sharding: Sharding) -> Any:
     """Puts an array on all devices; hosts that hold equal copies of it make one array of them."""
     if not isinstance(leaf, jax.Array):
         return leaf

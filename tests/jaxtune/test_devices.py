@@ -47,6 +47,15 @@ def test_without_a_mesh_there_is_one_device():
         assert devices.count() == 1
 
 
+def test_a_program_is_compiled_once_wherever_its_arrays_come_from():
+    program = jax.jit(lambda values: values + 1.0)
+    call = devices.on_all(program)
+    fresh = jax.numpy.zeros(3)
+    for values in (fresh, jax.device_put(fresh, jax.devices()[0]), call(fresh)):
+        call(values)
+    assert program._cache_size() == 1
+
+
 @pytest.mark.parametrize("count", [0, 1000])
 def test_a_mesh_has_as_many_devices_as_there_are(count):
     with pytest.raises(ValueError, match=f"devices: got {count}, expected 1 to"):
