@@ -35,6 +35,7 @@ def play():
     return sim, jax.jit(play, static_argnums=0)
 
 
+@pytest.mark.slow
 def test_it_stands_and_falls(play):
     _, run = play
     still = run(lambda obs: jnp.zeros(12))

@@ -33,6 +33,7 @@ def on_two(imports, options, environment, outs):
         end(process)
 
 
+@pytest.mark.slow
 def test_two_hosts_train_what_two_devices_train_and_one_of_them_writes(environment, tmp_path):
     first, other, alone = (tmp_path / name for name in ("first", "other", "alone"))
     options = ["--robot", ROBOT, "--preset", "smoke", "--updates", "6"]

@@ -159,6 +159,7 @@ def swept(trained, tmp_path):
 EXCESSES = ("novelty", "threshold", "cover", "lost", "misfit", "beyond")
 
 
+@pytest.mark.slow
 def test_a_lane_of_a_sweep_is_a_run_of_its_own(trained, swept):
     sizes, robot, entries, case = sweep.check(swept)
     learner = Learner(sizes, entries, kind=robot)

@@ -267,10 +267,10 @@ def answered(monkeypatch):
     monkeypatch.setattr(rounds, "wait", wait)
 
 
-def states(out, programs, index):
+def states(out, programs, index, method):
     """The state that a round begins with."""
     learner = programs.learner
-    like = programs.machines["ours"].init(
+    like = programs.machines[method].init(
         learner.init(jax.random.PRNGKey(0)), learner.dist(transfer.check(ARGS)[3], 0.2), rounds.tuner.knobs()
     )
     return checkpoint.load(out / f"round_{index:03d}" / "start", like, {})
@@ -280,9 +280,12 @@ class Stopped(Exception):
     """The run was killed."""
 
 
-def test_a_run_stopped_after_every_file_is_the_same_run(programs, answered, tmp_path, monkeypatch):
-    whole = transfer.play(replace(ARGS, out=tmp_path / "whole"), programs)
-    args = replace(ARGS, out=tmp_path / "stopped")
+# All but the tuning itself is the same for every method, and a round of dr takes less time.
+@pytest.mark.parametrize("method", ["dr", pytest.param("ours", marks=pytest.mark.slow)])
+def test_a_run_stopped_after_every_file_is_the_same_run(method, programs, answered, tmp_path, monkeypatch):
+    args = replace(ARGS, method=method)
+    whole = transfer.play(replace(args, out=tmp_path / "whole"), programs)
+    args = replace(args, out=tmp_path / "stopped")
     left = []
 
     def stopping(function):
@@ -309,7 +312,7 @@ def test_a_run_stopped_after_every_file_is_the_same_run(programs, answered, tmp_
     assert 7 <= stops < 39
     assert json.dumps(as_json(pieces)) == json.dumps(as_json(whole))
     for index in range(3):
-        one, other = (states(tmp_path / name, programs, index) for name in ("whole", "stopped"))
+        one, other = (states(tmp_path / name, programs, index, method) for name in ("whole", "stopped"))
         jax.tree.map(np.testing.assert_array_equal, one, other)
     assert (args.out / "round_001" / "report.html").exists()
     # And more rounds may be asked for later.

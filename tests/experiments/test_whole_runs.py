@@ -57,6 +57,7 @@ def test_whole_runs_are_simulated_to_their_ends_each_as_if_alone(asked):
         assert np.abs(positions[1] - positions[0]).max() > 0.02
 
 
+@pytest.mark.slow
 def test_the_deciding_motion_is_the_one_in_which_two_models_differ_most(asked):
     question, log = asked
     # A limit that slow motion does not reach decides in large steps.

@@ -1,7 +1,11 @@
-"""What one, two and four devices compute, as JSON; a process of its own, since devices are made once."""
+"""What one, two and four devices compute by the functions that are named, as JSON.
+
+It is a process of its own, since devices are made once.
+"""
 
 import json
 import os
+import sys
 
 os.environ["XLA_FLAGS"] = (
     "--xla_force_host_platform_device_count=4 --xla_backend_optimization_level=0 "
@@ -84,7 +88,7 @@ def pairs():
 
 
 found = {}
-for function in (episodes, update, tunings, lanes, pairs):
+for function in (globals()[name] for name in sys.argv[1:]):
     found[function.__name__] = [np.asarray(function(), float).ravel().tolist()]
     for count in (2, 4):
         with jax.set_mesh(devices.mesh(count)):

@@ -47,6 +47,7 @@ def test_a_gymnasium_environment_is_tuned(monkeypatch):
         assert abs(found[name] - truth) < abs(1.0 - truth) / 2
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::UserWarning", "ignore::DeprecationWarning")
 def test_a_brax_environment_is_tuned(monkeypatch):
     scope = run("brax.md", monkeypatch)
@@ -55,6 +56,7 @@ def test_a_brax_environment_is_tuned(monkeypatch):
     assert 1.0 < found["pole"]["value"] < 2.0
 
 
+@pytest.mark.slow
 def test_a_playground_environment_is_tuned(monkeypatch):
     pytest.importorskip("mujoco_playground", reason="needs the extra playground")
     scope = run("playground.md", monkeypatch)

@@ -863,7 +863,7 @@ def find():
     return find
 
 
-@pytest.mark.parametrize(("friction", "mass"), [(0.5, -0.5), (-0.5, 0.5)])
+@pytest.mark.parametrize(("friction", "mass"), [(0.5, -0.5), pytest.param(-0.5, 0.5, marks=pytest.mark.slow)])
 def test_tuner_finds_a_truth_beyond_its_first_distribution(find, friction, mass):
     errors = []
     for seed in range(4):
