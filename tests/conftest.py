@@ -29,7 +29,8 @@ def pytest_configure(config):
     # What tests compile they run briefly. Flags are read when JAX makes its first array.
     with warnings.catch_warnings(action="ignore"):
         from experiments.common.config import QUICK_COMPILATION
-    os.environ.setdefault("XLA_FLAGS", QUICK_COMPILATION)
+    # Every process of pytest has a core, so none splits a program to compile it on several.
+    os.environ.setdefault("XLA_FLAGS", f"{QUICK_COMPILATION} --xla_cpu_parallel_codegen_split_count=1")
     # As `experiments.common.checkpoint.set_up_compiler` does.
     os.environ.setdefault("NPROC", "8")
 

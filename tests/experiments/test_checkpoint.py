@@ -183,6 +183,7 @@ def learner():
     return Learner(replace(PRESETS["smoke"], chunk=1), robot.chosen("mass"), kind=robot)
 
 
+@pytest.mark.slow
 def test_a_training_that_was_killed_ends_as_if_it_had_not_been(learner, monkeypatch, tmp_path):
     key, updates = jax.random.PRNGKey(3), 4
     whole, curve = policies.trained(key, learner, updates, tmp_path / "whole")

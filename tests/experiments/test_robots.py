@@ -240,6 +240,7 @@ def test_what_is_exported_acts_as_what_was_trained(trained, tmp_path):
         network(np.array([0.0, np.nan, 0.0]))
 
 
+@pytest.mark.slow
 def test_a_round_with_a_robot_that_answers_through_observations(trained, tmp_path):
     terms = Terms(walk_s=1.2, force=True, timeout_s=0.0)
     options = {"robot": ROBOT, "parameters": "mass,damping", "policy": str(trained), "preset": "smoke", "rounds": 1}

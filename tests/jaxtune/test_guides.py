@@ -64,6 +64,7 @@ def test_a_playground_environment_is_tuned(monkeypatch):
     assert abs(found["torso"]["value"] - 1.4) < 0.2
 
 
+@pytest.mark.slow
 def test_logs_alone_are_tuned_to(monkeypatch, tmp_path):
     sim = sled.simulator()
     robot = types.ModuleType("my_robot")

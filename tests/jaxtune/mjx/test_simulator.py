@@ -168,6 +168,7 @@ def test_a_distribution_reads_in_physical_values(sim):
     assert found["delay"] == pytest.approx({"low": 0.0, "value": 0.0, "high": 0.01}, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_a_tuner_takes_it_as_it_is(sim):
     config = toys.TINY
     machine = tuner.Tuner(config=config, train_policy=tuner.keep, simulate=sim.simulate(act))

@@ -42,6 +42,7 @@ def test_derived_fields_follow(sleds):
         np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_robots_of_a_training_start_anew_one_by_one(sleds):
     starts = {}
     for impl, sled in sleds.items():
