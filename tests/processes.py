@@ -6,13 +6,18 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax
 import numpy as np
+
+from experiments.common.config import PRESETS
+from experiments.walking.learner import Learner
+from experiments.walking.policies import starting_policy
+from experiments.walking.robots import kind
 
 ROOT = Path(__file__).parents[1]
 ROBOT = f"{ROOT / 'tests' / 'sled.py'}:simulator"
 # A checkpoint after every chunk of updates, not every minute.
 TRAIN = "from experiments.walking import policies; policies._KEEP_S = 0.0; from experiments import train as command"
-EXPORT = "from experiments import export as command"
 SIM2SIM = "from experiments import sim2sim as command"
 SIM2REAL = "from experiments import sim2real as command"
 DISCOVER = "from experiments import discover as command"
@@ -61,8 +66,8 @@ def read(path):
     return json.loads(path.read_text())
 
 
-def networks(policy, out, environment):
-    """Arrays of a policy by name, as `export` writes them."""
-    end(start(EXPORT, ["--robot", ROBOT, "--preset", "smoke", "--policy", str(policy), "--out", str(out)], environment))
-    with np.load(out / "policy.npz", allow_pickle=False) as stored:
-        return {name: stored[name] for name in stored.files}
+def networks(policy):
+    """Arrays of a policy of the test robot, all that training goes on with."""
+    robot = kind(ROBOT)
+    learner = Learner(PRESETS["smoke"], robot.chosen(None), kind=robot)
+    return [np.asarray(leaf) for leaf in jax.tree.leaves(starting_policy(str(policy), learner).learner)]

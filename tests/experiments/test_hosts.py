@@ -41,7 +41,7 @@ def test_two_hosts_train_what_two_devices_train_and_one_of_them_writes(environme
     on_two(TRAIN, options, environment[1], (first, other))
     assert not other.exists()
     same(read(first / "curve.json"), read(alone / "curve.json"), 1e-4)
-    assert np.isfinite(networks(first, tmp_path / "exported", environment[1])["kernel_0"]).all()
+    assert all(np.isfinite(values).all() for values in networks(first))
 
 
 @pytest.mark.slow

@@ -41,9 +41,8 @@ def check_train(environment, tmp_path, kills, updates=60):
     assert ours["config"] == theirs["config"]
     assert not (out / "training").exists()
     # What it does is what the other does, to the last bit.
-    ours, theirs = (networks(place, place / "exported", environment) for place in (out, tmp_path / "whole"))
-    for name, values in ours.items():
-        np.testing.assert_array_equal(values, theirs[name])
+    for ours, theirs in zip(networks(out), networks(tmp_path / "whole"), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
 
 
 @pytest.mark.slow

@@ -321,9 +321,9 @@ def test_a_run_stopped_after_every_file_is_the_same_run(method, programs, answer
 
 @pytest.fixture
 def first(programs, tmp_path):
-    """A run that has not begun, by its terms."""
+    """A run that has not begun, by its terms; of the method whose rounds take least time."""
     policy, start = starting_policy("walk", programs.learner), transfer.check(ARGS)[3]
-    return lambda terms: Rounds(tmp_path, terms, programs, "ours", policy, start, 0.2)
+    return lambda terms: Rounds(tmp_path, terms, programs, "dr", policy, start, 0.2)
 
 
 def test_no_walks_are_requested_if_too_many_falls_are_expected(first, answered, tmp_path, monkeypatch):
@@ -339,7 +339,8 @@ def test_no_walks_are_requested_if_too_many_falls_are_expected(first, answered, 
     assert first(TERMS).play(0, None).expected_falls >= 0.25
     # A walk that was walked already may be learnt from.
     (place / "tuning.json").unlink()
-    assert first(careful).play(0, None).tuning.verdicts
+    assert first(careful).play(0, None).tuning.moved
+    assert (place / "tuning.json").exists()
 
 
 def test_every_walk_that_was_asked_for_is_counted(first, answered, tmp_path):
@@ -360,7 +361,7 @@ def test_every_walk_that_was_asked_for_is_counted(first, answered, tmp_path):
 def test_a_run_goes_on_in_the_model_that_it_began_with(programs, answered, tmp_path):
     model = tmp_path / "model"
     shutil.copytree(Path(sim2real.__file__).parent / "results" / "stand_in" / "found" / "model", model)
-    args = replace(ARGS, out=tmp_path / "run", rounds=1, model=model)
+    args = replace(ARGS, out=tmp_path / "run", rounds=1, model=model, method="dr")
     assert transfer.play(args, programs) == transfer.play(args, programs)
     text = (model / "model.xml").read_text()
     (model / "model.xml").write_text(text.replace("<mujoco", "<mujoco ", 1))
@@ -453,7 +454,8 @@ def test_a_log_that_means_something_else_is_not_learnt_from(first, answered, tmp
     with pytest.raises(ValueError, match="left_knee turns the other way"):
         first(TERMS).play(0, None)
     assert not (tmp_path / "round_000" / "tuning.json").exists()
-    assert first(replace(TERMS, trust_log=True)).play(0, None).tuning.verdicts
+    assert first(replace(TERMS, trust_log=True)).play(0, None).tuning.moved
+    assert (tmp_path / "round_000" / "tuning.json").exists()
 
 
 def test_a_log_of_another_policy_is_not_learnt_from(first, answered, programs, tmp_path):
