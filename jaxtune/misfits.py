@@ -52,8 +52,7 @@ def misfits(
     model, ways = fit(config, collected)
     means, lived = _means(model.steps, collected.trajectory, phase)
     # An episode that ended before a phase says nothing of it: there it stands where the others are.
-    usual = jnp.sum(means * lived, axis=0) / jnp.maximum(lived.sum(axis=0), 1.0)
-    means = jnp.where(lived > 0, means, usual).reshape(len(means), -1)
+    means = jnp.where(lived > 0, means, _pooled(means, lived)).reshape(len(means), -1)
     in_phases = surface.train(model.replace(read=model.known[:, None] * means))
     involved = windows.involved(measured.obs.shape[-1] + measured.action.shape[-1]) * model.varies
     scatter = jnp.sqrt(jnp.mean(ways.residual**2, axis=0))
@@ -65,10 +64,9 @@ def misfits(
         rest = weight * surface.unexplained(ways, moments, answer)
         channels = jnp.sqrt(involved @ rest**2 / jnp.maximum(involved.sum(axis=1), 1.0))
         means, lived = _means(model.steps, episodes, phase)
-        count = lived.sum(axis=0)
-        mean = jnp.sum(means * lived, axis=0) / jnp.maximum(count, 1.0)
+        mean = _pooled(means, lived)
         left = surface.unexplained(in_phases, mean.reshape(-1), answer).reshape(mean.shape)
-        return channels, jnp.where(count > 0, jnp.abs(left), jnp.nan)
+        return channels, jnp.where(lived.any(axis=0), jnp.abs(left), jnp.nan)
 
     shared = (model, ways, in_phases, involved, weight)
     channels, phases = of_all_sets(one, shared, collected, measured)
@@ -84,13 +82,18 @@ def _means(steps: windows.Scaler, episodes: Trajectory, phase: Phase) -> tuple[j
 
     def one(steps, episode):
         within = jnp.clip(jnp.floor(PHASES * phase(episode)), 0, PHASES - 1)
-        lives = jnp.cumsum(~episode.alive) == 0
+        lives = windows.valid_starts(episode.alive, 1)
         counted = (within[:, None] == jnp.arange(PHASES)) & lives[:, None]
         values = jnp.where(lives[:, None], steps.clipped(windows.steps(episode)), 0.0)
         count = counted.sum(axis=0)[:, None].astype(values.dtype)
         return counted.T @ values / jnp.maximum(count, 1.0), count
 
     return devices.in_chunks(one, (episodes,), _EPISODES, shared=(steps,))
+
+
+def _pooled(means: jax.Array, lived: jax.Array) -> jax.Array:
+    """Averages the means of episodes, as `_means` returns them, every living step weighing the same."""
+    return jnp.sum(means * lived, axis=0) / jnp.maximum(lived.sum(axis=0), 1.0)
 
 
 def _in_medians(left: jax.Array) -> jax.Array:

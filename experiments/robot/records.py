@@ -79,7 +79,8 @@ class Misfit:
     times: float
     """Over the whole motion: `jaxtune.misfits.Misfits.channels`."""
     phases: tuple[float | None, ...]
-    """Of its mean in each phase of the gait, from the beginning of the left foot's stance on."""
+    """Of its mean in each phase: of the gait, from the beginning of the left foot's stance on, or of the compared time
+    if the robot has no clock; None where it did not stand so long."""
 
 
 @dataclass(frozen=True, kw_only=True)
