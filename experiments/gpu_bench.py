@@ -98,7 +98,7 @@ def _tunings(place: str) -> Callable[[Path], dict[str, float]]:
 RESULTS: dict[str, Callable[[Path], dict[str, Any]]] = {
     "speed": _speed,
     "policy": _training,
-    "walk": lambda out: read_json(out / "walk" / "evaluation.json"),
+    "walk": lambda out: read_json(out / "walk" / "evaluation.json")["rows"],
     "tunings": _tunings("tunings"),
     "tunings_cached": _tunings("tunings_cached"),
     "sweep": lambda out: {name: read_json(out / "sweep" / "summary.json")[name] for name in ("lanes", "seconds")},

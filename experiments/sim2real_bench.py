@@ -21,7 +21,7 @@ from envs.biteno import constants, walks
 from envs.targets import recorded
 from experiments.common import checkpoint, plots
 from experiments.common.checkpoint import as_json, from_json, read_json, write_json
-from experiments.common.cli import bars, console, run
+from experiments.common.cli import bars, console, count, run
 from experiments.common.config import preset
 from experiments.robot import policy_files
 from experiments.robot import transfer as transfers
@@ -225,11 +225,13 @@ def main(args: Args) -> None:
             before = evaluate(args, programs, args.out / f"start_{seed}" / "learner")
             for name in args.methods:
                 transfer = transfer_of(args, name, seed)
+                last = transfer.out / f"round_{args.rounds:03d}"
+                kept = (last / "round_evaluation").exists()
                 with stand_in(transfer.out):
                     rounds = transfers.play(transfer, programs)
-                after = evaluate(args, programs, transfer.out / f"round_{args.rounds:03d}" / "learner")
+                after = evaluate(args, programs, last / "learner")
                 results[name].append(Outcome(seed=seed, rounds=rounds, start=before, end=after))
-                progress.advance(task)
+                count(progress, task, sum(map(len, results.values())), kept)
     write_json(args.out / "summary.json", {"methods": results, "versions": checkpoint.versions()})
     plots.transfer(args.out / "fig6.png", as_json(results))
     show(args, results)

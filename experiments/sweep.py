@@ -20,7 +20,7 @@ from rich.table import Table
 
 from envs.targets.mjx import MjxTarget
 from experiments.common import checkpoint, hosts, plots
-from experiments.common.cli import bars, console, run
+from experiments.common.cli import bars, console, count, run
 from experiments.common.config import Preset, named_values, preset
 from experiments.walking import memory
 from experiments.walking.cases import Case, check_positive, check_seeds, checked_case, errors
@@ -215,7 +215,8 @@ def sweep(args: Args, learner: Learner, case: Case) -> None:
         pieces = []
         for start in range(0, len(rows), size):
             path = args.out / "lanes" / f"{start:04d}.json"
-            if not checkpoint.exists(path):
+            kept = checkpoint.exists(path)
+            if not kept:
                 # The last piece is filled up: another size would be another program.
                 some = rows[(start + np.arange(size)) % len(rows)]
                 begin = time.monotonic()
@@ -223,7 +224,7 @@ def sweep(args: Args, learner: Learner, case: Case) -> None:
                 found = {name: values[: len(rows) - start] for name, values in found.items()}
                 checkpoint.write_json(path, found | {"seconds": time.monotonic() - begin})
             pieces.append(checkpoint.read_json(path))
-            progress.update(task, completed=min(start + size, len(rows)))
+            count(progress, task, min(start + size, len(rows)), kept)
     names = ("step_size", "widen_factor", "radius", "level")
     of_lanes = {name: np.concatenate([piece[name] for piece in pieces]).reshape(grid.shape[:-1]) for name in RESULTS}
     summary = {

@@ -10,7 +10,15 @@ from typing import Any, NoReturn
 import tyro
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
 console = Console()
 """Where commands print their results."""
@@ -70,6 +78,19 @@ def bars() -> Progress:
     kind = Progress if console.is_terminal else _Lines
     # A step may take minutes, and the pace is that of all steps within the period.
     return kind(*columns, TimeElapsedColumn(), TimeRemainingColumn(), console=console, speed_estimate_period=_DAY_S)
+
+
+def count(progress: Progress, task: TaskID, completed: int, kept: bool) -> None:
+    """Says how many steps of a task are done.
+
+    Args:
+      progress: of `bars`.
+      task: whose steps they are.
+      completed: steps that are done, the last one among them.
+      kept: whether an earlier call did the last one. It took no time now, so the pace by which the time that is left is
+        foretold begins after it.
+    """
+    (progress.reset if kept else progress.update)(task, completed=completed)
 
 
 class _Lines(Progress):

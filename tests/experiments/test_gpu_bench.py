@@ -1,5 +1,7 @@
 import json
+import shutil
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -44,6 +46,36 @@ def test_finished_parts_are_not_run_again(fake, tmp_path, capsys):
     summary = json.loads((args.out / "summary.json").read_text())
     assert {name: part["found"] for name, part in summary["parts"].items()}["policy"] == {"without_s": 3.0}
     assert "500,000" in capsys.readouterr().out
+
+
+@pytest.fixture
+def kept(tmp_path):
+    """Results that its commands wrote, as they are kept in the repository, where the benchmark looks for them."""
+    package = Path(gpu_bench.__file__).parent
+    files = {
+        "bench/speed.json": "results/speed.json",
+        "bench/profile.json": "results/profile.json",
+        "policy/curve.json": "policies/walk/curve.json",
+        "walk/evaluation.json": "results/walk_mjx/evaluation.json",
+        "tunings/metrics.jsonl": "results/main_command/metrics.jsonl",
+    }
+    for place, source in files.items():
+        (tmp_path / place).parent.mkdir(exist_ok=True)
+        shutil.copy(package / source, tmp_path / place)
+    return tmp_path
+
+
+def test_what_its_commands_wrote_is_read(kept):
+    found = {part: gpu_bench.RESULTS[part](kept) for part in ("speed", "policy", "walk", "tunings", "profile")}
+    assert found["speed"]["fast"] > found["speed"]["exact"] > 1e3
+    policy = found["policy"]
+    assert policy["steps"] == json.loads((kept / "policy" / "curve.json").read_text())["curve"][-1]["steps"]
+    assert 0 < policy["without_s"] < policy["with_compilation_s"]
+    assert found["walk"]["grid"]["touchdowns_per_s"] > 0
+    tunings = found["tunings"]
+    assert tunings["tunings"] == 5
+    assert 0 < tunings["before_the_first_s"] < tunings["seconds"]
+    assert found["profile"]["simulated episodes"]["run_s"] > 0
 
 
 def test_every_part_has_a_command_whose_result_can_be_read(tmp_path):

@@ -440,6 +440,20 @@ def test_progress_is_a_line_a_minute_where_there_is_no_terminal(monkeypatch):
         assert "min: done" not in output.getvalue()
 
 
+def test_what_an_earlier_call_did_says_nothing_of_the_pace():
+    with cli.bars() as progress:
+        task = progress.add_task("runs", total=10)
+        for done in range(1, 4):
+            cli.count(progress, task, done, kept=True)
+        assert progress.tasks[0].completed == 3
+        assert progress.tasks[0].time_remaining is None
+        for done in (4, 5):
+            time.sleep(0.05)
+            cli.count(progress, task, done, kept=False)
+        # Five steps are left, of at least 50 ms each.
+        assert progress.tasks[0].speed <= 1 / 0.05
+
+
 def test_a_log_that_means_something_else_is_not_learnt_from(first, answered, tmp_path, monkeypatch):
     turned = Finding("flipped sign", "q", ("left_knee",), -1.0, "q: left_knee turns the other way")
     late = Finding("late", "dq", (), 10.0, "dq: what was measured is 10 ms late")
