@@ -27,7 +27,8 @@ def spec(robot: str) -> mujoco.MjSpec:
     """Loads the MJCF of a robot as a spec, which can be changed before it is compiled.
 
     It needs no other file: included files are part of it, and meshes, height fields and textures are left out
-    (`without_files`). Saved as XML, it loads again from any folder.
+    (`without_files`). Saved as XML, it loads again from any folder. A body without a name that a joint moves is called
+    after the joint, as a place where effects may be.
 
     Args:
       robot: the name of a built-in robot, or the path of an MJCF file, as in a log's `meta.yaml`.
@@ -39,9 +40,15 @@ def spec(robot: str) -> mujoco.MjSpec:
     if not path.is_file():
         raise ValueError(f"robot: got '{robot}', expected {', '.join(BUILT_IN)} or the path of an MJCF file")
     try:
-        return without_files(mujoco.MjSpec.from_file(str(path)))
+        found = without_files(mujoco.MjSpec.from_file(str(path)))
     except ValueError as error:
         raise ValueError(f"robot: {path}: {error}") from error
+    taken = {body.name for body in found.bodies}
+    for body in found.bodies:
+        moves = [joint.name for joint in body.joints if joint.name]
+        if not body.name and moves and f"{moves[-1]}_link" not in taken:
+            body.name = f"{moves[-1]}_link"
+    return found
 
 
 def one_file(robot: str) -> str:
@@ -66,8 +73,9 @@ def one_file(robot: str) -> str:
 def without_files(spec: mujoco.MjSpec) -> mujoco.MjSpec:
     """Returns a robot without what is stored in files of its own: meshes, height fields, skins and textures.
 
-    Bodies whose inertia follows from a mesh get it written out. Contacts of meshes are lost; on a test rig there are
-    none.
+    Inertias that follow from a mesh are written out. So are all that the compiler computes anew each time, from
+    geometries, a total mass or fused bodies: they would undo what is changed in them. Bodies stay as they are, also
+    where the model asks for static ones to be fused. Contacts of meshes are lost; on a test rig there are none.
 
     Args:
       spec: of the robot; it may be changed.
@@ -77,21 +85,27 @@ def without_files(spec: mujoco.MjSpec) -> mujoco.MjSpec:
     """
     textures = [texture for texture in spec.textures if texture.file or any(texture.cubefiles)]
     elements = (*spec.meshes, *spec.hfields, *spec.skins, *textures)
-    if not elements:
+    compiler = spec.compiler
+    anew = (
+        compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
+        or compiler.settotalmass > 0
+        or compiler.fusestatic
+    )
+    if not elements and not anew:
         return spec
     whole = spec.copy()
     whole.compiler.fusestatic = whole.compiler.discardvisual = False
     model = whole.compile()
-    from_geoms = spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
     filed = (mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtGeom.mjGEOM_HFIELD)
     for body, compiled in zip(spec.bodies, whole.bodies, strict=True):
         # A primitive may be fitted to a mesh, which it then names.
         mine = [geom for geom in body.geoms if geom.type in filed or geom.meshname]
-        if (mine or from_geoms) and body.name != "world":
+        if (mine or anew) and body.name != "world":
             _write_inertia(body, model, compiled.id)
         for geom in mine:
             spec.delete(geom)
-    spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
+    compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
+    compiler.settotalmass, compiler.fusestatic = -1.0, False
     lost = {texture.name for texture in textures}
     for material in spec.materials:
         material.textures = ["" if name in lost else name for name in material.textures]
@@ -101,6 +115,8 @@ def without_files(spec: mujoco.MjSpec) -> mujoco.MjSpec:
 
 
 def _write_inertia(body: mujoco.MjsBody, model: mujoco.MjModel, number: int) -> None:
+    if not model.body_mass[number]:
+        return
     body.explicitinertial = True
     body.mass = model.body_mass[number]
     body.ipos, body.iquat, body.inertia = (
@@ -141,20 +157,21 @@ def check_flags(spec: mujoco.MjSpec, clear: bool = False) -> tuple[str, ...]:
 def suspended(spec: mujoco.MjSpec) -> mujoco.MjModel:
     """Compiles a robot as it is on a test rig: without its free joints, and with contacts switched off.
 
+    Its own actuators, sensors and keyframes are left out, and its choice of a solver, an integrator and diagnostics:
+    who simulates a rig brings torques, readings and these. Gravity compensation that went through actuators stays.
+
     Args:
       spec: of the robot; it is copied, not changed.
-
-    Returns:
-      The compiled model. It has no keyframes if a free joint was removed, because they contain the base's pose.
     """
-    spec = spec.copy()
+    spec = without_files(spec.copy())
     free = [joint for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_FREE]
-    if free:
-        # Keyframes would have the wrong size without the base.
-        for key in spec.keys:
-            spec.delete(key)
-    for joint in free:
-        spec.delete(joint)
+    for element in (*free, *spec.keys, *spec.actuators, *spec.sensors):
+        spec.delete(element)
+    for joint in spec.joints:
+        joint.actgravcomp = False
+    default = mujoco.MjOption()
+    for name in ("solver", "integrator", "enableflags", "noslip_iterations"):
+        setattr(spec.option, name, getattr(default, name))
     model = spec.compile()
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
     return model

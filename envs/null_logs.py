@@ -192,7 +192,8 @@ class _Drive:
     def __init__(self, runs: Sequence[Run], times: np.ndarray, straight: Sequence[bool]):
         rows = [_last_row(run, own) for run, own in zip(runs, times, strict=True)]
         laws = [run.impedance()[row] for run, row in zip(runs, rows, strict=True)]
-        self._driven = "target" in runs[0].signals
+        # Of the others, torques were sent.
+        self._driven = np.array(["target" in run.signals for run in runs])[:, None]
         by_tick = lambda values: np.stack(values, axis=1)  # noqa: E731
         self._law = Impedance(
             stiffness=by_tick([law.stiffness for law in laws]),
@@ -202,7 +203,7 @@ class _Drive:
         )
         each = zip(runs, times, rows, straight, strict=True)
         targets = [
-            _targets(run, own, row, linear) if self._driven else run.signals["tau"][row]
+            _targets(run, own, row, linear) if "target" in run.signals else run.sent_torque()[row]
             for run, own, row, linear in each
         ]
         self._wanted = by_tick(targets)
@@ -210,7 +211,7 @@ class _Drive:
     def torque(self, look: int, q: np.ndarray, dq: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Commanded torques [runs, joints] at a tick, and what the back electromotive force takes from them."""
         law, wanted = self._law[look], self._wanted[look]
-        return (law.torque(wanted, q, dq) if self._driven else wanted), law.back_emf * dq
+        return np.where(self._driven, law.torque(wanted, q, dq), wanted), law.back_emf * dq
 
 
 def as_recorded(robot: Robot, run: Run, motion: Motion) -> Run:

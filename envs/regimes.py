@@ -55,7 +55,7 @@ def control_torque(run: Run, position: np.ndarray, speed: np.ndarray) -> tuple[n
     """
     controller = run.impedance()
     if "target" not in run.signals:
-        return run.signals["tau"], controller.limit
+        return run.sent_torque(), controller.limit
     return controller.torque(run.signals["target"], position, speed), controller.limit
 
 

@@ -53,6 +53,9 @@ class Rig:
       joints: names of the joints that are controlled and read, in the log's order.
       control_hz: rate of the controller. The simulation's step is the longest that divides the controller's period and
         is no longer than 1 ms.
+
+    Raises:
+      ValueError: the robot has something that MJX lacks.
     """
 
     def __init__(
@@ -77,7 +80,8 @@ class Rig:
             if model.body_weldid[i] > 0 and model.body_mass[i] > 0 and model.body(i).name
         ]
         self._bodies = np.array(moving)
-        self.trees = model.dof_treeid[self.dof].copy()
+        # Equality constraints and tendons may couple what is apart as kinematic trees.
+        self.trees = np.zeros_like(self.dof) if model.neq or model.ntendon else model.dof_treeid[self.dof].copy()
         self.bodies = tuple(model.body(i).name for i in moving)
         self.mj_model = model
         # Joints that move but are neither controlled nor read; `check_matches` refuses a model that has some.
@@ -90,7 +94,10 @@ class Rig:
         device.opt.timestep, device.opt.disableflags = self.dt, model.opt.disableflags
         device.opt.iterations = _ITERATIONS
         device.dof_frictionloss[self.dof] = np.maximum(model.dof_frictionloss[self.dof], MIN_FRICTION_NM)
-        self._model = mjx.put_model(device)
+        try:
+            self._model = mjx.put_model(device)
+        except NotImplementedError as error:
+            raise ValueError(f"robot: MJX cannot simulate it: {error}") from error
         self._data = mjx.make_data(self._model)
         self._scales: Mapping[str, np.ndarray] = {}
         # A robot on a rig has no feet on the ground, so effects of contact have no place and drop out below.

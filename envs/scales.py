@@ -13,16 +13,18 @@ from envs.regimes import control_torque
 from envs.rig import Rig
 from envs.segments import smoothed
 
+_DRIVEN = 0.01  # least share of the torque that moves a joint's inertia; a passive joint gets none
+
 
 def measure_scales(rig: Rig, runs: Sequence[Run]) -> dict[str, np.ndarray]:
     """Measures scales with which one unit of every coordinate matters about equally, whatever the robot's size.
 
     With rms values over all rows, tau the controller's torque and dq the joint's speed, per joint or body:
 
-        torque     rms(tau)                    Nm
-        damping    rms(tau) / rms(dq)          Nm s/rad
-        quadratic  rms(tau) / rms(dq)^2        Nm s^2/rad^2
-        stiffness  rms(tau) / 0.02             Nm/rad
+        torque     rms(tau); of a joint that no torque drives, what its inertia takes, rms(inertia ddq)   Nm
+        damping    torque / rms(dq)            Nm s/rad
+        quadratic  torque / rms(dq)^2          Nm s^2/rad^2
+        stiffness  torque / 0.02               Nm/rad
         inertia    diagonal of the joint-space inertia in the mean pose, kg m^2
         mass       mass of the body            kg
         drag       9.81 mass                   N s/m
@@ -39,21 +41,24 @@ def measure_scales(rig: Rig, runs: Sequence[Run]) -> dict[str, np.ndarray]:
     Returns:
       [places] by the name of the scale (`jaxtune.types.Scale`).
     """
-    torque, speed, limit, pose = [], [], [], []
+    torque, speed, rise, limit, pose = [], [], [], [], []
     for run in runs:
         position, velocity = np.moveaxis(smoothed(run), 1, 0)
         wanted, most = control_torque(run, position, velocity)
         torque.append(wanted)
         speed.append(velocity)
+        rise.append(np.gradient(velocity, run.time, axis=0))
         # An infinite limit is no limit; without any, `motor` is tiny.
         limit.append(np.where(np.isfinite(most), most, 0.0))
         pose.append(position)
     mass, inertia = rig.inertias(np.concatenate(pose).mean(axis=0))
+    moves = inertia * _rms(rise)
+    torque = np.where(_rms(torque) > _DRIVEN * moves, _rms(torque), moves)
     return {
-        "torque": _rms(torque),
-        "damping": _rms(torque) / _rms(speed),
-        "quadratic": _rms(torque) / _rms(speed) ** 2,
-        "stiffness": _rms(torque) / 0.02,  # of a spring that winds up by 20 mrad under the rms torque
+        "torque": torque,
+        "damping": torque / _rms(speed),
+        "quadratic": torque / _rms(speed) ** 2,
+        "stiffness": torque / 0.02,  # of a spring that winds up by 20 mrad under the rms torque
         "inertia": inertia,
         "mass": mass,
         "drag": mass * 9.81,  # a drag that equals the link's weight at 1 m/s

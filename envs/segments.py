@@ -36,6 +36,7 @@ COMPARED = ("q", "dq", "tau", "abs_tau", "gravity")
 HISTORY_S = LONGEST_S + 0.02
 """Length of the history before a segment, in s: the longest delay and some time for lags to settle."""
 
+_SAME_S = 2e-6  # times that differ by less are the same: time stamps are rounded, those of a wall clock to 0.2 us
 _PAST_S, _PAST_STEP_S = 2.0, 0.01  # before the history: how far back positions are kept, and the time between them
 
 
@@ -125,7 +126,7 @@ def cut(
     together = rows_together(period, bin_s)
     rows = max(1, round(horizon_s / period / together)) * together
     # Every segment needs a history, the first one too.
-    first = [int(np.searchsorted(run.time, run.time[0] + HISTORY_S)) for run in runs]
+    first = [_after_history(run) for run in runs]
     starts = [np.arange(begin, len(run.time) - rows, rows) for run, begin in zip(runs, first, strict=True)]
     if not any(map(len, starts)):
         longest = max(run.time[-1] - run.time[0] for run in runs)
@@ -158,7 +159,7 @@ def whole(runs: Sequence[Run], dt: float) -> Cut:
       runs: of one robot.
       dt: step of the simulation in s.
     """
-    first = [int(np.searchsorted(run.time, run.time[0] + HISTORY_S)) for run in runs]
+    first = [_after_history(run) for run in runs]
     most = max(len(run.time) - 1 - start for run, start in zip(runs, first, strict=True))
     row = [
         np.minimum(start + 1 + np.arange(most), len(run.time) - 1)[None] for run, start in zip(runs, first, strict=True)
@@ -171,6 +172,11 @@ def whole(runs: Sequence[Run], dt: float) -> Cut:
         run=np.arange(len(runs)),
         row=np.concatenate(row),
     )
+
+
+def _after_history(run: Run) -> int:
+    """The first row before which there is a whole history."""
+    return int(np.searchsorted(run.time, run.time[0] + HISTORY_S - _SAME_S))
 
 
 def _segments(
@@ -192,7 +198,7 @@ def _segments(
         all segments get as many steps as the longest.
       dt: step of the simulation in s.
     """
-    after = 1 + int(np.ceil(longest_s / dt - 1e-6))
+    after = 1 + int(np.ceil((longest_s - _SAME_S) / dt))
     every = zip(runs, estimates, starts, rows, strict=True)
     parts = [_of_run(run, one.states, start, row, after, dt) for run, one, start, row in every]
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
@@ -214,20 +220,20 @@ def _of_run(run: Run, states: np.ndarray, start: np.ndarray, rows: np.ndarray, a
     begin = run.time[start][:, None]
     grid = begin + dt * np.arange(-before, after)
     # A row's values act from its time stamp until the next.
-    last = np.clip(np.searchsorted(run.time, grid + 1e-9, side="right") - 1, 0, len(run.time) - 1)
+    last = np.clip(np.searchsorted(run.time, grid + _SAME_S, side="right") - 1, 0, len(run.time) - 1)
     target, between = _targets(run, grid, last)
-    controller, none = run.impedance(), np.zeros(run.signals["q"].shape)
+    controller = run.impedance()
     held = {
-        "feed": none if "target" in run.signals else run.signals["tau"],
+        "feed": run.sent_torque(),
         "stiffness": controller.stiffness,
         "damping": controller.damping,
         "limit": controller.limit,
         "emf": controller.back_emf,
     }
     # Where the controller's ticks lie between rows is unknown; they are counted from the run's first row.
-    ticks = np.floor((grid - run.time[0]) * run.controller.rate_hz + 1e-6)
+    ticks = np.floor((grid + _SAME_S - run.time[0]) * run.controller.rate_hz)
     at = (run.time[rows] - begin) / dt
-    step = np.minimum(np.floor(at + 1e-6).astype(np.int32), after - 1)
+    step = np.minimum(np.floor(at + _SAME_S / dt).astype(np.int32), after - 1)
     position, velocity = np.moveaxis(states, 1, 0)
     fine = begin + dt * np.arange(-before, ahead + 1)
     # The slope of interpolated positions would have several times the noise of the velocities, but not at the rows: a

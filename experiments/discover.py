@@ -12,7 +12,7 @@ from experiments.common import checkpoint
 from experiments.common.cli import bars, console, run
 from experiments.discovery import gate, report
 from experiments.discovery.investigate import investigate
-from experiments.discovery.setup import read_logs
+from experiments.discovery.setup import digest, read_logs
 from jaxtune.discovery.workflow import share_done
 
 
@@ -59,7 +59,9 @@ def main(args: Args) -> None:
     for note in gate.check(log, spec, args.horizons, trust=args.trust_log):
         console.print(f"note: {note}", highlight=False, markup=False, soft_wrap=True)
     identity = {name: value for name, value in vars(args).items() if name not in ("out", "trust_log")}
-    checkpoint.open_run(args.out, identity | {"logs": [str(path) for path in args.logs]})
+    # What was read may change behind the same names, as when a sign or a gain is corrected.
+    identity |= {"logs": [str(path) for path in args.logs], "read_sha256": digest(log, spec)}
+    checkpoint.open_run(args.out, identity)
     with checkpoint.lock(args.out / "summary.json"), bars() as progress:
         task = progress.add_task("simulating null logs", total=100)
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from envs.corrected.record import EFFECTS, MODEL, Effects
 from envs.effects import EVERY
+from envs.models import without_files
 from envs.rig import Rig
 
 
@@ -38,7 +39,7 @@ def _corrected_spec(spec: mujoco.MjSpec, rig: Rig, vector: np.ndarray) -> mujoco
     """Makes the nominal MJCF with the corrected inertias, armatures, dampings and friction losses, compiled."""
     values = rig.values(rig.tree(jnp.asarray(vector, jnp.float32)))
     model, device = rig.mj_model, jax.jit(rig.model)(values)
-    spec = spec.copy()
+    spec = without_files(spec.copy())
     for name in rig.bodies:
         body, number = spec.body(name), model.body(name).id
         # Without this the compiler would compute mass and inertia from the geometries again.

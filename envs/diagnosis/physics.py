@@ -170,11 +170,12 @@ def _offsets(run: Run, disagreement: Disagreement) -> list[_Repair]:
     on = run.signals.get("enabled", np.ones(len(run.time)))[rows, None] > 0
     lacks = np.where(free & on, commanded[rows] - needed, np.nan)
     found = []
-    for joint, column in enumerate(lacks.T):
-        if np.isnan(column).all():
+    for joint, (column, gain) in enumerate(zip(lacks.T, run.controller.gains["kp"], strict=True)):
+        # A passive joint has no gain.
+        if np.isnan(column).all() or not gain:
             continue
         # The median, because friction adds to the difference with both signs.
-        offset = float(np.nanmedian(column)) / run.controller.gains["kp"][joint]
+        offset = float(np.nanmedian(column)) / gain
         if abs(offset) >= _LEAST_OFFSET_RAD:
             shift = np.where(np.arange(len(run.signals["q"][0])) == joint, offset, 0.0)
             found.append(_Repair("offset", "q", (joint,), -offset, _on(("q",), lambda v, shift=shift: v + shift)))

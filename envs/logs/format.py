@@ -96,6 +96,14 @@ class Run:
         on = self.signals.get("enabled", np.ones(len(self.time)))
         return self.controller.impedance(on, self.signals.get("volts"))
 
+    def sent_torque(self) -> np.ndarray:
+        """Returns the torque that was sent to the joints directly, [rows, joints] Nm: none where there are targets, or
+        where the motors were switched off."""
+        if "target" in self.signals:
+            return np.zeros(self.signals["q"].shape)
+        on = self.signals.get("enabled", np.ones(len(self.time)))
+        return self.signals["tau"] * (on > 0)[:, None]
+
 
 @dataclass(frozen=True, kw_only=True)
 class Log:

@@ -106,7 +106,9 @@ class Meta:
         for joint, sign in self._mapping("sign", meta.get("sign"), dict.fromkeys(self.joints)).items():
             self.signs[joint] = float(self._one_of(f"sign.{joint}", sign, (1, -1)))
         units = self._mapping("units", meta.get("units"), {"angle": False, "torque": False})
-        self.angle = _ANGLE[self._one_of("units.angle", units.get("angle", "rad"), _ANGLE)]
+        angle = _ANGLE[self._one_of("units.angle", units.get("angle", "rad"), _ANGLE)]
+        # Positions of slide joints are no angles: they are always in m.
+        self.angle = np.array([1.0 if movable and not movable[joint] else angle for joint in self.joints])
         self.torque = _TORQUE[self._one_of("units.torque", units.get("torque", "Nm"), _TORQUE)]
         self.known = {"t": None, **dict.fromkeys(self._all_columns())}
         # An observation has as many columns as the log says.
@@ -193,17 +195,17 @@ class Meta:
             self._refuse(where, value, f"one number or {len(self.joints)}, one per joint")
         return np.array([self._number(where, one, zero=name in ("kp", "kd")) for one in values])
 
-    def _robot(self, folder: Path, name: str, robots: Mapping[str, Sequence[str]]) -> tuple[str, Sequence[str]]:
-        """Resolves a robot to its name or path, and the joints that may be logged."""
+    def _robot(self, folder: Path, name: str, robots: Mapping[str, Sequence[str]]) -> tuple[str, dict[str, bool]]:
+        """Resolves a robot to its name or path, and the joints that may be logged, with whether each turns."""
         if name in robots:
-            return name, robots[name]
+            return name, dict.fromkeys(robots[name], True)
         path = folder / name
         if not path.is_file():
             self._refuse("robot", name, f"{', '.join(robots)}, or the path of an MJCF file, relative to {folder}")
         check_model(folder, path, f"{self.path}: robot")
         return self._read_model(path)
 
-    def _read_model(self, path: Path) -> tuple[str, Sequence[str]]:
+    def _read_model(self, path: Path) -> tuple[str, dict[str, bool]]:
         if not path.is_file():
             raise ValueError(f"robot: got {path}, expected an MJCF file")
         try:
@@ -211,8 +213,9 @@ class Meta:
         except ValueError as error:
             raise ValueError(f"{self.path}: robot: {path}: {error}") from error
         # A column holds one number per joint, which free and ball joints have not.
-        kinds = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
-        return str(path.resolve()), [model.joint(i).name for i in range(model.njnt) if model.jnt_type[i] in kinds]
+        turns = {int(mujoco.mjtJoint.mjJNT_HINGE): True, int(mujoco.mjtJoint.mjJNT_SLIDE): False}
+        kinds = {model.joint(i).name: int(model.jnt_type[i]) for i in range(model.njnt)}
+        return str(path.resolve()), {name: turns[kind] for name, kind in kinds.items() if kind in turns}
 
     def _names(self, where: str, value: Any) -> tuple[str, ...]:
         if not isinstance(value, list) or not value:

@@ -144,7 +144,8 @@ def excitation(
       Runs, split into train, select and sealed so that every split has both of the motion's gains.
 
     Raises:
-      ValueError: fewer runs than can be split, fewer rows than the motion needs, or the motion is unknown.
+      ValueError: fewer runs than can be split, fewer rows than the motion needs, the motion is unknown, or a slide
+        joint has no range.
     """
     if motion not in MOTIONS:
         raise ValueError(f"motion: got '{motion}', expected one of {', '.join(MOTIONS)}")
@@ -182,10 +183,19 @@ def excitation(
     return motions
 
 
+def unlimited_slides(model: mujoco.MjModel, joints: Sequence[str]) -> list[str]:
+    """Lists slide joints of which nobody says how far they may move."""
+    found = [model.joint(name) for name in joints]
+    slide = mujoco.mjtJoint.mjJNT_SLIDE
+    return [one.name for one in found if model.jnt_type[one.id] == slide and not model.jnt_limited[one.id]]
+
+
 def _ranges(model: mujoco.MjModel, joints: Sequence[str]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns least, largest and middle positions; a joint without limits turns by a right angle each way."""
+    """Returns least, largest and middle positions; a hinge without limits turns by a right angle each way."""
     found = [model.joint(name) for name in joints]
     limited = np.array([bool(model.jnt_limited[joint.id]) for joint in found])
+    if endless := unlimited_slides(model, joints):
+        raise ValueError(f"robot: slide joint '{endless[0]}' has no range, expected one in the MJCF, in m")
     span = np.array([joint.range for joint in found])
     low, high = np.where(limited[:, None], span, [-np.pi / 2, np.pi / 2]).T
     middle = np.where(limited, 0.5 * (low + high), np.array([joint.qpos0[0] for joint in found]))
@@ -236,9 +246,11 @@ _PIECES = {"triangle": _triangle, "chirp": _chirp, "steps": _steps, "holds": _ho
 
 
 def scaled(controller: Controller, gain: float) -> Controller:
-    """Returns a controller whose proportional and derivative gains are multiplied by a factor; limits stay.
+    """Returns a controller whose gains of position and velocity errors are multiplied by a factor; limits stay.
 
     Two gains make effects of the controller (delay, gain error) distinguishable from those of the body.
     """
-    gains = {name: values * (gain if name in ("kp", "kd") else 1.0) for name, values in controller.gains.items()}
+    gains = {
+        name: values * (gain if name in ("kp", "kd", "gain") else 1.0) for name, values in controller.gains.items()
+    }
     return replace(controller, gains=gains)

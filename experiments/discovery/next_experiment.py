@@ -7,7 +7,7 @@ import numpy as np
 
 from envs import segments
 from envs.logs import Log, Run
-from experiments.discovery.excitation import TargetRun, deciding, scaled
+from experiments.discovery.excitation import TargetRun, deciding, scaled, unlimited_slides
 from experiments.discovery.setup import Question
 from experiments.discovery.whole_runs import simulate_runs
 from jaxtune.discovery.result import Result
@@ -25,10 +25,10 @@ def deciding_experiment(question: Question, log: Log, folder: Path, result: Resu
       result: with the two models.
 
     Returns:
-      A sentence with the command that writes the targets; None where there are no two models with an effect, or where
-      no motion can be simulated with both.
+      A sentence with the command that writes the targets; None where there are no two models with an effect, where no
+      motion can be simulated with both, or where a slide joint has no range.
     """
-    if len(result.rivals) < 2:
+    if len(result.rivals) < 2 or unlimited_slides(question.rig.mj_model, log.joints):
         return None
     (one, other), vectors = (key for key, _ in result.rivals), np.stack([vector for _, vector in result.rivals])
 

@@ -1,5 +1,6 @@
 """Turns measured logs and a nominal model into the problem that discovery works on."""
 
+import hashlib
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -38,6 +39,7 @@ __all__ = [
 ]
 
 _LEAST_STALE = 0.02  # share of readings
+_RATES = 1.8  # largest ratio of two runs' rates: all segments have one number of rows. A servo's logs differed by 1.5
 _LATE_S = 0.001  # a velocity that lags its position by more was filtered, and would be mistaken for a sensor's lag
 
 
@@ -108,9 +110,30 @@ def read_logs(
     notes = (f"flags of the model that disabled {', '.join(cleared)} were cleared",) if cleared else ()
     runs = first.runs
     if len(logs) > 1:
-        runs = tuple(replace(run, name=f"{run.name}_{number}") for number, log in enumerate(logs) for run in log.runs)
+        runs = tuple(_numbered(run, number) for number, log in enumerate(logs) for run in log.runs)
     log = split_in_time(replace(first, runs=runs, notes=notes))
     return with_halves_swapped(log) if swap_halves else log, spec
+
+
+def _numbered(run: Run, number: int) -> Run:
+    """A run of one of several folders; one that is a condition of its own stays so."""
+    name = f"{run.name}_{number}"
+    return replace(run, name=name, condition=name if run.condition == run.name else run.condition)
+
+
+def digest(log: Log, spec: mujoco.MjSpec) -> str:
+    """Computes a SHA-256 of all that a discovery reads: the runs with their controllers, and the model."""
+    found = hashlib.sha256(spec.copy().to_xml().encode())
+    for run in log.runs:
+        told = (run.name, run.condition, run.split, run.controller.kind, run.controller.rate_hz)
+        found.update(repr((*told, run.controller.between_rows)).encode())
+        facts = {f"{signal}.{name}": value for signal, known in run.known.items() for name, value in known.items()}
+        for name, values in sorted(
+            [("t", run.time), *run.controller.gains.items(), *run.signals.items(), *facts.items()]
+        ):
+            found.update(name.encode())
+            found.update(np.ascontiguousarray(values, float))
+    return found.hexdigest()
 
 
 def build_question(
@@ -214,7 +237,12 @@ def check_simulatable(log: Log, spec: mujoco.MjSpec, horizons: Sequence[float]) 
             "fix them by taking their <joint> out of the MJCF"
         )
     rate = log.runs[0].controller.rate_hz
-    for run in log.runs:
+    rows = [1.0 / np.median(np.diff(run.time)) for run in log.runs]
+    for run, own in zip(log.runs, rows, strict=True):
+        if not 1.0 / _RATES < own / rows[0] < _RATES:
+            raise ValueError(
+                f"{run.name}: got {own:.4g} rows a second, expected {rows[0]:.4g} as in {log.runs[0].name}"
+            )
         if run.controller.rate_hz != rate:
             raise ValueError(
                 f"{run.name}: controller.rate_hz: got {run.controller.rate_hz:g}, expected {rate:g} for all"

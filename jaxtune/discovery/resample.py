@@ -102,7 +102,9 @@ def standard_errors(fit: Fit, unit: np.ndarray) -> np.ndarray:
 def _blocks(run: np.ndarray, length: int) -> tuple[np.ndarray, np.ndarray]:
     """Numbers of consecutive blocks within every run, and their lengths; a short rest joins the block before it."""
     lengths: list[int] = []
-    for count in np.unique(run, return_counts=True)[1]:
+    # In the order of the segments, whatever the runs' numbers are.
+    ends = np.append(np.flatnonzero(np.diff(run)) + 1, len(run))
+    for count in np.diff(ends, prepend=0):
         whole = max(1, int(count) // length)
         lengths += [int(count) // whole + (index < int(count) % whole) for index in range(whole)]
     return np.arange(len(lengths)), np.array(lengths)

@@ -6,6 +6,7 @@ import pytest
 from PIL import Image
 
 from envs import models
+from envs.rig import Rig
 
 BOX = """v -1 -1 -1
 v 1 -1 -1
@@ -97,6 +98,80 @@ def test_one_file_moves_as_many_did(robot, tmp_path, compiler):
         mujoco.mj_step(one, data, 300)
         found.append(data.qpos.copy())
     np.testing.assert_allclose(*found, atol=1e-4)
+
+
+ARM = """<mujoco>
+  <compiler {compiler}/>
+  <option {option}><flag {flag}/></option>
+  <worldbody>
+    <body name="upper" gravcomp="{gravcomp}">
+      <joint name="shoulder" axis="0 1 0" armature="0.01" actuatorgravcomp="true"/>
+      <geom type="capsule" size="0.03" fromto="0 0 0 0 0 -0.3" mass="1.2"/>
+      <body {name} pos="0 0 -0.3" gravcomp="{gravcomp}">
+        <joint name="elbow" axis="0 1 0" armature="0.01"/>
+        <geom type="capsule" size="0.02" fromto="0 0 0 0 0 -0.25" mass="0.6"/>
+        <body name="tool" pos="0 0 -0.25"><geom size="0.03" mass="0.4"/><site name="tip"/></body>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>{actuator}</actuator>
+  <sensor><touch site="tip"/></sensor>
+  <keyframe><key qpos="0.1 0.2"/></keyframe>
+</mujoco>"""
+
+
+@pytest.fixture
+def arm(tmp_path):
+    def put(**changed):
+        plain = {"compiler": "", "option": "", "flag": 'contact="disable"', "gravcomp": 0, "name": 'name="lower"'}
+        (tmp_path / "arm.xml").write_text(ARM.format(**{**plain, "actuator": "", **changed}))
+        return models.spec(str(tmp_path / "arm.xml"))
+
+    return put
+
+
+@pytest.mark.filterwarnings("ignore:.*settotalmass:UserWarning")
+@pytest.mark.parametrize("compiler", ['inertiafromgeom="true"', 'settotalmass="5"', 'fusestatic="true"'])
+def test_inertias_that_a_compiler_would_compute_anew_are_written_out(arm, compiler):
+    spec = arm(compiler=compiler)
+    masses = np.array([0.0, 1.2, 0.6, 0.4])
+    model = spec.compile()
+    np.testing.assert_allclose(model.body_mass, masses * (5.0 / 2.2 if "total" in compiler else 1.0), rtol=1e-6)
+    spec = arm(compiler=compiler)
+    spec.body("lower").mass *= 1.5
+    assert spec.copy().compile().body_mass[2] == pytest.approx(1.5 * model.body_mass[2])
+    again = mujoco.MjModel.from_xml_string(spec.to_xml())
+    assert again.body_mass[2] == pytest.approx(1.5 * model.body_mass[2], rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"flag": 'energy="enable"'},
+        {"flag": 'fwdinv="enable"'},
+        {"option": 'integrator="implicit"'},
+        {"option": 'solver="PGS" noslip_iterations="3"'},
+        {"actuator": '<adhesion body="tool" ctrlrange="0 1"/>'},
+    ],
+    ids=str,
+)
+def test_what_a_rig_does_not_need_is_no_obstacle(arm, changed):
+    found, plain = (Rig(arm(**options), ("shoulder", "elbow"), 500.0) for options in (changed, {}))
+    assert found.layout[:5] == plain.layout[:5]
+
+
+def test_gravity_is_compensated_though_actuators_are_switched_off(arm):
+    model = models.suspended(arm(gravcomp=1))
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION
+    data = mujoco.MjData(model)
+    data.qpos[:] = 1.0, 0.5
+    mujoco.mj_forward(model, data)
+    np.testing.assert_allclose(data.qfrc_passive, data.qfrc_gravcomp, atol=1e-9)
+    assert np.abs(data.qfrc_gravcomp).min() > 0.1
+
+
+def test_a_body_without_a_name_is_called_after_its_joint(arm):
+    assert Rig(arm(name=""), ("shoulder", "elbow"), 500.0).bodies == ("upper", "elbow_link", "tool")
 
 
 def test_a_mesh_that_is_missing_is_named(robot):

@@ -127,3 +127,16 @@ def test_torques_that_were_sent_stay_what_they_are(spec):
     read = played(run, spec)
     np.testing.assert_array_equal(read["tau"], sent)
     assert np.abs(read["q"]).max() > 0.01
+
+
+def test_runs_with_targets_and_runs_with_torques_are_driven_each_by_its_own(spec):
+    told = measured()
+    sent = replace(told, name="run_001", signals={"q": told.signals["q"], "tau": 0.3 * told.signals["target"]})
+    for runs in ((told, sent), (sent, told)):
+        log = replace(log_of(told), runs=runs)
+        (both,) = simulate_null_logs(log, spec, 1, 0)
+        for run, mine in zip(runs, both.runs, strict=True):
+            (alone,) = simulate_null_logs(replace(log, runs=(run,)), spec, 1, 0)
+            # The controller's ticks are drawn for all runs together, and so is the noise.
+            np.testing.assert_allclose(mine.signals["q"], alone.runs[0].signals["q"], atol=0.02)
+        np.testing.assert_array_equal(both.runs[runs.index(sent)].signals["tau"], sent.signals["tau"])

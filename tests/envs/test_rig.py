@@ -366,3 +366,26 @@ def test_a_step_divides_the_controllers_period_and_is_no_longer_than_a_milliseco
     rig = Rig(models.spec("pendulum"), ("hinge",), control_hz)
     np.testing.assert_allclose(rig.dt, 1.0 / control_hz / steps, rtol=1e-9)
     assert rig.mj_model.opt.timestep == rig.dt
+
+
+GRIPPER = """<mujoco><worldbody>
+  <body name="left"><joint name="l" type="slide" axis="0 1 0"/><geom size="0.01" mass="0.1"/></body>
+  <body name="right"><joint name="r" type="slide" axis="0 -1 0"/><geom size="0.01" mass="0.1"/></body>
+</worldbody>{coupling}</mujoco>"""
+
+
+@pytest.mark.parametrize(
+    ("coupling", "trees"),
+    [
+        ("", [0, 1]),
+        ('<equality><joint joint1="l" joint2="r"/></equality>', [0, 0]),
+        (
+            '<tendon><fixed stiffness="200"><joint joint="l" coef="1"/><joint joint="r" coef="-1"/></fixed></tendon>',
+            [0, 0],
+        ),
+    ],
+    ids=["apart", "equality", "tendon"],
+)
+def test_joints_that_something_couples_are_of_one_tree(coupling, trees):
+    rig = Rig(mujoco.MjSpec.from_string(GRIPPER.format(coupling=coupling)), ("l", "r"), rigs.CONTROL_HZ)
+    np.testing.assert_array_equal(rig.trees, trees)

@@ -452,3 +452,28 @@ def test_velocities_between_rows_are_as_good_as_those_at_rows():
     error = np.where(there, cut.segments.measured[:, :, 1, 0] - np.interp(grid, time, speed), 0.0)
     by_phase = np.sqrt((error**2).mean(axis=0).reshape(-1)[: BEFORE + AHEAD].reshape(-1, 5).mean(axis=0))
     assert by_phase.max() < 1.1 * by_phase[0]
+
+
+def test_rounded_time_stamps_move_no_tick_and_no_target():
+    time = times(2.0)
+    motion = {"q": parabola(time)[0], "target": np.random.default_rng(6).normal(size=(len(time), 2))}
+    exact = segments.cut([run(time, **motion)], 0.2, DT).segments
+    # As seconds since 1970 are.
+    rounded = segments.cut([run((1.7e9 + time) - 1.7e9, **motion)], 0.2, DT).segments
+    assert exact.target.shape == rounded.target.shape
+    np.testing.assert_array_equal(rounded.sample, exact.sample)
+    np.testing.assert_array_equal(rounded.target, exact.target)
+
+
+def test_torque_that_was_sent_drives_nothing_while_motors_are_off():
+    time = times(2.0)
+    enabled = (time < 1.0).astype(float)
+    mine = run(time, target=None, tau=np.full((len(time), 2), 0.3), enabled=enabled)
+    sent = mine.sent_torque()
+    np.testing.assert_array_equal(sent, 0.3 * np.repeat(enabled[:, None], 2, axis=1))
+    cut = segments.cut([mine], 0.2, DT)
+    begins = time[cut.row[:, 0]]
+    after = np.asarray(cut.segments.feed)[:, -100:]
+    np.testing.assert_allclose(after[begins > 1.0], 0.0)
+    np.testing.assert_allclose(after[begins < 0.7], 0.3, rtol=1e-6)
+    assert not run(time, tau=np.ones((len(time), 2))).sent_torque().any()

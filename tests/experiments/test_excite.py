@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from envs import models
-from envs.logs import read, write
+from envs.logs import Controller, read, write
 from experiments import excite
 from experiments.discovery.blind_cases import ARM
-from experiments.discovery.excitation import MOTIONS, deciding, excitation
+from experiments.discovery.excitation import MOTIONS, deciding, excitation, scaled
 
 JOINTS = ("shoulder", "elbow")
 LEG = """<mujoco model="leg">
@@ -177,3 +177,20 @@ def test_a_folder_that_is_not_empty_is_left_as_it_is(tmp_path):
     with pytest.raises(ValueError, match="out: got"):
         excite.main(excite.Args(out=tmp_path, robot=str(ARM)))
     assert [path.name for path in Path(tmp_path).iterdir()] == ["mine"]
+
+
+def test_a_slide_joint_needs_a_range():
+    text = """<mujoco><worldbody>
+      <body><joint name="rail" type="slide" {}/><geom size="0.1"/></body>
+    </worldbody></mujoco>"""
+    with pytest.raises(ValueError, match="slide joint 'rail' has no range, expected one in the MJCF, in m"):
+        excitation(mujoco.MjSpec.from_string(text.format("")), ("rail",), 4, 2.0, 100.0)
+    spec = mujoco.MjSpec.from_string(text.format('range="-0.1 0.3" limited="true"'))
+    for motion in excitation(spec, ("rail",), 4, 2.0, 100.0):
+        assert -0.1 <= motion.target.min() < motion.target.max() <= 0.3
+
+
+def test_half_the_gain_of_a_servo_is_half_of_its_gain():
+    gains = {"gain": np.array([4.0]), "kt": np.array([0.5]), "resistance_ohm": np.array([2.0])}
+    found = scaled(Controller(kind="servo", rate_hz=500.0, gains=gains), 0.5).gains
+    assert (found["gain"], found["kt"], found["resistance_ohm"]) == (2.0, 0.5, 2.0)

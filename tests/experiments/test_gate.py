@@ -16,7 +16,7 @@ from experiments.discovery import gate
 from experiments.discovery.blind_cases import ARM
 from experiments.discovery.blind_robots import Truth, record
 from experiments.discovery.excitation import excitation
-from experiments.discovery.setup import read_logs
+from experiments.discovery.setup import digest, read_logs
 
 JOINTS = ("shoulder", "elbow")
 GAINS = {"kp": np.array([40.0, 20.0]), "kd": np.array([2.0, 0.8]), "torque_limit_nm": np.array([15.0, 15.0])}
@@ -241,3 +241,40 @@ def test_the_doctor_looks_at_the_model_whose_flags_were_cleared(tmp_path, good):
     log, spec = read_logs([folder], clear_flags=True)
     assert gate.check(log, spec, HORIZONS) == []
     assert log.notes == ("flags of the model that disabled gravity were cleared",)
+
+
+def slower(log, number, every):
+    """The log with every so-manyth row of one run."""
+    run = log.runs[number]
+    run = replace(run, time=run.time[::every], signals={name: values[::every] for name, values in run.signals.items()})
+    return replace(log, runs=(*log.runs[:number], run, *log.runs[number + 1 :]))
+
+
+def test_runs_of_different_rates_are_refused(good):
+    with pytest.raises(ValueError, match=r"run_002: got 250 rows a second, expected 500 as in run_000"):
+        check(slower(good, 2, 2))
+
+
+def test_runs_of_one_name_in_several_folders_are_conditions_of_their_own(tmp_path, good):
+    folders = [tmp_path / f"log_{number}" for number in range(4)]
+    for folder, run in zip(folders, good.runs, strict=True):
+        write(replace(good, runs=(replace(run, name="run_000", condition="run_000", split=None),)), folder)
+    log, _ = read_logs(folders)
+    assert [run.condition for run in log.runs] == [f"run_000_{number}" for number in range(4)]
+    assert log.notes == ()
+
+
+def test_a_log_that_was_corrected_is_another_question(tmp_path, good):
+    write(good, tmp_path / "log")
+    log, spec = read_logs([tmp_path / "log"])
+    assert digest(log, spec) == digest(*read_logs([tmp_path / "log"]))
+    heavier = spec.copy()
+    heavier.geoms[0].mass *= 1.1
+    others = [
+        digest(log, heavier),
+        digest(gains(log, kp=np.array([41.0, 20.0])), spec),
+        digest(signals(log, q=lambda values: -values), spec),
+        digest(replace(log, runs=log.runs[1:]), spec),
+        digest(replace(log, runs=(replace(log.runs[0], split="sealed"), *log.runs[1:])), spec),
+    ]
+    assert len({digest(log, spec), *others}) == 6

@@ -53,6 +53,16 @@ def folder(arm, quick, tmp_path_factory):
     return folder
 
 
+@pytest.mark.filterwarnings("ignore:.*settotalmass:UserWarning")
+@pytest.mark.parametrize("compiler", ['inertiafromgeom="true"', 'settotalmass="5"'])
+def test_a_compiler_that_computes_masses_anew_undoes_no_correction(tmp_path, compiler):
+    spec = mujoco.MjSpec.from_string(rigs.ARM.replace("<compiler ", f"<compiler {compiler} "))
+    arm = rigs.Player(Rig(spec, rigs.ARM_JOINTS, rigs.CONTROL_HZ))
+    corrected.save(tmp_path, spec, arm.rig, arm.vector(link_mass={"lower": {"ratio": 1.5}}))
+    rig, _ = corrected.load(tmp_path)
+    np.testing.assert_allclose(rig.mj_model.body_mass, arm.rig.mj_model.body_mass * [1.0, 1.0, 1.5], rtol=1e-5)
+
+
 def test_saved_and_loaded_it_moves_the_same(arm, folder):
     start = np.array([0.5, -0.7])
     segment = rigs.segment(arm.rig, start, start + np.array([0.3, 0.5]), kp=12.0, kd=0.3, limit=3.0)

@@ -73,6 +73,25 @@ def test_units_signs_and_names_become_the_models(tmp_path):
         np.testing.assert_allclose(run.signals[signal], expected, rtol=1e-12)
 
 
+def test_slide_joints_are_in_metres_whatever_the_unit_of_angles(tmp_path):
+    folder = put(tmp_path / "log", meta={"robot": "arm.xml", "units": {"angle": "deg"}})
+    (folder / "arm.xml").write_text(
+        """<mujoco><worldbody><body><joint name="left_hip" type="slide"/><geom size=".1"/>
+        <body><joint name="left_knee"/><geom size=".1"/></body></body></worldbody></mujoco>"""
+    )
+    (run,) = logs.read(folder).runs
+    for signal in ("q", "dq", "target"):
+        expected = np.stack([columns()[f"{signal}.{joint}"] for joint in JOINTS], axis=1) * [1.0, np.pi / 180]
+        np.testing.assert_allclose(run.signals[signal], expected, rtol=1e-12)
+
+
+def test_time_stamps_of_a_wall_clock_begin_at_zero(tmp_path):
+    (run,) = logs.read(put(tmp_path / "log", columns() | {"t": 1.7e9 + columns()["t"]})).runs
+    np.testing.assert_allclose(run.time, columns()["t"], atol=2.5e-7)
+    (run,) = logs.read(put(tmp_path / "log", columns() | {"t": 5.0 + columns()["t"]})).runs
+    np.testing.assert_array_equal(run.time, 5.0 + columns()["t"])
+
+
 def test_swapped_columns_are_swapped_back(tmp_path):
     meta = {"columns": {"q.left_hip": "q.left_knee", "q.left_knee": "q.left_hip"}}
     (run,) = logs.read(put(tmp_path / "log", meta=meta)).runs

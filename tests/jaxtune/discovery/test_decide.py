@@ -160,6 +160,13 @@ def test_whole_runs_are_drawn_where_there_are_enough():
     assert len(set(zip(run.tolist(), blocks.tolist(), strict=True))) == len(set(blocks.tolist())) == 12
 
 
+def test_blocks_stay_within_runs_of_any_number_and_length():
+    run = np.repeat([0, 2, 1, 3], [9, 9, 5, 7])
+    blocks = units(run, np.random.default_rng(0).normal(size=(30, 1)) ** 2, 2)
+    assert all(len(np.unique(run[blocks == number])) == 1 for number in np.unique(blocks))
+    assert len(np.unique(blocks)) > 4
+
+
 def test_blocks_are_longer_than_the_correlation():
     rng = np.random.default_rng(0)
     run = np.zeros(400, int)

@@ -1,0 +1,44 @@
+"""Sizes of coordinates, from what a robot did in a log."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from envs.logs import Controller, Log, Run
+from envs.null_logs import simulate_null_logs
+from envs.regimes import control_torque
+from envs.rig import Rig
+from envs.scales import measure_scales
+from envs.smoothing import smoothed
+from tests.rigs import ARM, ARM_JOINTS
+
+
+@pytest.mark.parametrize("kp", [[40.0, 20.0], [40.0, 0.0]], ids=["driven", "passive"])
+def test_a_torque_of_one_is_what_moves_the_joint(kp):
+    """The elbow swings under what the shoulder does."""
+    time = np.arange(1000) / 200.0
+    target = np.sin(2 * np.pi * time)[:, None] * [0.8, 0.0]
+    gains = {"kp": np.array(kp), "kd": np.array([2.0, 0.4 if kp[1] else 0.0]), "torque_limit_nm": np.full(2, np.inf)}
+    run = Run(
+        name="run_000",
+        condition="a",
+        split=None,
+        controller=Controller(kind="pd", rate_hz=500.0, gains=gains, between_rows="hold"),
+        time=time,
+        signals={"q": np.zeros_like(target), "target": target},
+        known={"q": {"noise_sd": np.full(2, 1e-5)}},
+    )
+    log = Log(robot="", base="fixed", rate_hz=200.0, joints=ARM_JOINTS, policy=None, runs=(run,))
+    spec = mujoco.MjSpec.from_string(ARM)
+    (played,) = simulate_null_logs(log, spec, 1, 0)
+    found = measure_scales(Rig(spec, ARM_JOINTS, 500.0), played.runs)
+    commanded, _ = control_torque(played.runs[0], *np.moveaxis(smoothed(played.runs[0]), 1, 0))
+    rms = np.sqrt((commanded**2).mean(axis=0))
+    assert found["torque"][0] == pytest.approx(rms[0], rel=1e-4)
+    if kp[1]:
+        assert found["torque"][1] == pytest.approx(rms[1], rel=1e-4)
+    else:
+        assert not rms[1]
+        # The weight of 0.6 kg, 0.125 m from the elbow, would be 0.74 Nm if it hung level.
+        assert 0.05 < found["torque"][1] < 2.0
+    np.testing.assert_allclose(found["damping"] * found["speed"], found["torque"], rtol=1e-5)
