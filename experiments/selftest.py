@@ -188,6 +188,8 @@ def show(reports: Mapping[int, SelfTest]) -> None:
             table.add_row(name, "", "", "", _rate(rate), "")
         console.print(table)
         console.print(f"all true values in their intervals: {_rate(report.covered)}", markup=False)
+        for name, count in report.unusable.items():
+            console.print(f"{name}: {count} sets are too short or not finite, and are not counted", markup=False)
         for place, text in selftest.whole_tunings(report).items():
             console.print(f"{place}: {text}", markup=False)
     for line in lacking(reports):

@@ -85,7 +85,7 @@ def check_states(measured: Trajectory, simulated: Trajectory, config: TunerConfi
 
     Raises:
       ValueError: one of them has no states, a measured state has a name or a shape that simulated ones have not, or
-        episodes are no longer than a piece.
+        episodes are no longer than a piece, or there are fewer held-out sets than are to be fitted.
     """
     for source, episodes in (("measured", measured), ("simulate", simulated)):
         if not isinstance(episodes.state, Mapping):
@@ -98,6 +98,10 @@ def check_states(measured: Trajectory, simulated: Trajectory, config: TunerConfi
             shape = (*np.shape(measured.alive), *np.shape(expected)[np.ndim(simulated.alive) :])
             if np.shape(got) != shape:
                 raise ValueError(f"measured, state, {name}: got shape {np.shape(got)}, expected {shape}")
+    if not 1 <= config.replay.sets <= config.held_out_sets:
+        raise ValueError(
+            f"ReplayConfig.sets: got {config.replay.sets}, expected 1 to {config.held_out_sets} held-out sets"
+        )
     steps = np.shape(measured.alive)[1]
     if steps <= config.replay.window:
         raise ValueError(

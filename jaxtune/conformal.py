@@ -3,11 +3,18 @@
 import jax
 import jax.numpy as jnp
 
+_ROUNDING = 1e-5  # less than the distance of two p-values of as many sets as anybody simulates
+
 
 def p_value(scores: jax.Array) -> jax.Array:
     """The conformal p-value of the last score among all [sets + 1]; nan where it is."""
     p_value = (1 + jnp.sum(scores[:-1] >= scores[-1])) / len(scores)
     return jnp.where(jnp.isnan(scores[-1]), jnp.nan, p_value)
+
+
+def rejects(p_value: jax.Array, level: jax.Array | float) -> jax.Array:
+    """Whether a p-value is at most `1 - level`. Both are rounded, which must not cost a rank; nan rejects nothing."""
+    return p_value <= 1.0 - level + _ROUNDING
 
 
 def quantile(values: jax.Array, level: jax.Array | float) -> jax.Array:

@@ -30,7 +30,8 @@ def make(centre: Coords, radius: float, lower: Coords, upper: Coords) -> ParamDi
       upper: largest coordinate by name.
 
     Raises:
-      ValueError: names differ, the radius is not a positive number, or a centre lies outside its bounds.
+      ValueError: names differ, the radius is not a positive number, bounds leave no room, or a centre lies outside
+        them.
     """
     if isinstance(radius, str) or not 0 < radius < math.inf:
         raise ValueError(f"radius: got {radius!r}, expected a positive number")
@@ -38,6 +39,10 @@ def make(centre: Coords, radius: float, lower: Coords, upper: Coords) -> ParamDi
         if set(named) != set(centre):
             raise ValueError(f"{field}: got {sorted(named)}, expected {sorted(centre)}")
     for name, value in centre.items():
+        if not lower[name] < upper[name]:
+            raise ValueError(
+                f"lower['{name}']: got {lower[name]}, expected less than {upper[name]}; leave out what is not searched"
+            )
         if not lower[name] <= value <= upper[name]:
             raise ValueError(f"centre['{name}']: got {value}, expected {lower[name]} to {upper[name]}")
 
@@ -152,4 +157,15 @@ def move(dist: ParamDist, step: Float[Array, " coords"]) -> ParamDist:
     """
     centre = ravel(dist.centre) + ravel(dist.radius) * step
     centre = jnp.clip(centre, ravel(dist.lower), ravel(dist.upper))
-    return dist.replace(centre=unravel(names(dist), centre))
+    return dist.replace(centre=unravel(names(dist), centre.astype(jnp.float32)))
+
+
+def narrow(dist: ParamDist, interval: Float[Array, " coords"], least: float) -> ParamDist:
+    """Narrows every radius to an interval in radii, no further than to `least` in coordinates; none grows.
+
+    A radius whose interval is nan stays.
+    """
+    radius = ravel(dist.radius)
+    narrowed = jnp.clip(radius * interval, jnp.minimum(least, radius), radius)
+    narrowed = jnp.where(jnp.isnan(interval), radius, narrowed)
+    return dist.replace(radius=unravel(names(dist), narrowed.astype(jnp.float32)))

@@ -33,6 +33,7 @@ from jaxtune.types import Trajectory
 _STRIDE = 2
 _LAYERS = 4  # they shorten a window of 50 steps to 25, 13, 7 and 4
 # A channel without noise (the gait clock) would otherwise raise the ELBO without limit as its learned noise shrinks.
+_AWAY = 1e4  # where references lie that there are no windows for: within no reach
 _MIN_LOG_STD = -3.0
 
 
@@ -174,11 +175,13 @@ def train(key: jax.Array, config: DVMConfig, trajectory: Trajectory) -> tuple[DV
     (variables, _), losses = jax.lax.scan(
         descend, (variables, optimizer.init(variables)), jax.random.split(key_train, config.train_steps)
     )
-    window, _ = windows.draw(key_reference, trajectory, config.references, config.window)
+    # Not one of them twice, or copies would be each other's neighbours.
+    window, valid = windows.choose(key_reference, trajectory, config.references, config.window)
     elbo, latent = _evaluate(config, variables, scaler, window)
+    latent = jnp.where(valid[:, None], latent, _AWAY)
     # The first neighbour of a reference is itself.
     own, _ = jax.lax.top_k(-_distances(latent, latent), config.neighbours + 1)
-    reach = jnp.quantile(-own[:, -1], config.reach)
+    reach = jnp.nanquantile(jnp.where(valid, -own[:, -1], jnp.nan), config.reach)
     dvm = DVM(variables=variables, scaler=scaler, latent=latent, elbo=elbo, reach=reach)
     return dvm, -losses[-max(config.train_steps // 10, 1) :].mean() / scale
 
@@ -204,10 +207,7 @@ def novelty(
     near = -closeness <= dvm.reach
     mean = jnp.sum(jnp.where(near, dvm.elbo[index], 0.0), axis=-1) / jnp.maximum(near.sum(axis=-1), 1)
     # Observations that never change in simulation say nothing of a robot, so there is no novelty to compute.
-    channels = trajectory.obs.shape[-1]
-    rounding = 1e-5 * jnp.abs(dvm.scaler.mean[:channels])
-    varies = jnp.any(dvm.scaler.std[:channels] > windows.MIN_STD + rounding)
-    elbo = jnp.where(varies, elbo, jnp.nan)
+    elbo = jnp.where(dvm.scaler.varies[: trajectory.obs.shape[-1]].any(), elbo, jnp.nan)
     # A window that is not finite must stay nan for the gate to see it, not pass for one without a neighbour.
     covered = near.any(axis=-1) | jnp.isnan(elbo)
     return jnp.where(covered, mean - elbo, 0.0), valid.reshape(-1), covered

@@ -70,7 +70,10 @@ def misfits(
 
     shared = (model, ways, in_phases, involved, weight)
     channels, phases = of_all_sets(one, shared, collected, measured)
-    return Misfits(channels=_in_medians(channels), phases=_in_medians(phases))
+    phases = _in_medians(phases)
+    # No moment of a channel that never varies is read: that it is off shows in its mean alone.
+    channels = jnp.where(involved.any(axis=1), _in_medians(channels), jnp.nanmax(phases, axis=0))
+    return Misfits(channels=channels, phases=phases)
 
 
 def _means(steps: windows.Scaler, episodes: Trajectory, phase: Phase) -> tuple[jax.Array, jax.Array]:

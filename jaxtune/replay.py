@@ -68,7 +68,13 @@ class ReplayConfig:
     iterations: int = 6
     """Gauss-Newton steps."""
     sets: int = 19
-    """Simulated sets that are fitted beside the measured one. A level of 0.95 needs 19."""
+    """Simulated sets that are fitted beside the measured one. A level of 0.95 needs 19. As many again say how features
+    err; with fewer than twice as many held-out sets, these are partly the same, and p-values too small."""
+
+    @property
+    def parts(self) -> tuple[slice, slice]:
+        """Of the held-out sets: those that are fitted, and those that say how features err."""
+        return slice(self.sets), slice(-self.sets, None)
 
 
 @chex.dataclass(frozen=True)
@@ -113,11 +119,13 @@ def estimate(
     measured: Trajectory,
     dist: ParamDist,
     coverage: float,
+    others: Trajectory,
+    true_others: Coords,
 ) -> Replayed:
     """Estimates the coordinates of a measured set, and how far the estimate may be off.
 
     Each set is fitted by itself, from the centre of the distribution. With Q the conformal quantile over simulated
-    sets and e the standard errors of a fit, joined with the median error of simulated sets,
+    sets and e the standard errors of a fit, joined with the median error of the other simulated sets,
 
         interval = e(measured) Q(max over coordinates of |estimate - truth| / e).
 
@@ -129,35 +137,57 @@ def estimate(
       measured: the set with states, [episodes, time].
       dist: a distribution near the truth; estimates may leave it, but not its bounds.
       coverage: share of sets of which all true coordinates shall lie in their intervals.
+      others: as many simulated sets again, which say how features err. Others than the fitted ones: what was learnt of
+        a set fits it better than it fits the measured one.
+      true_others: their coordinates.
+
+    Returns:
+      What was found; not finite where the measured set has no whole piece, or hardly any simulated one has.
     """
-    # What the measured states lack, the simulated ones must do without.
-    lean = simulated.replace(state={name: simulated.state[name] for name in measured.state})
-    every = jax.tree.map(lambda sets, one: jnp.concatenate([sets, one[None]]), lean, measured)
-    pieces = jax.vmap(lambda episodes: _cut(config, replay, episodes))(every)
-    truth = dists.normalise(dist, truth)
-    fits = _fit(config, replay, pieces, truth, dist)
-    error = fits.best[:-1] - truth
+
+    def cut(sets):
+        # What the measured states lack, the simulated ones must do without.
+        lean = sets.replace(state={name: sets.state[name] for name in measured.state})
+        every = jax.tree.map(lambda sets, one: jnp.concatenate([sets, one[None]]), lean, measured)
+        return jax.vmap(lambda episodes: _cut(config, replay, episodes))(every)
+
+    pieces, truth = cut(simulated), dists.normalise(dist, truth)
+    fits = _fit(config, replay, pieces, cut(others), dists.normalise(dist, true_others), dist)
+    # A set without a piece says nothing, and counts as one that is fitted badly.
+    known = pieces.valid.any(axis=-1)
+    error = jnp.where(known[:-1, None], fits.best[:-1] - truth, jnp.nan)
     deviations = jax.vmap(lambda normal: jnp.sqrt(jnp.diag(jnp.linalg.inv(normal))))(fits.normal)
     # Slopes that jump make some standard errors far too small.
-    deviations = jnp.hypot(deviations, jnp.maximum(jnp.median(jnp.abs(error), axis=0), _CLOSEST))
+    deviations = jnp.hypot(deviations, jnp.maximum(_medians(jnp.abs(error)), _CLOSEST))
     scaled = (jnp.abs(error) / deviations[:-1]).max(axis=-1)
-    logs = jnp.where(pieces.valid, jnp.log1p(fits.energy), 0.0).sum(axis=-1)
+    logs = jnp.where(pieces.valid, jnp.log1p(fits.energy), 0.0).sum(axis=-1) / jnp.maximum(pieces.valid.sum(axis=-1), 1)
+    left = jnp.nan_to_num(error)
     return Replayed(
-        estimate=fits.best[-1],
+        estimate=jnp.where(known[-1], fits.best[-1], jnp.nan),
         interval=deviations[-1] * conformal.quantile(scaled, coverage),
-        errors=error.T @ error / len(error),
-        p_value=conformal.p_value(logs / jnp.maximum(pieces.valid.sum(axis=-1), 1)),
+        errors=left.T @ left / known[:-1].sum(),
+        p_value=conformal.p_value(jnp.where(known, logs, jnp.inf)),
     )
 
 
-def _fit(config: ReplayConfig, replay: Replay, pieces: _Pieces, truth: jax.Array, dist: ParamDist) -> _Fit:
+def _medians(values: Float[Array, "sets coords"]) -> Float[Array, "sets+1 coords"]:
+    """The median over all other sets of each set and, last, over all sets: as if each were the measured one."""
+    own = jnp.eye(len(values), dtype=bool)[..., None]
+    others = jnp.nanmedian(jnp.where(own, jnp.nan, values), axis=1)
+    return jnp.concatenate([others, jnp.nanmedian(values, axis=0)[None]])
+
+
+def _fit(
+    config: ReplayConfig, replay: Replay, pieces: _Pieces, others: _Pieces, truth: jax.Array, dist: ParamDist
+) -> _Fit:
     """Fits the pieces of all sets, each set by itself and all side by side.
 
     Args:
       config: sizes.
       replay: simulates pieces.
       pieces: of the simulated sets and, last, of the measured one, [sets + 1, pieces, ...].
-      truth: [sets, coords] of the simulated ones, in radii.
+      others: of the sets that say how features err, and one that is not read.
+      truth: [sets, coords] of these, in radii.
       dist: whose radii and bounds are meant.
     """
     names, (count, coords) = dists.names(dist), truth.shape
@@ -178,11 +208,11 @@ def _fit(config: ReplayConfig, replay: Replay, pieces: _Pieces, truth: jax.Array
         tried = jax.vmap(lambda fit: jnp.clip(fit.best + fit.step, low, high))(fits)
         secants = jax.vmap(lambda fit, trial: _secants(fit, trial, low, high))(fits, tried)
         around = tried[:, None] + jnp.concatenate([jnp.zeros((1, coords)), jnp.eye(coords)]) * secants[:, None]
-        points = jnp.where(number == 0, probes, around)
+        points, mine = optax.tree.where(number == 0, (probes, others), (around, pieces))
         left = devices.in_chunks(
-            misses, (pieces, points), _SETS, shared=(dists.ravel(dist.centre), dists.ravel(dist.radius))
+            misses, (mine, points), _SETS, shared=(dists.ravel(dist.centre), dists.ravel(dist.radius))
         )
-        learn = lambda: _whitening(left[:-1, 0], left[:-1, 1], pieces.valid[:-1])  # noqa: E731
+        learn = lambda: _whitening(left[:-1, 0], left[:-1, 1], others.valid[:-1])  # noqa: E731
         whitening = jax.lax.cond(number == 0, learn, lambda: whitening)
         white = left / whitening.size @ whitening.inverse.T
         white = jnp.where(jnp.isfinite(white).all(axis=-1, keepdims=True), white, _BROKEN)

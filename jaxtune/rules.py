@@ -23,6 +23,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
+from typing import Any
 
 import chex
 import jax
@@ -41,6 +42,7 @@ from jaxtune.types import ParamDist, Trajectory
 _IDENTIFIABLE = 0.9
 # Least distance of median and 0.9-quantile of each statistic, where all simulated sets are alike.
 _LEAST_SPREAD = {"cover": 0.02, "lost": 0.1, "misfit": 0.05, "beyond": 0.1}
+_EACH, _MOST = 0.1, 5  # share of all misses that one reading's box may have, and readings that are allowed for
 _SAME = 1e-6  # of an observation's size: it does not change
 LEAST_ERROR = 1e-4
 """Radii; without noise a regression may be exact."""
@@ -144,6 +146,18 @@ class Collected:
     held_out: Trajectory  # [sets, set_episodes, time]
     held_out_coords: dict  # true coordinates of the held-out sets, [sets] by name
     dist: ParamDist  # what all coordinates were drawn from
+    # What `examine` reads of these and the measured set; gate and update read it themselves where it is None.
+    reading: Any = None
+
+
+@chex.dataclass(frozen=True)
+class Reading:
+    """What regression and response surface say of all held-out sets and, last, of the measured one."""
+
+    model: regression.Regression
+    answers: jax.Array  # [sets + 1, coords] estimates in radii, which may lie beyond the box
+    misfit: jax.Array  # [sets + 1] of the four statistics of `calibrated_gate`; nan for a set without a valid window
+    beyond: jax.Array  # [sets + 1] likewise
 
 
 @chex.dataclass(frozen=True)
@@ -238,8 +252,8 @@ def calibrated_gate(
     cover = _mean_ranks(jnp.where(covered, novelty, jnp.inf), valid)
     alive = jnp.concatenate([collected.held_out.alive, measured.alive[None]]).mean(axis=(1, 2))
     statistics = {"cover": cover, "lost": jnp.abs(alive - collected.trajectory.alive.mean())}
-    _, _, found = _examined(config, collected, measured)
-    excess = {name: _excess(name, values) for name, values in (statistics | found).items()}
+    statistics |= _misses(_reading(config, collected, measured))
+    excess = {name: _excess(name, values) for name, values in statistics.items()}
     fixed = ~jnp.isnan(knobs.threshold)
     every = jnp.where(fixed, cover, jnp.nanmax(jnp.stack([*excess.values()]), axis=0))
     calibration, value = every[:-1], jnp.where(sane[-1], every[-1], jnp.nan)
@@ -278,15 +292,8 @@ def _mean_ranks(novelty: jax.Array, valid: jax.Array) -> jax.Array:
     return jnp.where(valid.any(axis=-1), jnp.sum(share * jnp.where(valid, rank, 0.0), axis=-1), jnp.nan)
 
 
-def _examined(
-    config: TunerConfig, collected: Collected, measured: Trajectory
-) -> tuple[regression.Regression, jax.Array, dict[str, jax.Array]]:
-    """Estimates all sets by regression, and computes how well they fit.
-
-    Returns:
-      The regression; estimates [sets + 1, coords] in radii, which may lie beyond the box; and `misfit` and `beyond`
-      [sets + 1] by name, nan for a set without a valid window. The measured set is the last.
-    """
+def examine(config: TunerConfig, collected: Collected, measured: Trajectory) -> Reading:
+    """Estimates all sets by regression, and computes how well they fit."""
     model, ways = fit(config, collected)
     scale = jnp.maximum(model.error, LEAST_ERROR)
 
@@ -298,7 +305,15 @@ def _examined(
         return answer, jnp.where(known, jnp.log(jnp.maximum(off, 1e-9)), jnp.nan), jnp.where(known, beyond, jnp.nan)
 
     answers, misfit, beyond = of_all_sets(one, (model, ways, scale), collected, measured)
-    return model, answers, {"misfit": misfit, "beyond": beyond}
+    return Reading(model=model, answers=answers, misfit=misfit, beyond=beyond)
+
+
+def _reading(config: TunerConfig, collected: Collected, measured: Trajectory) -> Reading:
+    return examine(config, collected, measured) if collected.reading is None else collected.reading
+
+
+def _misses(reading: Reading) -> dict[str, jax.Array]:
+    return {"misfit": reading.misfit, "beyond": reading.beyond}
 
 
 def _excess(name: str, values: jax.Array) -> jax.Array:
@@ -355,14 +370,19 @@ def posterior_update(
     episode that it leaves out, and all values in radii,
 
         interval     = e Q(max over coordinates of |estimate - truth| / e)
+        wide         = the same with a quantile of 1 - (1 - coverage) / 10
         ignorant     = Q(|middle of the box - truth|)
         identifiable = Q(|estimate - truth|) < 0.9 ignorant
         step         = estimate(measured)                           where identifiable, else 0
-        radius      <- max(radius * interval, min_radius)           where identifiable, if all are inside; never larger
+        radius      <- max(radius * wide, min_radius)               where identifiable, if all are inside; never larger
 
     The intervals hold together: all truths at once lie in them with probability `coverage`, if the measured set is a
-    draw like the held-out ones. A coordinate that is not identifiable keeps centre and radius. Where the interval of
-    one that is reaches past the box, and not merely past a bound, all keep their radii, and centres move.
+    draw like the held-out ones. It no longer is where a narrower box than the truth's was drawn from, and every
+    refinement draws from a narrower one. So the box is narrowed to `wide`, which misses a tenth as often, and the
+    quantile Q is by as much higher as all refinements may miss: `1 - (1 - coverage) (1 - refinements / 10)`.
+
+    A coordinate that is not identifiable keeps centre and radius. Where the interval of one that is reaches past the
+    box, and not merely past a bound, all keep their radii, and centres move.
 
     Args:
       key: not used.
@@ -372,22 +392,23 @@ def posterior_update(
       dist: the distribution that the episodes were drawn from.
       knobs: not used.
     """
-    model, answers, found = _examined(config, collected, measured)
-    low, high = dists.normalised_box(dist)
-    estimates = jnp.clip(answers, low, high)
+    reading = _reading(config, collected, measured)
+    model, (low, high) = reading.model, dists.normalised_box(dist)
+    estimates = jnp.clip(reading.answers, low, high)
     held_out, estimate = estimates[:-1], estimates[-1]
     # The errors on robots with known coordinates stand for the error on the measured one.
     truth = dists.normalise(dist, collected.held_out_coords)
     error = jnp.abs(held_out - truth)
     # What scales the errors must not come from the sets that calibrate them.
     scale = jnp.maximum(model.error, LEAST_ERROR)
-    interval = scale * conformal.quantile((error / scale).max(axis=-1), config.coverage)
+    missed = 1.0 - config.coverage
+    interval, wide = (
+        scale * conformal.quantile((error / scale).max(axis=-1), 1.0 - share * missed)
+        for share in (1.0 - _EACH * min(config.refinements, _MOST), _EACH)
+    )
     ignorant = conformal.quantile(jnp.abs((low + high) / 2 - truth), config.coverage)
     identifiable = conformal.quantile(error, config.coverage) < _IDENTIFIABLE * ignorant
     step = jnp.where(identifiable, estimate, 0.0)
-    moved = dists.move(dist, step)
-    radius = dists.ravel(dist.radius)
-    narrowed = jnp.clip(radius * interval, jnp.minimum(config.min_radius, radius), radius)
     # Held-out truths all lie in the box, so their errors say nothing of truths beyond it. One that is outside in one
     # coordinate may bend the estimates of all, and narrowing could exclude it for good.
     # No truth lies beyond a physical bound.
@@ -395,9 +416,8 @@ def posterior_update(
     below, above = (jnp.isclose(*pair, atol=1e-4) for pair in zip((low, high), ends, strict=True))
     inside = ((step - interval >= low) | below) & ((step + interval <= high) | above)
     inside = (inside | ~identifiable).all()
-    radius = jnp.where(identifiable & inside, narrowed, radius)
-    moved = moved.replace(radius=dists.unravel(dists.names(dist), radius))
-    excess = {name: _excess(name, values) for name, values in found.items()}
+    moved = dists.narrow(dists.move(dist, step), jnp.where(identifiable & inside, wide, 1.0), config.min_radius)
+    excess = {name: _excess(name, values) for name, values in _misses(reading).items()}
     return moved, UpdateInfo(
         step=step,
         interval=interval,

@@ -38,12 +38,12 @@ class Rate:
     Attributes:
       hits: how many.
       of: of how many.
-      by_gate: hits of every gate, each of as many robots; empty where they are not counted by gate.
+      by_gate: the same two of every gate; empty where they are not counted by gate.
     """
 
     hits: int
     of: int
-    by_gate: tuple[int, ...] = ()
+    by_gate: tuple[tuple[int, int], ...] = ()
 
     @property
     def share(self) -> float:
@@ -53,11 +53,12 @@ class Rate:
     @property
     def independent(self) -> float:
         """How many independent robots say as much: fewer than there are if gates differ by more than chance."""
-        if len(self.by_gate) < 2 or self.hits in (0, self.of):
+        counted = np.array([pair for pair in self.by_gate if pair[1]], float)
+        if len(counted) < 2 or self.hits in (0, self.of):
             return float(self.of)
-        each = self.of / len(self.by_gate)
-        chance = self.share * (1.0 - self.share) / each
-        return self.of * chance / max(chance, float(np.var(np.array(self.by_gate) / each, ddof=1)))
+        hits, each = counted.T
+        chance = self.share * (1.0 - self.share) / each.mean()
+        return self.of * chance / max(chance, float(np.var(hits / each, ddof=1)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,16 +93,18 @@ class SelfTest:
     others: dict[str, Rate]
     """Robots rejected of which something else is different, by name."""
     identified: dict[str, Rate]
-    """Robots inside of which the first update called the coordinate identifiable."""
+    """Robots inside and accepted of which the first update called the coordinate identifiable."""
     error: dict[str, float]
     """Median |estimate - truth| of the first update in coordinates, where identifiable; nan where never."""
     interval: dict[str, float]
     """Median half width of its interval, likewise."""
     covered: Rate
-    """Robots inside whose identifiable coordinates all lie in their intervals; of those that have intervals, which
-    `vote_update` gives none."""
+    """Robots inside and accepted whose identifiable coordinates all lie in their intervals; of those that have
+    intervals, which `vote_update` gives none."""
     tuned: dict[str, tuple[Tuned, ...]]
     """Whole tunings in their order, by case; empty where none was run."""
+    unusable: dict[str, int]
+    """Sets that were too short or not finite, by case, where there are any. No rate counts them."""
 
 
 def run(
@@ -144,14 +147,17 @@ def run(
     cases = [{}, *outside.values(), *others.values()]
     calls = _call(key_gates, tuner, state, cases, extra, robots, gates, lambda number: done(number, total))
     rejected, noticed = (
-        [_count(column) for column in np.moveaxis(calls[name], 1, 0)] for name in ("rejected", "noticed")
+        [_told(column) for column in np.moveaxis(calls[name], 1, 0)] for name in ("rejected", "noticed")
     )
+    unusable = np.isnan(calls["rejected"]).sum(axis=(0, 2)).tolist()
     ends = len(outside) + 1
     whole_cases = {INSIDE: {}} | others if whole else {}
     tuned = _tune(
         key_whole, tuner, state, whole_cases, extra, whole, tunings, lambda number: done(gates + number, total)
     )
-    known, errors, intervals = (calls[name] for name in ("identifiable", "errors", "intervals"))
+    errors, intervals = calls["errors"], calls["intervals"]
+    accepted = calls["rejected"][:, 0] == 0.0
+    known = calls["identifiable"] & accepted[..., None]
     unit, order = np.asarray(dists.ravel(state.dist.radius)), dists.names(state.dist)
     columns = lambda values: dict(zip(order, np.moveaxis(values, -1, 0), strict=True))  # noqa: E731
     median = lambda values: {  # noqa: E731
@@ -165,11 +171,12 @@ def run(
         outside=dict(zip(outside, rejected[1:ends], strict=True)),
         noticed=dict(zip(outside, noticed[1:ends], strict=True)),
         others=dict(zip(others, rejected[ends:], strict=True)),
-        identified={name: _count(column) for name, column in columns(known).items()},
+        identified={name: _told(np.where(accepted, column, np.nan)) for name, column in columns(known).items()},
         error=median(errors),
         interval=median(intervals),
-        covered=_told(_covers(errors, intervals, known)),
+        covered=_told(np.where(accepted, _covers(errors, intervals, known), np.nan)),
         tuned=tuned,
+        unusable={name: count for name, count in zip([INSIDE, *outside, *others], unusable, strict=True) if count},
     )
 
 
@@ -186,8 +193,8 @@ def _call(
     """Calls gate and update for the robots of every case, the first of which is the one inside the distribution.
 
     Returns:
-      `rejected` and `noticed` [gates, cases, robots]; of the robots inside, `identifiable`, and `errors` and
-      `intervals` in radii, [gates, robots, coords].
+      `rejected` and `noticed` [gates, cases, robots]: 1, 0, or nan where the set is unusable; of the robots inside,
+      `identifiable`, and `errors` and `intervals` in radii, [gates, robots, coords].
     """
     programs = (_scorer(tuner, robots), tuner.collect, partial(_measured, tuner))
     score, collect, measure = (devices.on_all(jax.jit(program)) for program in programs)
@@ -200,12 +207,12 @@ def _call(
         ]
         coords = jax.tree.map(lambda *rows: jnp.concatenate(rows), *drawn)
         sets, collected = measure(keys[1], state, coords), collect(keys[2], state.policy, state.dist)
-        rejected, update, moved = jax.device_get(score(keys[3], collected, sets, state))
+        rejected, usable, update, moved = jax.device_get(score(keys[3], collected, sets, state))
         truth = np.asarray(dists.normalise(state.dist, {name: drawn[0][name] for name in state.dist.centre}))
         calls.append(
             {
-                "rejected": rejected.reshape(-1, robots),
-                "noticed": (rejected | _inside(moved, coords)).reshape(-1, robots),
+                "rejected": np.where(usable, rejected, np.nan).reshape(-1, robots),
+                "noticed": np.where(usable, rejected | _inside(moved, coords), np.nan).reshape(-1, robots),
                 "identifiable": update.identifiable,
                 "errors": np.abs(update.step - truth),
                 "intervals": update.interval,
@@ -276,20 +283,15 @@ def _covers(errors: np.ndarray, intervals: np.ndarray, known: np.ndarray) -> np.
 
 
 def _told(covers: np.ndarray) -> Rate:
-    """Counts what is covered among what has intervals; by gate where all of [gates, robots] have some."""
-    if covers.ndim == 2 and not np.isnan(covers).any():
-        return _count(covers > 0)
-    return Rate(int(np.nansum(covers)), int(np.isfinite(covers).sum()))
-
-
-def _count(values: np.ndarray) -> Rate:
-    """Counts what is true of the robots of every gate, [gates, robots]."""
-    return Rate(int(values.sum()), values.size, tuple(int(hits) for hits in values.sum(axis=1)))
+    """Counts ones among what is not nan, of robots [robots], or by gate, [gates, robots]."""
+    hits, told = np.nansum(covers, axis=-1), np.isfinite(covers).sum(axis=-1)
+    by_gate = tuple((int(one), int(of)) for one, of in zip(hits, told, strict=True)) if covers.ndim == 2 else ()
+    return Rate(int(hits.sum()), int(told.sum()), by_gate)
 
 
 def summary(report: SelfTest) -> str:
     """Says in words what a self-test found: lines of text."""
-    percent = lambda rate: f"{100 * rate.share:.0f} % of {rate.of}"  # noqa: E731
+    percent = lambda rate: f"{100 * rate.share:.0f} % of {rate.of}" if rate.of else "unknown"  # noqa: E731
     lines = [
         f"false alarms: {percent(report.alarms)} (nominal {100 * (1 - report.level):.0f} %)",
         f"all true values in their intervals: {percent(report.covered)}",
@@ -301,6 +303,7 @@ def summary(report: SelfTest) -> str:
         lines.append(f"{name}: {told}; rejected one radius outside: {percent(rate)}, or then inside: {held}")
     lines += [f"{name}: rejected: {percent(rate)}" for name, rate in report.others.items()]
     lines += [f"{place}: {text}" for place, text in whole_tunings(report).items()]
+    lines += [f"{name}: {count} sets are too short or not finite" for name, count in report.unusable.items()]
     return "\n".join(lines)
 
 
@@ -363,6 +366,7 @@ def _scorer(tuner: Tuner, robots: int) -> Callable:
             lambda one: tuner.update(key_update, tuner.config, collected, one, state.dist, state.knobs)
         )(sets)
         inside = jax.tree.map(lambda leaf: leaf[:robots], update)
-        return (gate.novelty > gate.threshold) & gate.comparable, inside, moved
+        usable = gate.comparable & jnp.isfinite(gate.novelty) & jnp.isfinite(gate.threshold)
+        return gate.novelty > gate.threshold, usable, inside, moved
 
     return score

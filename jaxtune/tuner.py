@@ -24,7 +24,7 @@ ones, and trains a policy in it. One tuning is one `Tuner.step`:
 D_q holds the simulated episodes that gate and update learn from; the held-out sets imitate the measured set and
 calibrate both. Novelty says how unlike the simulated episodes the measured set is, and the threshold is the largest
 novelty that still counts as covered. The verdict is the first of these that holds:
-`not_finite` if novelty or threshold is not a finite number; `not_comparable` if the gate says so; `accept` if novelty
+`not_comparable` if the gate says so; `not_finite` if novelty or threshold is not a finite number; `accept` if novelty
 <= threshold; `unexplained` if the distribution fills its bounds and p <= 0.01; `radius_exhausted` if it fills them or
 was widened `max_widenings` times; else `widen`. A radius that was widened stays so, unless the update narrows it.
 
@@ -80,6 +80,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
+from jaxtune import conformal
 from jaxtune import dist as dists
 from jaxtune import replay as replays
 from jaxtune.checks import check_measured, check_simulated, check_states
@@ -95,6 +96,7 @@ from jaxtune.rules import (
     UpdateInfo,
     Verify,
     calibrated_gate,
+    examine,
     knobs,
     no_gate_log,
     no_update,
@@ -283,6 +285,8 @@ class Tuner:
             # Every round simulates new robots and trains its models anew, because the distribution has changed.
             key_collect, key_verify, key_update = jax.random.split(jax.random.fold_in(key, carry["rounds"]), 3)
             collected = self.collect(key_collect, state.policy, carry["dist"])
+            # Once for gate and update, and for neither where they do not read it.
+            collected = collected.replace(reading=examine(self.config, collected, measured))
             carry, last = counted(carry, collected), carry["left"] <= 0
             # Branches, so that (unless vmapped) no model is trained that is not needed.
             carry = jax.lax.cond(
@@ -371,7 +375,7 @@ class Tuner:
         dist, tested, before = carry["dist"], carry["tested"], carry["update"]
         # The gate has just tested the distribution of the first reading.
         again = carry["left"] < 1 + self.config.refinements
-        misfits = again & (update.p_value <= 1.0 - knobs.level)
+        misfits = again & conformal.rejects(update.p_value, knobs.level)
         # Tested once a tuning, so that its rate of false alarms is that of one test: at filled bounds by the gate.
         first = (carry["left"] == self.config.refinements) & ~dists.at_bounds(tested)
         unexplained = first & (update.p_misfit <= _UNEXPLAINED)
@@ -414,18 +418,18 @@ class Tuner:
           radii) are smaller than those of the estimate before, and if the measured set fits it. Radii only narrow.
         """
         dist, tested, before = carry["dist"], carry["tested"], carry["update"]
-        sizes = self.config.replay
-        sets = jax.tree.map(lambda leaf: leaf[: sizes.sets], (collected.held_out, collected.held_out_coords))
-        found = replays.estimate(sizes, self.replay, *sets, measured, dist, self.config.coverage)
+        sizes, held_out = self.config.replay, (collected.held_out, collected.held_out_coords)
+        # The last ones are others than the first where there are twice as many.
+        first, last = (jax.tree.map(lambda leaf, part=part: leaf[part], held_out) for part in sizes.parts)
+        found = replays.estimate(sizes, self.replay, *first, measured, dist, self.config.coverage, *last)
         radius, unit = dists.ravel(dist.radius), dists.ravel(tested.radius)
         errors = found.errors * jnp.outer(radius / unit, radius / unit)
         # An update that gives no errors gives no reason to keep its estimate.
-        closer = ~(jnp.trace(errors) >= jnp.trace(before.errors))
-        fits = found.p_value > 1.0 - knobs.level
-        taken = closer & fits & jnp.isfinite(found.estimate).all()
-        moved = dists.move(dist, found.estimate)
-        narrowed = jnp.clip(radius * found.interval, jnp.minimum(self.config.min_radius, radius), radius)
-        moved = moved.replace(radius=dists.unravel(dists.names(dist), narrowed))
+        closer = jnp.isnan(before.errors).any() | (jnp.trace(errors) < jnp.trace(before.errors))
+        fits = ~conformal.rejects(found.p_value, knobs.level)
+        known = (found.estimate, found.interval, errors, found.p_value)
+        taken = closer & fits & jnp.stack([jnp.isfinite(values).all() for values in known]).all()
+        moved = dists.narrow(dists.move(dist, found.estimate), found.interval, self.config.min_radius)
         update = before.replace(
             step=(dists.ravel(moved.centre) - dists.ravel(tested.centre)) / unit,
             interval=found.interval * radius / unit,
@@ -479,15 +483,16 @@ class Tuner:
         full = dists.at_bounds(dist)
         return jnp.select(
             [
-                ~(jnp.isfinite(gate.novelty) & jnp.isfinite(gate.threshold)),
+                # First: where nothing lives as long as a window, nothing of it is finite either.
                 ~jnp.asarray(gate.comparable),
+                ~(jnp.isfinite(gate.novelty) & jnp.isfinite(gate.threshold)),
                 gate.novelty <= gate.threshold,
                 full & (gate.p_value <= _UNEXPLAINED),
                 full | (calls >= self.config.max_widenings),
             ],
             [
-                Verdict.NOT_FINITE,
                 Verdict.NOT_COMPARABLE,
+                Verdict.NOT_FINITE,
                 Verdict.ACCEPT,
                 Verdict.UNEXPLAINED,
                 Verdict.RADIUS_EXHAUSTED,

@@ -17,8 +17,8 @@ from jaxtune.types import Trajectory
 
 _FAR = 10.0  # standard deviations
 
-MIN_STD = 1e-3
-"""Smallest standard deviation by which a channel is divided: one that is smaller in training counts as constant."""
+_LEAST = 1e-3  # smallest standard deviation by which values are divided, of values whose typical size is one
+_CONSTANT = 1e-5  # of a channel's largest value: a standard deviation that rounding may give
 
 
 def steps(trajectory: Trajectory) -> Float[Array, "... time channels"]:
@@ -62,7 +62,28 @@ def draw(
     cumulative = jnp.cumsum(valid.reshape(-1))
     rank = jax.random.randint(key, (count,), 0, jnp.maximum(cumulative[-1], 1))
     flat = jnp.searchsorted(cumulative, rank, side="right")
-    episode, start = jnp.divmod(jnp.minimum(flat, cumulative.size - 1), valid.shape[1])
+    return _at(trajectory, jnp.minimum(flat, cumulative.size - 1), length)
+
+
+def choose(
+    key: jax.Array, trajectory: Trajectory, count: int, length: int
+) -> tuple[Float[Array, "count length channels"], Bool[Array, " count"]]:
+    """Chooses different windows, all valid ones equally likely; arguments are those of `draw`.
+
+    Returns:
+      The windows, and which of them are valid: fewer than `count` where there are no more.
+    """
+    valid = valid_starts(trajectory.alive, length).reshape(-1)
+    order = jnp.where(valid, jax.random.uniform(key, valid.shape), 2.0)
+    _, flat = jax.lax.top_k(-order, min(count, valid.size))
+    flat = jnp.resize(flat, count)
+    window, _ = _at(trajectory, flat, length)
+    return window, valid[flat] & (jnp.arange(count) < valid.size)
+
+
+def _at(trajectory: Trajectory, flat: jax.Array, length: int):
+    """The windows at some starts, numbered over all episodes, and their episodes."""
+    episode, start = jnp.divmod(flat, trajectory.alive.shape[1] - length + 1)
     within = start[:, None] + jnp.arange(length)
     return steps(trajectory)[episode[:, None], within], episode
 
@@ -94,6 +115,7 @@ class Scaler:
 
     mean: jax.Array  # [channels]
     std: jax.Array  # [channels], never zero
+    varies: jax.Array  # [channels] whether the values differed by more than rounding
 
     def __call__(self, windows: Float[Array, "... channels"]) -> Float[Array, "... channels"]:
         """Standardises values channel by channel: `(windows - mean) / std`, of any leading shape."""
@@ -105,26 +127,34 @@ class Scaler:
 
 
 def scaler(values: Float[Array, "... channels"], weight: Float[Array, "... 1"] | None = None) -> Scaler:
-    """Fits a scaler to values, over all axes but the last.
+    """Fits a scaler to values of a size near one, over all axes but the last. No deviation is smaller than 0.001.
 
     `weight` counts some values more than others, or not at all; it broadcasts against the values and must sum to one
     over a channel. All values count alike where it is None. Values of weight zero must still be finite.
     """
+    mean, std = _spread(values, values.shape[-1] / values.size if weight is None else weight)
+    return Scaler(mean=mean, std=jnp.maximum(std, _LEAST), varies=std > _LEAST)
+
+
+def _spread(values: Float[Array, "... channels"], weight) -> tuple[jax.Array, jax.Array]:
+    """Mean and standard deviation, [channels] each."""
     axes = tuple(range(values.ndim - 1))
-    weight = values.shape[-1] / values.size if weight is None else weight
     mean = jnp.sum(weight * values, axis=axes)
-    variance = jnp.sum(weight * (values - mean) ** 2, axis=axes)
-    return Scaler(mean=mean, std=jnp.maximum(jnp.sqrt(variance), MIN_STD))
+    return mean, jnp.sqrt(jnp.sum(weight * (values - mean) ** 2, axis=axes))
 
 
 def fit_scaler(trajectory: Trajectory) -> Scaler:
-    """Fits a scaler to observations and actions of all steps that are alive.
+    """Fits a scaler to observations and actions of all steps that are alive, in whatever units.
 
-    Steps after an episode's end count for nothing, whatever they hold.
+    Steps after an episode's end count for nothing, whatever they hold. A channel that never changes is divided by a
+    thousandth of its value.
     """
     # What follows an end may be anything, and zero times nan is nan.
     channels = jnp.where(trajectory.alive[..., None], steps(trajectory), 0.0)
-    return scaler(channels, trajectory.alive[..., None] / jnp.maximum(trajectory.alive.sum(), 1))
+    mean, std = _spread(channels, trajectory.alive[..., None] / jnp.maximum(trajectory.alive.sum(), 1))
+    size = jnp.abs(channels).max(axis=tuple(range(channels.ndim - 1)))
+    varies = std > _CONSTANT * size
+    return Scaler(mean=mean, std=jnp.where(varies, std, _LEAST * jnp.where(size > 0, size, 1.0)), varies=varies)
 
 
 def moments(window: Float[Array, "batch time channels"]) -> Float[Array, "batch moments"]:

@@ -80,6 +80,7 @@ REPORT = SelfTest(
             Tuned(verdicts={"accept": 3}, held=Rate(3, 3), covered=Rate(2, 3), error={"colour": 0.1, "mass": 0.02}),
         )
     },
+    unusable={"torque_scale=0.75": 3},
 )
 
 
@@ -93,6 +94,7 @@ def test_tables_say_what_was_counted(monkeypatch):
     assert "all true values in their intervals: 0.90" in text
     assert "tuning 1, inside the distribution: 3 accept, truth in the distribution: 3 of 3" in text
     assert "in its intervals: 2 of 3" in text
+    assert "torque_scale=0.75: 3 sets are too short or not finite, and are not counted" in text
 
 
 def test_the_plot_has_a_row_for_every_case(tmp_path):

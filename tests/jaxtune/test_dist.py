@@ -91,6 +91,21 @@ def test_move_is_in_radii_and_stops_at_the_bounds(two):
     assert moved.radius == two.radius
 
 
+def test_narrow_goes_to_the_interval_but_not_below_the_least(two):
+    # Radii of 0.5: to 0.3 of them, to the least, and not at all where nothing is known or the interval is wider.
+    found = dists.narrow(two, jnp.array([0.6, 0.1]), 0.1).radius
+    assert found == pytest.approx({"a": 0.3, "b": 0.1})
+    assert dists.narrow(two, jnp.array([jnp.nan, 3.0]), 0.1).radius == pytest.approx({"a": 0.5, "b": 0.5})
+    assert dists.narrow(two, jnp.array([0.1, 0.1]), 2.0).radius == pytest.approx({"a": 0.5, "b": 0.5})
+
+
+def test_make_needs_room_between_the_bounds():
+    with pytest.raises(
+        ValueError, match=r"lower\['a'\]: got 0.0, expected less than 0.0; leave out what is not searched"
+    ):
+        dists.make({"a": 0.0, "b": 0.0}, 0.2, {"a": 0.0, "b": -1.0}, {"a": 0.0, "b": 1.0})
+
+
 def test_make_needs_a_positive_radius():
     for radius in (0.0, -0.5, float("nan")):
         with pytest.raises(ValueError, match=f"radius: got {radius}"):

@@ -110,7 +110,7 @@ def placed(reach, neighbours=3):
     """Every window is encoded at the origin; four simulated ones lie at 0.1, 0.2, 0.4 and 3 from it."""
     config = dataclasses.replace(CONFIG, neighbours=neighbours)
     latent = jnp.zeros((4, 6)).at[:, 2].set(jnp.array([0.4, -0.1, 3.0, 0.2]))
-    scaler = windows.Scaler(mean=jnp.zeros(3), std=jnp.ones(3))
+    scaler = windows.Scaler(mean=jnp.zeros(3), std=jnp.ones(3), varies=jnp.ones(3, bool))
     elbo = jnp.array([-100.0, -300.0, 7.0, -200.0])
     return config, DVM(variables=blank(), scaler=scaler, latent=latent, elbo=elbo, reach=jnp.float32(reach))
 
@@ -182,3 +182,14 @@ def test_windows_after_a_fall_are_not_valid(score):
     _, valid, _ = score(trajectory.replace(alive=trajectory.alive.at[0].set(False).at[1, 55:].set(False)))
     # Starts 0, 5 and 10 of windows of 50 in three episodes: dead from the start, for 55 steps, for all 60.
     np.testing.assert_array_equal(valid.reshape(3, 3), [[0, 0, 0], [1, 1, 0], [1, 1, 1]])
+
+
+def test_few_windows_are_still_each_others_neighbours():
+    """Episodes of one window each, fewer than references: copies would bring the reach to nothing."""
+    dist, slider = toys.uniform(CENTRE, radius=0.2), toys.Slider(steps=CONFIG.window)
+    draws = dists.sample(jax.random.key(0), dist, 100)
+    simulated, others = (slider.simulate(jax.random.key(seed), toys.policy(), draws) for seed in (1, 5))
+    model, _ = toys.train_dvm(jax.random.key(2), CONFIG, simulated)
+    _, valid, covered = dvm.novelty(CONFIG, model, others)
+    assert valid.all()
+    assert covered.mean() > 0.8

@@ -24,17 +24,22 @@ def dist():
 
 
 @partial(jax.jit, static_argnums=0)
-def calibration(slider, dist):
+def calibration(slider, dist, seed):
     """Simulated sets, and their coordinates."""
-    truth = dists.sample(jax.random.key(5), dist, SETS)
+    truth = dists.sample(jax.random.key(seed), dist, SETS)
     each = {name: jnp.repeat(values, EPISODES) for name, values in truth.items()}
-    sets = slider.simulate(jax.random.key(6), toys.policy(), each)
+    sets = slider.simulate(jax.random.key(seed + 1), toys.policy(), each)
     return jax.tree.map(lambda leaf: leaf.reshape(SETS, EPISODES, *leaf.shape[1:]), sets), truth
 
 
 @partial(jax.jit, static_argnums=0)
+def fitted(slider, dist, measured, sets):
+    others = calibration(slider, dist, 7)
+    return replay.estimate(SIZES[slider], slider.replay(), *sets, measured, dist, 0.9, *others)
+
+
 def estimate(slider, dist, measured):
-    return replay.estimate(SIZES[slider], slider.replay(), *calibration(slider, dist), measured, dist, 0.9)
+    return fitted(slider, dist, measured, calibration(slider, dist, 5))
 
 
 def measured(slider, seed=3, **truth):
@@ -95,6 +100,26 @@ def test_pieces_that_break_do_not_spoil_the_others(dist):
     np.testing.assert_allclose(0.2 * estimate(EXACT, dist, broken).estimate, [0.1, 0.1], atol=2e-3)
 
 
+def test_a_simulated_set_without_a_piece_counts_as_a_bad_fit(dist):
+    one, (sets, truth) = measured(EXACT, friction=0.13, mass=-0.18), calibration(EXACT, dist, 5)
+    dead = sets.replace(alive=sets.alive.at[4, :, 1:].set(False))
+    found = fitted(EXACT, dist, one, (dead, truth))
+    np.testing.assert_allclose(0.2 * found.estimate, [0.13, -0.18], atol=2e-4)
+    assert (found.interval < 0.05).all()
+    assert np.isfinite(found.errors).all()
+    assert found.p_value >= 2 / (SETS + 1)
+    # Of which there are too many for a quantile, or the measured one itself.
+    none = sets.replace(alive=sets.alive.at[:, :, 1:].set(False))
+    assert not np.isfinite(fitted(EXACT, dist, one, (none, truth)).interval).any()
+    fallen = one.replace(alive=one.alive.at[:, 1:].set(False))
+    assert not np.isfinite(fitted(EXACT, dist, fallen, (sets, truth)).estimate).any()
+
+
+def test_a_median_is_of_the_other_sets():
+    values = jnp.array([[1.0], [2.0], [9.0], [jnp.nan], [4.0]])
+    np.testing.assert_allclose(replay._medians(values)[:, 0], [4.0, 4.0, 2.0, 3.0, 2.0, 3.0])
+
+
 def machine(slider, **changes):
     return Tuner(
         config=dataclasses.replace(toys.TINY, set_episodes=EPISODES, replay=SIZES[slider], min_radius=0.01),
@@ -141,6 +166,21 @@ def test_the_tuner_takes_the_better_estimate(dist, slider, errors, extra, replay
         assert "measured states give no better estimate" in tuner.explain(info)
 
 
+def test_a_held_out_robot_that_falls_at_once_leaves_the_distribution_finite(dist):
+    def simulate(key, policy, coords):
+        episodes = EXACT.simulate(key, policy, coords)
+        falls = jnp.arange(len(episodes.alive)) // EPISODES == 4
+        return episodes.replace(alive=episodes.alive & ~(falls[:, None] & (jnp.arange(EXACT.steps) > 0)))
+
+    one = machine(EXACT, verify=accept, update=partial(stay, 0.1))
+    one = dataclasses.replace(one, simulate=simulate, config=dataclasses.replace(one.config, episodes=3 * EPISODES))
+    state = one.init(toys.policy(), dist, tuner.knobs())
+    after, info = jax.jit(one.tune)(jax.random.key(0), state, measured(EXACT, friction=0.1, mass=-0.15))
+    assert np.isfinite(dists.ravel(after.dist.radius)).all()
+    assert np.isfinite(dists.ravel(after.dist.centre)).all()
+    assert np.isfinite(info.update.interval).all()
+
+
 def test_a_rejected_set_is_not_replayed(dist):
     reject = lambda *args: accept(*args).replace(novelty=jnp.full((), 2.0))  # noqa: E731
     one = machine(EXACT, verify=reject, update=partial(stay, 0.1))
@@ -167,3 +207,6 @@ def test_states_that_are_missing_or_of_another_robot_are_refused(dist):
     long = dataclasses.replace(one, config=dataclasses.replace(one.config, replay=ReplayConfig(window=60)))
     with pytest.raises(ValueError, match="expected more than 60"):
         long.tune(jax.random.key(0), state, whole)
+    many = dataclasses.replace(one, config=dataclasses.replace(one.config, replay=ReplayConfig(sets=20)))
+    with pytest.raises(ValueError, match="sets: got 20, expected 1 to 19 held-out sets"):
+        many.tune(jax.random.key(0), state, whole)

@@ -1,6 +1,7 @@
 import dataclasses
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import toys
@@ -42,10 +43,13 @@ def report():
 def test_robots_inside_pass_and_robots_outside_do_not(report):
     assert report.alarms.of == 24
     assert report.alarms.share < 0.2
+    assert report.unusable == {}
+    accepted = 24 - report.alarms.hits
     for name in ("friction", "mass"):
         assert report.outside[name].share > 0.7
         assert report.outside[name].hits <= report.noticed[name].hits
-        assert report.identified[name] == Rate(24, 24, (12, 12))
+        assert (report.identified[name].hits, report.identified[name].of) == (accepted, accepted)
+        assert sum(of for _, of in report.identified[name].by_gate) == accepted
         assert report.error[name] < report.interval[name] < 0.2
     for rate in report.others.values():
         assert rate.share > 0.9
@@ -86,18 +90,36 @@ def test_robots_without_intervals_are_not_counted_as_misses():
     covers = selftest._covers(errors, intervals, known)
     np.testing.assert_array_equal(covers, [1.0, 0.0, np.nan])
     assert selftest._told(covers) == Rate(1, 2)
-    assert selftest._told(covers[None, :2]) == Rate(1, 2, (1,))
+    assert selftest._told(covers[None, :2]) == Rate(1, 2, ((1, 2),))
     # A coordinate that is not identifiable needs none.
     assert selftest._covers(errors[2], intervals[2], np.array([True, False])) == 1.0
+
+
+def test_sets_that_tell_nothing_are_counted_apart():
+    """Robots of a case that fall at once; the walk of the others goes on."""
+    tuner, state = machine()
+
+    def simulate(key, policy, coords):
+        episodes = toys.Slider().simulate(key, policy, coords)
+        falls = (coords["mass"] > 0.8)[:, None] & (jnp.arange(60) >= 20)
+        return episodes.replace(alive=episodes.alive & ~falls)
+
+    tuner = dataclasses.replace(tuner, simulate=simulate)
+    found = selftest.run(jax.random.key(0), tuner, state, robots=3, others={"falls": {"mass": 0.9}})
+    assert found.unusable == {"falls": 3}
+    assert found.others["falls"].of == 0
+    assert np.isnan(found.others["falls"].share)
+    assert found.alarms.of == 3
+    assert "falls: 3 sets are too short or not finite" in selftest.summary(found)
 
 
 def test_gates_that_differ_count_for_fewer_robots():
     assert Rate(20, 40).independent == 40
     # As chance has it, or less.
-    assert Rate(20, 40, (10, 10)).independent == 40
+    assert Rate(20, 40, ((10, 20), (10, 20))).independent == 40
     # Each gate rejects all of its robots or none, so four gates are four draws at most.
-    assert Rate(40, 80, (20, 0, 20, 0)).independent < 4
-    assert Rate(0, 40, (0, 0)).independent == 40
+    assert Rate(40, 80, ((20, 20), (0, 20), (20, 20), (0, 20))).independent < 4
+    assert Rate(0, 40, ((0, 20), (0, 20))).independent == 40
 
 
 def test_a_bound_that_leaves_no_room_outside_is_left_out():

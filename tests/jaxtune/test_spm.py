@@ -144,7 +144,7 @@ def with_logits(monkeypatch, curve):
     # Normalised, the second parameter's box ends at (1 - 0.75) / 0.5 = 0.5.
     bounds = {"a": jnp.float32(-1), "b": jnp.float32(-1)}, {"a": jnp.float32(1), "b": jnp.float32(1)}
     dist = dists.make({"a": jnp.float32(0), "b": jnp.float32(0.75)}, 0.5, *bounds)
-    scaler = windows.Scaler(mean=jnp.zeros(3), std=jnp.ones(3))
+    scaler = windows.Scaler(mean=jnp.zeros(3), std=jnp.ones(3), varies=jnp.ones(3, bool))
     return SPM(variables={}, steps=scaler, moments=scaler, dist=dist)
 
 

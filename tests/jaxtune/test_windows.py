@@ -74,6 +74,17 @@ def test_draw_differs_by_key_alone():
     assert np.any(starts(0) != starts(1))
 
 
+@pytest.mark.parametrize("count", [10, 22, 30, 60])
+def test_choose_returns_valid_windows_none_of_them_twice(count):
+    cut, valid = windows.choose(jax.random.key(1), episodes(), count, LENGTH)
+    assert cut.shape == (count, LENGTH, 3)
+    # Of 22 that there are.
+    assert valid.sum() == min(count, 22)
+    starts = {tuple(window[0, :2].tolist()) for window in np.asarray(cut)[np.asarray(valid)]}
+    assert len(starts) == valid.sum()
+    assert all(start + LENGTH <= LIVED[int(episode)] for episode, start in starts)
+
+
 def test_grid_is_every_nth_window_and_says_which_are_valid():
     cut, valid = windows.grid(episodes(), LENGTH, 3)
     # Starts 0, 3 and 6; a fourth at 9 would reach past step 12.
@@ -108,11 +119,21 @@ def test_scaler_is_numpy_on_living_steps():
     np.testing.assert_allclose(scaled.std(axis=0), 1.0, rtol=1e-4)
 
 
-def test_scaler_leaves_a_constant_channel_finite():
+@pytest.mark.parametrize("value", [7.0, 0.0, 100.3])
+def test_scaler_leaves_a_constant_channel_finite(value):
     trajectory = episodes()
-    scaler = windows.fit_scaler(trajectory.replace(action=jnp.full_like(trajectory.action, 7.0)))
+    scaler = windows.fit_scaler(trajectory.replace(action=jnp.full_like(trajectory.action, value)))
     assert np.isfinite(scaler(windows.steps(trajectory))).all()
-    assert scaler.std[2] > 0
+    assert scaler.std[2] == pytest.approx(1e-3 * (value or 1.0))
+    np.testing.assert_array_equal(scaler.varies, [True, True, False])
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
+def test_scaler_knows_no_unit(unit):
+    trajectory = noisy()
+    scaled = trajectory.replace(obs=unit * trajectory.obs)
+    found, expected = (windows.fit_scaler(one)(windows.steps(one))[..., :2] for one in (scaled, trajectory))
+    np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-4)
 
 
 def test_scaler_ignores_what_a_broken_simulation_left_behind():
