@@ -45,6 +45,11 @@ def play(sim):
     return run
 
 
+def rollout(sim, seed, act, policy, params):
+    """One compilation; op by op would take longer."""
+    return jax.jit(lambda params: sim.rollout(jax.random.key(seed), act, policy, params))(params)
+
+
 def in_mujoco(velocity, actions, **params):
     """Positions and velocities of the sled in MuJoCo C, given what its motor was told."""
     sled = Sled()
@@ -98,7 +103,7 @@ def test_a_step_that_is_not_finite_is_counted_and_masked(sim):
     def breaks(policy, obs, key):
         return jnp.where(obs[:1] > policy, jnp.nan, 2.0)
 
-    episodes = sim.rollout(jax.random.key(7), breaks, 0.3, {"delay": jnp.zeros(2)})
+    episodes = rollout(sim, 7, breaks, 0.3, {"delay": jnp.zeros(2)})
     assert episodes.not_finite.all()
     lived = episodes.alive.sum(axis=1)
     assert np.all((lived > 5) & (lived < STEPS))
@@ -109,13 +114,14 @@ def test_simulate_takes_coordinates_and_measure_hides_parameters(sim, play):
     key = jax.random.key(7)
     coords = {"mass": jnp.log(jnp.array([1.3])), "delay": jnp.array([0.8])}
     expected = play(mass=1.3, delay=0.02)
-    for episodes in (sim.simulate(act)(key, 3.0, coords), sim.measure(act, {"mass": 1.3, "delay": 0.02}, 1)(key, 3.0)):
+    measure = sim.measure(act, {"mass": 1.3, "delay": 0.02}, 1)
+    for episodes in (jax.jit(sim.simulate(act))(key, 3.0, coords), jax.jit(measure)(key, 3.0)):
         np.testing.assert_allclose(episodes.obs, expected.obs, rtol=1e-4, atol=1e-5)
 
 
 def test_a_replay_goes_on_from_any_state_as_the_episode_did(sim):
     truth = {"mass": 1.3, "damping": 2.0, "strength": 0.8, "delay": 0.03}
-    episodes = sim.measure(act, truth, 2, states=True)(jax.random.key(7), 3.0)
+    episodes = jax.jit(sim.measure(act, truth, 2, states=True))(jax.random.key(7), 3.0)
     np.testing.assert_array_equal(episodes.state["qpos"][..., 0], episodes.obs[..., 0])
     replay, steps = sim.replay(), 7
     coords = {name: jnp.float32(value) for name, value in to_coords(TABLE, truth).items()}
@@ -138,8 +144,9 @@ def test_a_replay_goes_on_from_any_state_as_the_episode_did(sim):
 
 def test_states_are_kept_where_they_are_asked_for_alone(sim):
     coords = {"mass": jnp.zeros(2)}
-    assert sim.simulate(act)(jax.random.key(7), 3.0, coords).state is None
-    kept = sim.simulate(act, states=True)(jax.random.key(7), 3.0, coords).state
+    given = (jax.random.key(7), 3.0, coords)
+    assert jax.eval_shape(sim.simulate(act), *given).state is None
+    kept = jax.eval_shape(sim.simulate(act, states=True), *given).state
     assert kept["qvel"].shape == (2, STEPS, 1)
 
 
@@ -151,12 +158,12 @@ def test_an_environment_without_mujocos_data_cannot_be_replayed(sim):
 
 def test_chunks_change_nothing(sim, monkeypatch):
     params = {"mass": jnp.linspace(0.5, 2.0, 5)}
-    whole = sim.rollout(jax.random.key(1), act, 1.0, params)
+    whole = rollout(sim, 1, act, 1.0, params)
     monkeypatch.setattr("jaxtune.mjx.episodes._CHUNK", {"cpu": 2})
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5),
         whole,
-        sim.rollout(jax.random.key(1), act, 1.0, params),
+        rollout(sim, 1, act, 1.0, params),
     )
 
 
@@ -190,7 +197,8 @@ def test_a_tuner_takes_it_as_it_is(sim):
 )
 def test_dictionary_observations_are_compared_by_key(observe, size):
     sim = Simulator(Keyed(), steps=3, parameters=TABLE, observe=observe)
-    episodes = sim.rollout(jax.random.key(0), lambda policy, obs, key: obs["state"][:1], None, {"mass": jnp.ones(2)})
+    start = lambda policy, obs, key: obs["state"][:1]  # noqa: E731
+    episodes = jax.eval_shape(lambda mass: sim.rollout(jax.random.key(0), start, None, {"mass": mass}), jnp.ones(2))
     assert episodes.obs.shape == (2, 3, size)
 
 
@@ -331,8 +339,8 @@ def test_another_model_of_the_users_own(sim):
 
     own = Simulator(Elsewhere(), steps=STEPS, parameters=TABLE, with_model=put)
     params = {"mass": jnp.array([0.6, 1.5]), "damping": jnp.array([2.0, 0.5])}
-    episodes = own.rollout(jax.random.key(7), act, 3.0, params)
-    expected = sim.rollout(jax.random.key(7), act, 3.0, params)
+    episodes = rollout(own, 7, act, 3.0, params)
+    expected = rollout(sim, 7, act, 3.0, params)
     np.testing.assert_allclose(episodes.obs, expected.obs, rtol=1e-5, atol=1e-6)
     assert np.abs(episodes.obs[0] - episodes.obs[1]).max() > 0.1
 
