@@ -26,11 +26,11 @@ class Args:
     out: Path
     """Folder of the log: meta.yaml, and for every run a run_*.csv with times, joint targets, and whether the motors are
     on."""
-    robot: str = "biteno"
-    """Robot: biteno, pendulum, or the path of an MJCF file."""
+    robot: str | None = None
+    """Robot: biteno (the default), pendulum, or the path of an MJCF file."""
     like: Path | None = None
-    """Folder of a log of the robot. Its model, joints and first run's controller are taken, in the place of robot, kp,
-    kd, torque_limit_nm and control_hz."""
+    """Folder of a log of the robot. Its joints and first run's controller are taken, in the place of kp, kd,
+    torque_limit_nm and control_hz, and its model unless robot is given."""
     runs: int = 6
     """Number of runs; 4 or more, so that they can be split into train, select and sealed."""
     seconds: float = 3.0
@@ -59,7 +59,7 @@ def main(args: Args) -> None:
       ValueError: an option is wrong, or the model cannot be read.
     """
     _check(args)
-    robot, joints, controller = _described(args) if args.like is None else _alike(args.like)
+    robot, joints, controller = _described(args) if args.like is None else _alike(args.like, args.robot)
     spec = models.spec(robot)
     runs = tuple(
         Run(
@@ -83,17 +83,18 @@ def _described(args: Args) -> tuple[str, tuple[str, ...], Controller]:
     """Robot, joints and controller as the options say."""
     # A free joint is the base, which is held, and a ball joint has no scalar target.
     kinds = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
-    joints = tuple(joint.name for joint in models.spec(args.robot).joints if joint.type in kinds)
+    robot = args.robot or "biteno"
+    joints = tuple(joint.name for joint in models.spec(robot).joints if joint.type in kinds)
     if not joints or not all(joints):
-        raise ValueError(f"robot: got '{args.robot}' with joints {joints}, expected hinges or slides that have names")
+        raise ValueError(f"robot: got '{robot}' with joints {joints}, expected hinges or slides that have names")
     gains = {"kp": args.kp, "kd": args.kd, "torque_limit_nm": args.torque_limit_nm}
     every = {name: np.full(len(joints), value) for name, value in gains.items()}
-    return args.robot, joints, Controller(kind="pd", rate_hz=args.control_hz, gains=every)
+    return robot, joints, Controller(kind="pd", rate_hz=args.control_hz, gains=every)
 
 
-def _alike(folder: Path) -> tuple[str, tuple[str, ...], Controller]:
-    """Robot, joints and controller of a log."""
-    log = read_any(folder)
+def _alike(folder: Path, robot: str | None) -> tuple[str, tuple[str, ...], Controller]:
+    """Robot, joints and controller of a log, which may be read with another model."""
+    log = read_any(folder, robot and Path(robot))
     return log.robot, log.joints, log.runs[0].controller
 
 

@@ -220,8 +220,10 @@ def _rate(rate: Rate) -> str:
 def main(args: Args) -> None:
     """Runs the self-test, prints tables, and writes `selftest.json` and a plot."""
     robot, entries, others, numbers = check(args)
-    args.out.mkdir(parents=True, exist_ok=True)
     checkpoint.set_up_compiler(preset(args.preset).xla_flags)
+    identity = {name: value for name, value in vars(args).items() if name != "out"}
+    # A policy that is trained first is kept in the folder, and is another one for other sizes.
+    checkpoint.open_run(args.out, identity | {"sizes": preset(args.preset)})
     begin = time.monotonic()
     with bars() as progress:
         reports = {number: tested(args, robot, entries, others, number, progress) for number in numbers}

@@ -104,6 +104,8 @@ def check(args: Args) -> tuple[Preset, Kind, dict[str, Entry], Case, tuner.Knobs
                 raise ValueError(f"{option}: got '{value}', expected one of {', '.join(allowed)}")
     if not args.methods:
         raise ValueError(f"methods: got none, expected some of {', '.join(METHODS)}")
+    if args.states and not ("ours" in args.methods and args.update == "posterior"):
+        raise ValueError("states: got true, expected method ours with the update posterior: no other one reads states")
     truth = named_values("truth", args.truth, robot.entries)
     case = checked_case(args.case, args.start, entries, engines=robot.engines, target=args.target, truth=truth)
     check_positive(radius=args.radius, dr_radius=args.dr_radius)
@@ -230,7 +232,7 @@ def main(args: Args) -> None:
     with bars() as progress:
         results = {name: [runner(name, seed, progress) for seed in args.seeds] for name in args.methods}
     off = case.off(entries)
-    settings = {name: getattr(args, name) for name in ("case", "start", "preset", "seeds")}
+    settings = {name: getattr(args, name) for name in ("case", "start", "truth", "target", "preset", "seeds")}
     summary = comparison.summarise(settings, results, off)
     write_json(args.out / "summary.json", summary | {"versions": checkpoint.versions()})
     # The file that grew line by line may also hold lines of a run that was interrupted and started again.

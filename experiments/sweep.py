@@ -230,6 +230,7 @@ def sweep(args: Args, learner: Learner, case: Case) -> None:
     summary = {
         "case": args.case,
         "start": args.start,
+        "truth": args.truth,
         "preset": args.preset,
         "update": args.update,
         "trained": not args.fixed_policy,

@@ -216,7 +216,7 @@ def calibrated_gate(
 
         cover   mean rank of its windows' novelty (Eq. 2 with its sign mended, see `dvm.novelty`) among the windows of
                 all sets, each of which weighs the same; a window without a neighbour ranks highest
-        lost    |share of its steps that are alive - mean share of D_q|
+        lost    |share of its steps in which the robot is up - that of D_q|, steps after an end that was no fall unknown
         misfit  logarithm of how far it lies from what robots of its estimate show (`surface.misfit`)
         beyond  largest distance of its estimate from the inside of the box, in errors of the regression
 
@@ -250,8 +250,8 @@ def calibrated_gate(
     novelty, valid, covered = of_all_sets(partial(dvm.novelty, config.dvm), (model,), collected, measured)
     sane = jnp.isfinite(jnp.where(valid, novelty, 0.0)).all(axis=-1)
     cover = _mean_ranks(jnp.where(covered, novelty, jnp.inf), valid)
-    alive = jnp.concatenate([collected.held_out.alive, measured.alive[None]]).mean(axis=(1, 2))
-    statistics = {"cover": cover, "lost": jnp.abs(alive - collected.trajectory.alive.mean())}
+    up = jnp.append(_share_up(collected.held_out), _share_up(measured))
+    statistics = {"cover": cover, "lost": jnp.abs(up - _share_up(collected.trajectory))}
     statistics |= _misses(_reading(config, collected, measured))
     excess = {name: _excess(name, values) for name, values in statistics.items()}
     fixed = ~jnp.isnan(knobs.threshold)
@@ -268,6 +268,16 @@ def calibrated_gate(
         elbo=elbo,
         **{name: values[-1] for name, values in excess.items()},
     )
+
+
+def _share_up(episodes: Trajectory) -> jax.Array:
+    """The share of steps in which robots are up, [...] of episodes [..., episodes, time].
+
+    What follows an episode's end counts as down if it fell or broke, and is unknown if it was cut short.
+    """
+    up, ended = episodes.alive.sum(axis=-1), episodes.fell | episodes.not_finite
+    known = jnp.where(ended, episodes.alive.shape[-1], up)
+    return up.sum(axis=-1) / jnp.maximum(known.sum(axis=-1), 1)
 
 
 def of_all_sets(function: Callable, shared: tuple, collected: Collected, measured: Trajectory):

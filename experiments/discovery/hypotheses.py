@@ -162,12 +162,13 @@ def _hypothesis(
     bounds = np.array([one.bounds for one in parameters], float)
     for number, one in enumerate(parameters):
         mine = [index[row.name, one.name, place] for place in places]
-        bounds[number, 0] = max(axes[axis].least for axis in mine)
         for axis in mine:
             # In single precision, as the physics has it.
             ratio = np.float32(axes[mine[0]].scale) / np.float32(axes[axis].scale)
             factor = 1.0 / ratio if one.form == "reciprocal" else ratio
             directions[number, axis] = 1.0 if one.form == "ratio" else factor
+        # Coordinates are in the first place's unit, and no place may lose more than it has.
+        bounds[number, 0] = max(axes[axis].least / directions[number, axis] for axis in mine)
     first = [index[row.name, parameters[0].name, place] for place in places]
     return Hypothesis(
         name=row.name,

@@ -1,5 +1,6 @@
 """The experiment that would decide between the two models that are most believed: both play every motion."""
 
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -7,6 +8,7 @@ import numpy as np
 
 from envs import segments
 from envs.logs import Log, Run
+from envs.models import BUILT_IN
 from experiments.discovery.excitation import TargetRun, deciding, scaled, unlimited_slides
 from experiments.discovery.setup import Question
 from experiments.discovery.whole_runs import simulate_runs
@@ -41,10 +43,17 @@ def deciding_experiment(question: Question, log: Log, folder: Path, result: Resu
     if found is None:
         return None
     return (
-        f"python -m experiments.excite --like {folder} --motion {found.name} --runs {_RUNS} --seconds {_SECONDS:g} "
+        f"python -m experiments.excite --like {shlex.quote(str(folder))}{_robot_of(log, folder)} "
+        f"--motion {found.name} --runs {_RUNS} --seconds {_SECONDS:g} "
         f"--rate-hz {_RATE_HZ:g} --out NEW: there {one} and {other} differ by "
         f"{1e3 * found.scores[found.name]:.2g} mrad (rms)"
     )
+
+
+def _robot_of(log: Log, folder: Path) -> str:
+    """The option that names a model that is not the log's own."""
+    own = log.robot in BUILT_IN or Path(log.robot).resolve().is_relative_to(folder.resolve())
+    return "" if own else f" --robot {shlex.quote(log.robot)}"
 
 
 def _as_run(log: Log, motion: TargetRun) -> Run:

@@ -6,7 +6,7 @@ Pieces of logs, their first states and their rows are those of `envs.segments`, 
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import mujoco
 import numpy as np
@@ -58,11 +58,10 @@ def take(runs: Sequence[Run], dt: float, horizon_s: float | None = None) -> Piec
     """Cuts runs into pieces that start from measured states.
 
     Args:
-      runs: of one robot. Targets are held between rows.
+      runs: of one robot. Where it is unknown how targets go on between rows, they are held.
       dt: step of the simulation in s.
       horizon_s: length of a piece; None takes whole runs, from the end of the first history on.
     """
-    runs = [replace(run, controller=replace(run.controller, between_rows="hold")) for run in runs]
     cut = segments.whole(runs, dt) if horizon_s is None else segments.cut(runs, horizon_s, dt)
     one, before = cut.segments, round(segments.HISTORY_S / dt)
     return Pieces(

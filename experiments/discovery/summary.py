@@ -90,18 +90,21 @@ def _changed(question: Question, result: Result) -> list[AcceptedTerm]:
 def _effect(rig: Rig, term: AcceptedTerm, fit: Fit, errors: np.ndarray) -> dict:
     """Describes a fitted effect: physical values with 95 % intervals, and what would distinguish it from its rivals."""
     hypothesis, parameters = term.hypothesis, {}
-    for direction in np.concatenate([one.directions for one in (hypothesis, *term.forms)]):
+    rows = [(part.form, row) for part in (hypothesis, *term.forms) for row in part.directions]
+    for form, direction in rows:
         mine = [i for i, free in enumerate(fit.free.directions) if ((free != 0) & (direction != 0)).any()]
         number = int(np.flatnonzero(direction)[0])
         axis, value = rig.axes[number], fit.vector[number]
-        scale, rows = axis.scale, rig.effects[axis.effect].parameters
-        parameter = next(one for one in rows if one.name == axis.parameter)
+        scale, known = axis.scale, rig.effects[axis.effect].parameters
+        parameter = next(one for one in known if one.name == axis.parameter)
         # Standard errors of the directions through this coordinate add up in quadrature; 1.96 makes it a 95 % interval.
         error = 1.96 * float(np.sqrt(sum((errors[i] * fit.free.directions[i][number]) ** 2 for i in mine)))
         # A limit or a stiffness that may as well not be there has no upper end.
         least = max(value - error, 1e-12) if parameter.form == "reciprocal" else value - error
         ends = sorted(float(parameter.value(end, scale)) for end in (least, value + error))
-        parameters[parameter.name] = {"value": float(parameter.value(value, scale)), "low": ends[0], "high": ends[1]}
+        # A delay that is filtered has two times.
+        name = f"{form}.{parameter.name}" if parameter.name in parameters else parameter.name
+        parameters[name] = {"value": float(parameter.value(value, scale)), "low": ends[0], "high": ends[1]}
     return {
         "name": hypothesis.name,
         "family": hypothesis.family,

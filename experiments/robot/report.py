@@ -41,13 +41,14 @@ _TEMPLATE = Path(__file__).with_suffix(".html")
 _QUANTITIES = {"return": "return", "fall_rate": "share of walks that end in a fall", "power_w": "mechanical power, W"}
 
 
-def write(path: Path, history: Sequence[Round], terms: Terms) -> None:
+def write(path: Path, history: Sequence[Round], terms: Terms, robot: str = "biteno") -> None:
     """Writes the page of the last round; text that comes from the log is escaped.
 
     Args:
       path: of the HTML file; its plot is embedded.
       history: all rounds so far.
       terms: conditions of the walks, for the largest fall rate and the length of a walk.
+      robot: its name. Only BITeno can be tuned in a model that discovery corrected.
     """
     last = history[-1]
     page = report.render(
@@ -62,6 +63,7 @@ def write(path: Path, history: Sequence[Round], terms: Terms) -> None:
         surprise=surprise(last.measured, last.tuning.explained),
         safe=last.expected_falls <= terms.max_fall_rate,
         terms=terms,
+        biteno=robot == "biteno",
         episodes=sum(one.measured.episodes for one in history),
         falls=sum(round(one.measured.episodes * one.measured.fall_rate) for one in history),
         misfits=plots.embedded(plots.misfits(as_json(last.tuning.misfits))) if last.tuning.misfits else "",

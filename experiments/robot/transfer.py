@@ -136,7 +136,7 @@ def play(transfer: Transfer, programs: Programs) -> list[Round]:
         for index in range(transfer.rounds):
             history.append(rounds.play(index, history[-1] if history else None))
             page = transfer.out / f"round_{index:03d}" / "report.html"
-            report.write(page, history, transfer.terms)
+            report.write(page, history, transfer.terms, programs.learner.kind.name)
             report.show(console, history[-1])
             console.print(f"report in {page}")
         checkpoint.write_json(transfer.out / "summary.json", {"rounds": history, "versions": checkpoint.versions()})

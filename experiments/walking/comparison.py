@@ -125,7 +125,8 @@ def show(console: Console, summary: dict, results: dict[str, list[dict]]) -> Non
 
 def _methods_table(summary: dict) -> Table:
     start = f", start {summary['start']:g}X" if summary["off"] else ""
-    table = Table(title=f"case {summary['case']}{start}, mean over {len(summary['seeds'])} seed(s)")
+    what = f"truth {', '.join(summary['truth'])}" if summary["truth"] else f"case {summary['case']}{start}"
+    table = Table(title=f"{what}, mean over {len(summary['seeds'])} seed(s)")
     columns = "method", "return in target", "falls", "parameter error", "gate calls", "target episodes", "seconds"
     for column in columns:
         table.add_column(column, justify="left" if column == "method" else "right")

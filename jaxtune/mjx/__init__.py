@@ -8,9 +8,9 @@ gives `jaxtune.tuner` all that it needs:
     machine = Tuner(config=TunerConfig(), train_policy=tuner.keep, simulate=sim.simulate(act))
 
 Beneath it, `apply` changes the fields of an `mjx.Model` inside `jit`, `vmap` or `grad`, and recomputes the fields that
-depend on them (`set_const` lists them; tendons, cameras and lights stay as they were). `apply_mujoco` does the same to
-a model of MuJoCo C. `to_coords` and `from_coords` translate between physical values (`Params`) and the coordinates that
-the tuner searches (`Coords`).
+depend on them (`set_const` lists them; lengths of tendons, cameras and lights stay as they were). `apply_mujoco` does
+the same to a model of MuJoCo C. `to_coords` and `from_coords` translate between physical values (`Params`) and the
+coordinates that the tuner searches (`Coords`).
 
 This package is the only one in jaxtune that imports MuJoCo; the tuner does without it.
 """

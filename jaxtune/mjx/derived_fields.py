@@ -10,7 +10,15 @@ import jax.numpy as jnp
 import mujoco
 from mujoco import mjx
 
-DERIVED = ("body_subtreemass", "body_invweight0", "dof_M0", "dof_invweight0", "actuator_acc0", "stat.meaninertia")
+DERIVED = (
+    "body_subtreemass",
+    "body_invweight0",
+    "dof_M0",
+    "dof_invweight0",
+    "tendon_invweight0",
+    "actuator_acc0",
+    "stat.meaninertia",
+)
 """Fields that `set_const` recomputes."""
 _MIN_VALUE = mujoco.mjMINVAL
 
@@ -22,23 +30,24 @@ def set_const(model: mjx.Model) -> mjx.Model:
     the model's reference pose `qpos0`, with M the joint-space inertia and J the Jacobian of a body's centre of mass:
 
         body_subtreemass    mass of the body and of all that it carries, kg
-        dof_M0              diagonal of M
+        dof_M0              diagonal of M, without the armatures of tendons
         dof_invweight0      diagonal of M^-1, averaged over the axes of a free joint's translation, of its rotation and
                             of a ball joint
         body_invweight0     mean of the diagonal of J M^-1 J^T over the three axes, for translation and for rotation;
                             zero for bodies that are welded to the world
+        tendon_invweight0   diagonal of J M^-1 J^T, J the Jacobian of the tendons
         actuator_acc0       norm of M^-1 m, m the moment arms of the actuator
         stat.meaninertia    mean of the diagonal of M
 
-    `mj_setConst` leaves `stat.meaninertia` to the compiler; here it is kept true as well. Fields of tendons, cameras
-    and lights are not recomputed.
+    `mj_setConst` leaves `stat.meaninertia` to the compiler; here it is kept true as well. Lengths of tendons, and
+    fields of cameras and lights, are not recomputed.
 
     Args:
       model: a model whose masses, inertias or armatures may have been changed.
 
     Returns:
-      The same model with these six fields replaced. In single precision they differ from `mj_setConst`'s by a relative
-      2e-6 at most.
+      The same model with these seven fields replaced. In single precision they differ from `mj_setConst`'s by a
+      relative 2e-6 at most.
 
     Raises:
       ValueError: the model is not of MJX's JAX implementation, the only one that has these stages.
@@ -49,15 +58,15 @@ def set_const(model: mjx.Model) -> mjx.Model:
         model = model.replace(body_subtreemass=_subtree_mass(model))
         data = mjx.make_data(model).replace(qpos=model.qpos0)
         # The stages of MuJoCo's pipeline that the fields below read from: poses, the inertia M, and moment arms.
-        for stage in (mjx.kinematics, mjx.com_pos, mjx.crb, mjx.transmission):
+        for stage in (mjx.kinematics, mjx.com_pos, mjx.tendon, mjx.crb, mjx.transmission):
             data = stage(model, data)
-        inertia = mjx.full_m(model, data)
-        inverse = jnp.linalg.inv(inertia)
-        diagonal = jnp.diagonal(inertia)
+        diagonal = jnp.diagonal(mjx.full_m(model, data))
+        inverse = jnp.linalg.inv(mjx.full_m(model, mjx.tendon_armature(model, data)))
         return model.replace(
             body_invweight0=_body_weight(model, data, inverse),
             dof_M0=diagonal,
             dof_invweight0=_dof_weight(model, inverse),
+            tendon_invweight0=jnp.einsum("ti,ij,tj->t", data._impl.ten_J, inverse, data._impl.ten_J),
             actuator_acc0=jnp.linalg.norm(data._impl.actuator_moment @ inverse, axis=-1),
             stat=model.stat.replace(meaninertia=diagonal.mean()),
         )

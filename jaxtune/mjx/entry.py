@@ -21,10 +21,12 @@ _PREFIXES = {
     "body": ("body_",),
     "geom": ("geom_", "pair_"),
     "joint": ("jnt_", "dof_"),
-    "actuator": ("actuator_", "jnt_actfrcrange"),
+    "actuator": ("actuator_", "jnt_actfrcrange", "tendon_actfrcrange"),
     "control": (),
 }
 """How the fields begin that have rows for objects of a kind."""
+_JOINTS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+_TENDONS = (mujoco.mjtTrn.mjTRN_TENDON,)
 _NOT_NEGATIVE = {"body_mass", "body_inertia", "dof_armature", "dof_damping", "dof_frictionloss", "jnt_stiffness"}
 _NOT_NEGATIVE |= {"geom_friction", "pair_friction"}
 
@@ -110,8 +112,8 @@ class Entry:
 
         Raises:
           ValueError: there is no field; the model has no such target, field or column; a multiplier meets zeros alone;
-            an offset may take a mass, a friction or the like below zero; or friction is added to a joint for which MJX
-            does not solve it.
+            an offset may take a mass, a friction or the like below zero; friction is added to a joint for which MJX
+            does not solve it; or the model was compiled without what the field needs.
         """
         if not self.fields and self.kind != "control":
             raise ValueError("fields: got none, expected at least one")
@@ -126,6 +128,7 @@ class Entry:
                 raise ValueError(f"column: got {column[0]} of '{name}', which has {math.prod(array.shape[1:])}")
             rows, _ = self.rows(model, name)
             met.append(np.asarray(array)[(rows, *column)])
+            self._check_solved(model, (name, *column), rows)
             if name == "dof_frictionloss" and not self.log and not met[-1].all():
                 raise ValueError(
                     "fields: MJX solves for dof_frictionloss only in joints that had some when the model was put on "
@@ -140,6 +143,26 @@ class Entry:
             raise ValueError(
                 f"{' and '.join(self.field_names)}: zero for {', '.join(self.targets or ['all'])}, so a multiplier "
                 "changes nothing; add to it (offset=True)"
+            )
+
+    def _check_solved(self, model: mjx.Model, cell: tuple, rows: np.ndarray) -> None:
+        """Refuses what a compiled model can no longer express."""
+        name = cell[0]
+        if name in ("body_ipos", "body_iquat") and np.asarray(model.body_simple)[rows].any():
+            raise ValueError(
+                f"fields: {name} of a body that is alone and has its centre of mass at its origin: the compiler left "
+                'out what couples its motions; set simple="false" in the <body>'
+            )
+        if name == "body_gravcomp" and not model.ngravcomp:
+            raise ValueError("fields: no body has gravity compensation, so MJX computes none; give one body 1e-9 of it")
+        muscle = mujoco.mjtGain.mjGAIN_MUSCLE
+        if (
+            cell in (("actuator_gainprm",), ("actuator_biasprm",))
+            and (np.asarray(model.actuator_gaintype)[rows] == muscle).any()
+        ):
+            raise ValueError(
+                f"fields: {name} of a muscle, whose numbers are not all forces; name the motors, and change muscles by "
+                "columns 2 and 3 (force, scale)"
             )
 
     @property
@@ -181,7 +204,7 @@ class Entry:
             return np.array([index])
         driven = {}
         if self.kind == "actuator":
-            numbers, joints = _driven(model, np.arange(model.nu))
+            numbers, joints = _driven(model, np.arange(model.nu), _JOINTS)
             for number, joint in zip(numbers, joints, strict=True):
                 driven.setdefault(mjx.id2name(model, mujoco.mjtObj.mjOBJ_JOINT, joint), []).append(number)
             if target in driven:
@@ -212,9 +235,11 @@ class Entry:
             holds = np.asarray(model.dof_jntid)[:, None] == ids
         elif field.startswith("pair_"):
             holds = (np.asarray(model.pair_geom1)[:, None] == ids) | (np.asarray(model.pair_geom2)[:, None] == ids)
-        elif self.kind == "actuator" and field.startswith("jnt_"):
-            numbers, joints = _driven(model, ids)
-            holds = (np.arange(model.njnt)[:, None] == joints) @ (numbers[:, None] == ids)
+        elif self.kind == "actuator" and field.startswith(("jnt_", "tendon_")):
+            joints = field.startswith("jnt_")
+            numbers, driven = _driven(model, ids, _JOINTS if joints else _TENDONS)
+            count = model.njnt if joints else model.ntendon
+            holds = (np.arange(count)[:, None] == driven) @ (numbers[:, None] == ids)
         else:
             return ids, owner
         rows = np.flatnonzero(holds.any(axis=1))
@@ -226,8 +251,7 @@ def is_number(value) -> bool:
     return np.ndim(value) == 0 and np.issubdtype(getattr(value, "dtype", type(value)), np.number)
 
 
-def _driven(model, actuators: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns those of the actuators that drive a joint, and the joints that they drive."""
-    kinds = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+def _driven(model, actuators: np.ndarray, kinds: tuple[mujoco.mjtTrn, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Returns those of the actuators that drive a joint or a tendon, and which they drive."""
     actuators = actuators[np.isin(np.asarray(model.actuator_trntype)[actuators], kinds)]
     return actuators, np.asarray(model.actuator_trnid)[actuators, 0]

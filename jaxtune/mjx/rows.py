@@ -37,14 +37,15 @@ def mass(bodies: Names, *, bounds: Bounds) -> Entry:
 def strength(joints: Names, *, bounds: Bounds) -> Entry:
     """Multiplies the torque of motors, and of position and velocity servos, by one value.
 
-    Gains, biases and force limits are multiplied alike, and so are the limits of actuator force at the joints that they
-    drive, so that every torque is this share of the nominal one.
+    Gains, biases and force limits are multiplied alike, and so are the limits of actuator force at the joints and
+    tendons that they drive, so that every torque is this share of the nominal one. Muscles are refused.
 
     Args:
       joints: names of actuators, or of the joints that they drive; None for all actuators.
       bounds: smallest and largest multiplier.
     """
-    fields = ("actuator_gainprm", "actuator_biasprm", "actuator_forcerange", "jnt_actfrcrange")
+    limits = ("actuator_forcerange", "jnt_actfrcrange", "tendon_actfrcrange")
+    fields = ("actuator_gainprm", "actuator_biasprm", *limits)
     return Entry(kind="actuator", targets=_names(joints), fields=fields, bounds=bounds)
 
 
@@ -113,7 +114,8 @@ def parameters_of(model: mujoco.MjModel | mjx.Model, *, control_s: float | None 
         names = [mjx.id2name(model, mujoco.mjtObj.mjOBJ_JOINT, joint) for joint in having]
         if any(names):
             table[what] = field(f"dof_{what}", joints=list(filter(None, names)), bounds=_JOINT)
-    if model.nu:
+    motors = np.asarray(model.actuator_gaintype) != mujoco.mjtGain.mjGAIN_MUSCLE
+    if motors.all() and motors.size:
         table["strength"] = strength(None, bounds=_MOTOR)
     if model.npair or np.any((np.asarray(model.geom_contype) | np.asarray(model.geom_conaffinity)) > 0):
         table["friction"] = friction(bounds=_GRIP)

@@ -39,6 +39,7 @@ from jaxtune.types import Coords, ParamDist, Trajectory
 
 Act = Callable[[Any, Any, jax.Array], jax.Array]
 """A policy: `(policy, observation of one environment, key) -> action [act]`. The policy is a pytree of arrays."""
+_EXPLODED = 1e8  # an observation in whatever unit
 _DATA = ("data", "pipeline_state")
 WithModel = Callable[[Any, mjx.Model], Any]
 """`(env, model) -> env`: a copy of an environment that simulates this model."""
@@ -257,7 +258,7 @@ class Simulator:
         key_reset, key = jax.random.split(key)
         # Environments of Playground and Brax keep raw keys in their states.
         start = self._env(params).reset(_raw(key_reset))
-        nothing = jnp.zeros(())
+        nothing = jnp.zeros((), jnp.float32)
         return self._as_state(
             start,
             past=jnp.zeros((len(self._delay_weights(params)), self.action_size)),
@@ -277,7 +278,8 @@ class Simulator:
         # Before the first action there was none: it is as if it had been given all along.
         past = jnp.where(state.steps == 0, action, jnp.roll(state.past, 1, axis=0).at[0].set(action))
         following = self._env(params).step(state.env, jnp.sum(self._delay_weights(params)[:, None] * past, axis=0))
-        finite = jnp.isfinite(self.observed(following.obs)).all() & jnp.isfinite(following.reward)
+        # One that is finite but has exploded would spoil the statistics of all others, as one that is not.
+        finite = (jnp.abs(self.observed(following.obs)) < _EXPLODED).all() & jnp.isfinite(following.reward)
         state = self._as_state(
             following,
             past=past,

@@ -192,6 +192,24 @@ def test_a_size_at_two_places_is_the_same_physical_size(spec, plain):
         np.testing.assert_allclose(values, values[0], rtol=1e-5)
 
 
+def test_no_place_loses_more_than_it_has(spec):
+    """Armatures of 0.1 and 0.01 at once: coordinates are in the unit of the first."""
+    from envs.rig import Rig
+
+    spec = spec.copy()
+    for name, armature in zip(JOINTS, (0.1, 0.01), strict=True):
+        spec.joint(name).armature = armature
+    rig = Rig(spec, JOINTS, 1000.0).scaled({"inertia": np.array([0.25, 0.08])})
+    rows = {"armature": rig.effects["armature"]}
+    (both,) = [one for one in hypotheses(rig.axes, rig.places, rows) if len(one.places) == 2]
+    vector = (both.bounds[:, 0] @ both.directions).astype(np.float32)
+    left = np.asarray(rig.model(rig.values(rig.tree(vector))).dof_armature)
+    assert (left > 0).all()
+    # The elbow may lose nine tenths, and the shoulder loses as much.
+    np.testing.assert_allclose(left[rig.dof], [0.091, 0.001], rtol=1e-3)
+    assert (both.probes >= both.bounds[0, 0]).all()
+
+
 def test_a_centre_of_mass_is_tried_near_and_far_in_each_direction(spec):
     # About an upright axis only a far one is felt, since inertia grows with its square.
     from envs.rig import Rig

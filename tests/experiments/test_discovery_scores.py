@@ -100,9 +100,12 @@ def test_of_several_effects_all_have_to_be_named_and_no_others():
     one = score(pair, answer([named("coulomb")]))
     more = score(pair, answer([named("coulomb"), named("payload", "inertia", ("upper",)), named("drag", "external")]))
     elsewhere = score(pair, answer([named("coulomb"), named("payload", "inertia", ("lower",))]))
-    assert [row["all_named"] for row in (both, one, more, elsewhere)] == [True, False, True, True]
+    assert [row["all_named"] for row in (both, one, more, elsewhere)] == [True, False, True, False]
     assert [row["extra"] for row in (both, one, more, elsewhere)] == [False, False, True, True]
-    assert value([both, one, more, elsewhere], "pairs: both named") == 0.75
+    assert value([both, one, more, elsewhere], "pairs: both named") == 0.5
+    # Two names that have changed places are two wrong ones.
+    swapped = score(pair, answer([named("coulomb", places=("upper",)), named("payload", "inertia", ("elbow",))]))
+    assert not swapped["all_named"]
 
 
 def test_a_wrong_name_beside_the_right_one_is_an_extra_one():
@@ -142,6 +145,7 @@ def test_a_case_that_failed_is_wrong_whatever_it_hides():
     rows = [score(one, failed) for one in (truth(hidden("coulomb")), EMPTY, truth(hidden("cogging"), kind="outside"))]
     assert value(rows, "top-1 name, 5 floor units and more") == 0.0
     assert value(rows, "`no_missing_effect` where nothing is hidden") == 0.0
+    assert value(rows, "names something where nothing is hidden") == 1.0
     assert value(rows, "`unnamed` outside the library") == 0.0
     assert all(wrong(row) == "failed: ValueError: no" for row in rows)
 

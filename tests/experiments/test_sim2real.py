@@ -237,9 +237,13 @@ def test_the_page_says_what_matters_and_runs_nothing_of_the_log(tmp_path):
     assert "gyro[1] 4.2" in text
     assert text.count('<img src="data:image/png') == 2
     assert "experiments.discover" in text
+    assert "--model FOUND/model" in text
     assert "may walk again" in text
     assert "So far it has walked 10 times,\nand 4 of these walks ended in a fall" in text
     assert "end too early" not in text
+    report.write(page, [line(["unexplained"], 0.4, 0.1)], TERMS, robot="go2")
+    assert "experiments.excite --robot ROBOT.xml" in page.read_text()
+    assert "--model" not in page.read_text()
     report.write(page, [line(["not_comparable"], 1.0, 0.1, cut_short=3)], TERMS)
     text = page.read_text()
     assert "a policy that stands longer" in text

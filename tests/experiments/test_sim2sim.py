@@ -45,6 +45,13 @@ def test_bad_input_is_named(field, value, named, monkeypatch):
     assert named in str(error.value)
 
 
+@pytest.mark.parametrize("options", [{"update": "vote"}, {"methods": ("spm", "dr")}], ids=str)
+def test_states_that_nobody_would_read_are_refused(options):
+    with pytest.raises(ValueError, match="states: got true, expected method ours with the update posterior"):
+        sim2sim.check(sim2sim.Args(states=True, **options))
+    sim2sim.check(sim2sim.Args(states=True))
+
+
 def test_sweep_checks_every_combination():
     with pytest.raises(ValueError, match="radius"):
         sweep.check(sweep.Args(radii=(0.2, -0.1)))

@@ -9,7 +9,7 @@ import pytest
 from rich.console import Console
 
 from envs.logs import Controller
-from experiments.discovery import report
+from experiments.discovery import next_experiment, report
 from experiments.discovery.blind_cases import ARM
 from experiments.discovery.blind_robots import Truth, record
 from experiments.discovery.excitation import excitation
@@ -97,6 +97,30 @@ def test_what_is_named_changed_and_neither(asked):
     assert change["parameters"]["ratio"]["value"] == pytest.approx(np.exp(0.3), rel=1e-5)
     assert (weaker["name"], weaker["refines"]) == ("constant_push", "coulomb@elbow")
     assert summary["families"] == [{"family": "joint_friction", "places": ["elbow"], "probability": 0.97}]
+
+
+def test_a_delay_that_is_filtered_has_two_times(asked):
+    log, question = asked
+    every = {hypothesis.key: hypothesis for hypothesis in question.problem.hypotheses}
+    delay = every["sensor_delay@shoulder+elbow"]
+    (form,) = [one for one in question.problem.forms if one.form == "filtered" and one.shapes(delay)]
+    directions = np.concatenate([delay.directions, form.directions])
+    free = Free(directions, np.ones(2), np.tile([-1.0, 1.0], (2, 1)), np.array([False, False]))
+    fit = Fit(free, np.array([0.012, 0.003]), np.zeros(0), np.zeros((0, 2)), None)
+    terms = (AcceptedTerm(delay, EVIDENCE, Thresholds(10.0), forms=(form,)),)
+    result = found(question, terms=terms, fit=fit, errors=np.array([0.001, 0.001]), changed={}, needs_torque={})
+    (effect,) = summarise(question, log, Path("logs"), result)["effects"]
+    assert effect["parameters"]["seconds"]["value"] == pytest.approx(0.012, rel=1e-5)
+    assert effect["parameters"]["filtered.seconds"]["value"] == pytest.approx(0.003, rel=1e-5)
+
+
+def test_the_command_that_decides_can_be_typed_as_it_is(tmp_path, asked):
+    log, _ = asked
+    assert next_experiment._robot_of(log, tmp_path) == f" --robot {ARM}"
+    assert next_experiment._robot_of(replace(log, robot="biteno"), tmp_path) == ""
+    own = tmp_path / "my logs" / "arm.xml"
+    assert next_experiment._robot_of(replace(log, robot=str(own)), own.parent) == ""
+    assert next_experiment._robot_of(replace(log, robot=str(own)), tmp_path / "log") == f" --robot '{own}'"
 
 
 def test_an_answer_without_a_name_asserts_nothing(asked):

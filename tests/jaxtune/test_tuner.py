@@ -514,10 +514,17 @@ def test_a_set_far_from_everything_is_novel(gate):
 
 def test_robots_that_fall_where_no_simulated_one_does_are_rejected(gate):
     sets = stacked({})
-    score = gate(sets.replace(alive=sets.alive.at[:, :2, 20:].set(False)))
+    score = gate(sets.replace(alive=sets.alive.at[:, :2, 20:].set(False), fell=sets.fell.at[:, :2].set(True)))
     assert np.all(score.comparable)
     np.testing.assert_allclose(score.novelty, score.lost)
     assert np.all(score.p_value <= 0.05)
+
+
+def test_episodes_that_were_cut_short_are_no_falls(gate):
+    sets = stacked({})
+    score = gate(sets.replace(alive=sets.alive.at[:, :2, 55:].set(False)))
+    assert np.all(score.lost <= gate(sets).lost + 1e-6)
+    assert np.mean(score.p_value <= 0.05) < 0.2
 
 
 def test_windows_are_ranked_among_those_of_all_sets_and_every_set_weighs_the_same():

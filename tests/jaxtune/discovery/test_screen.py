@@ -11,7 +11,7 @@ from jaxtune.discovery.curves import groups_of, simulate_library
 from jaxtune.discovery.fit import Fit, Free
 from jaxtune.discovery.least_squares import Counts
 from jaxtune.discovery.profile import Changes, profile_of
-from jaxtune.discovery.screen import promising, screen
+from jaxtune.discovery.screen import _smallest, promising, screen
 
 
 def screened(truth, pairs=0, forms=(), unknowns=None):
@@ -142,3 +142,11 @@ def test_a_profile_keeps_bounds():
 
 def test_axes_are_named_as_the_toy_names_them():
     assert [hypothesis.name for hypothesis in HYPOTHESES] == list(AXES[:5])
+
+
+def test_an_effect_is_looked_for_at_its_smallest_size_of_interest():
+    # A tiny loss, which is all that the model can lose, is no size of interest; of x, y and z any may show.
+    assert _smallest(np.array([[-0.002], [0.03], [0.3]])) == [1]
+    assert _smallest(0.1 * np.concatenate([np.eye(3), -np.eye(3), 2 * np.eye(3)])) == [0, 1, 2]
+    # What can only be lost.
+    assert _smallest(np.array([[-0.3], [-0.1]])) == [1]

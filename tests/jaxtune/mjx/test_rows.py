@@ -249,3 +249,77 @@ def test_names_of_links_tell_which_belong_together(names, stems):
     )
     model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{links}</worldbody></mujoco>")
     assert list(parameters_of(model)) == [f"{stem}_mass" for stem in stems]
+
+
+TENDONS = """
+<mujoco>
+  <worldbody>
+    <site name="s0" pos="0.05 0 1.1"/>
+    <body name="upper" pos="0 0 1">
+      <joint name="shoulder" axis="0 1 0"/><geom type="capsule" size="0.03" fromto="0 0 0 0 0 -0.3" mass="1.2"/>
+      <site name="s1" pos="0.05 0 -0.2"/>
+      <body name="lower" pos="0 0 -0.3">
+        <joint name="elbow" axis="0 1 0"/><geom type="capsule" size="0.02" fromto="0 0 0 0 0 -0.25" mass="0.6"/>
+        <site name="s2" pos="0.04 0 -0.1"/>
+      </body>
+    </body>
+  </worldbody>
+  <tendon>
+    <spatial name="string" limited="true" range="0.1 0.5"><site site="s0"/><site site="s1"/><site site="s2"/></spatial>
+    <fixed name="belt" armature="0.02" actuatorfrclimited="true" actuatorfrcrange="-3 3">
+      <joint joint="shoulder" coef="1"/><joint joint="elbow" coef="-.5"/>
+    </fixed>
+  </tendon>
+  <actuator>
+    {muscle}
+    <motor name="puller" tendon="belt" gear="2"/>
+    <motor name="turner" joint="shoulder" gear="5"/>
+  </actuator>
+</mujoco>
+"""
+MUSCLE = '<muscle name="flexor" tendon="string" lengthrange="0.1 0.6"/>'
+
+
+@pytest.mark.parametrize("muscle", ["", MUSCLE], ids=["motors", "muscle"])
+def test_fields_of_tendons_follow_masses(muscle):
+    model = mujoco.MjModel.from_xml_string(TENDONS.format(muscle=muscle))
+    table = {"it": mass("lower", bounds=(0.2, 5.0))}
+    found, expected = apply(mjx.put_model(model), {"it": 3.0}, table), apply_mujoco(model, {"it": 3.0}, table)
+    for name in ("actuator_acc0", "tendon_invweight0", "dof_M0", "dof_invweight0"):
+        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-5, err_msg=name)
+    assert (np.asarray(found.actuator_acc0) > 0).all()
+
+
+def test_strength_scales_the_limit_of_actuator_force_at_a_tendon():
+    model = mujoco.MjModel.from_xml_string(TENDONS.format(muscle=""))
+    row = strength("puller", bounds=(0.4, 2.0))
+    for weak in (changed(model, row, 0.5), apply(mjx.put_model(model), {"it": 0.5}, {"it": row})):
+        np.testing.assert_allclose(weak.tendon_actfrcrange, [[0, 0], [-1.5, 1.5]], rtol=1e-6)
+    weak = changed(model, row, 0.5)
+    data = mujoco.MjData(weak)
+    data.ctrl[:] = 3.8
+    mujoco.mj_forward(weak, data)
+    np.testing.assert_allclose(data.actuator_force[0], 1.5)
+
+
+def test_the_strength_of_a_muscle_is_refused():
+    model = mujoco.MjModel.from_xml_string(TENDONS.format(muscle=MUSCLE))
+    with pytest.raises(ValueError, match="actuator_gainprm of a muscle, whose numbers are not all forces"):
+        check(mjx.put_model(model), {"it": strength(None, bounds=(0.4, 2.0))})
+    check(mjx.put_model(model), {"it": strength(("puller", "turner"), bounds=(0.4, 2.0))})
+    force = field("actuator_gainprm", actuators="flexor", column=2, bounds=(0.4, 2.0))
+    check(mjx.put_model(model), {"it": force})
+    assert "strength" not in parameters_of(model)
+
+
+@pytest.mark.parametrize(
+    ("name", "text"), [("body_ipos", 'set simple="false"'), ("body_gravcomp", "no body has gravity compensation")]
+)
+def test_what_the_compiler_left_out_cannot_be_changed(name, text):
+    xml = """<mujoco><worldbody><body name="drone" {}><freejoint/><geom type="box" size=".2 .1 .05" mass="1"/></body>
+      </worldbody></mujoco>"""
+    column = {"column": 0} if name == "body_ipos" else {}
+    table = {"it": field(name, bodies="drone", offset=True, bounds=(-0.1, 1.0), **column)}
+    with pytest.raises(ValueError, match=text):
+        check(mjx.put_model(mujoco.MjModel.from_xml_string(xml.format(""))), table)
+    check(mjx.put_model(mujoco.MjModel.from_xml_string(xml.format('simple="false" gravcomp="1e-9"'))), table)

@@ -110,6 +110,26 @@ def test_a_step_that_is_not_finite_is_counted_and_masked(sim):
     assert np.isfinite(np.where(episodes.alive, episodes.score, 0.0)).all()
 
 
+def test_a_step_that_explodes_is_not_finite():
+    def step(state, action):
+        state = Sled.step(env, state, action)
+        return dataclasses.replace(state, obs=jnp.where(state.data.time > 0.3, 1e12, state.obs))
+
+    env = Sled()
+    env.step = step
+    episodes = rollout(Simulator(env, steps=STEPS, parameters=TABLE), 7, act, 3.0, {"delay": jnp.zeros(2)})
+    assert episodes.not_finite.all()
+    np.testing.assert_array_equal(episodes.alive.sum(axis=1), 15)
+
+
+def test_double_precision_is_simulated():
+    with jax.enable_x64(True):
+        sim = Simulator(Sled(), steps=5, parameters=TABLE)
+        params = {"mass": jnp.ones(2), "delay": jnp.zeros(2)}
+        shapes = jax.eval_shape(lambda params: sim.rollout(jax.random.key(0), act, 3.0, params), params)
+    assert shapes.obs.shape == (2, 5, 3)
+
+
 def test_simulate_takes_coordinates_and_measure_hides_parameters(sim, play):
     key = jax.random.key(7)
     coords = {"mass": jnp.log(jnp.array([1.3])), "delay": jnp.array([0.8])}
