@@ -7,7 +7,7 @@ import jax
 
 from envs import corrected
 from experiments.common import checkpoint, hosts, plots
-from experiments.common.checkpoint import write_json
+from experiments.common.checkpoint import as_json, read_json, write_json
 from experiments.common.cli import console, run
 from experiments.common.config import preset
 from experiments.walking import memory
@@ -44,7 +44,8 @@ def main(args: Args) -> None:
     """Trains, saves the policy, draws the training curve, and prints the speed.
 
     Raises:
-      ValueError: an option is wrong, the corrected model cannot be read, or the training does not fit into memory.
+      ValueError: an option is wrong, the corrected model cannot be read, the training does not fit into memory, or the
+        folder holds another policy or another command's run.
     """
     checkpoint.set_up_compiler(preset(args.preset).xla_flags)
     hosts.join(args)
@@ -53,6 +54,7 @@ def main(args: Args) -> None:
     updates = sizes.scratch_updates if args.updates is None else args.updates
     if updates < 1:
         raise ValueError(f"updates: got {updates}, expected 1 or more")
+    _check_folder(args)
     learner = Learner(sizes, entries, correction=args.model and corrected.read(args.model), kind=robot)
     memory.check(learner)
     _, curve = trained(jax.random.PRNGKey(args.seed), learner, updates, args.out)
@@ -64,6 +66,19 @@ def main(args: Args) -> None:
         speed = (last["steps"] - first["steps"]) / (last["seconds"] - first["seconds"])
         console.print(f"{speed:,.0f} environment steps per second after compilation")
     console.print(f"{last['steps']:,} steps in {last['seconds']:.0f} s, saved to {args.out}")
+
+
+def _check_folder(args: Args) -> None:
+    """Checks that no other policy, and no run of another command, would be overwritten."""
+    if (args.out / "training").exists() or not (args.out / "config.json").exists():
+        return
+    if not (args.out / "curve.json").exists():
+        raise ValueError(f"out: {args.out} holds a run of another command, expected a new folder")
+    # Without options it was killed before its last line.
+    there, now = read_json(args.out / "curve.json").get("args", {}), as_json(args)
+    for name in there.keys() & now.keys() - {"out"}:
+        if there[name] != now[name]:
+            raise ValueError(f"{name}: got {now[name]}, but {args.out} holds a policy with {there[name]}")
 
 
 if __name__ == "__main__":

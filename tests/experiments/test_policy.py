@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from experiments import train as train_command
 from experiments.common import checkpoint
 from experiments.common.config import PRESETS, WALK
 from experiments.walking.learner import Learner
@@ -94,3 +95,23 @@ def test_shipped_policy_loads_and_has_learnt(learner):
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(shipped.params))
     # A learner that has seen the task knows that joints do not all move alike.
     assert np.ptp(shipped.normalizer.std) > 0.1
+
+
+def test_a_training_overwrites_no_other_policy_and_no_other_run(tmp_path, monkeypatch):
+    monkeypatch.setattr(train_command, "Learner", lambda *_, **__: pytest.fail("it was begun"))
+    args = train_command.Args(out=tmp_path, preset="smoke")
+    (tmp_path / "config.json").write_text("{}")
+    with pytest.raises(ValueError, match=r"out: .* holds a run of another command, expected a new folder"):
+        train_command.main(args)
+    checkpoint.write_json(tmp_path / "curve.json", {"args": args, "curve": []})
+    for field, other in (("seed", 1), ("robot", "go2"), ("updates", 7)):
+        with pytest.raises(ValueError, match=f"{field}: got {other}, but .* holds a policy with"):
+            train_command.main(dataclasses.replace(args, **{field: other}))
+    # The same again, and one that was killed: between its two last lines, or earlier.
+    for written in ({"args": args}, {"curve": []}):
+        checkpoint.write_json(tmp_path / "curve.json", written)
+        with pytest.raises(pytest.fail.Exception, match="it was begun"):
+            train_command.main(args)
+    (tmp_path / "training").mkdir()
+    with pytest.raises(pytest.fail.Exception, match="it was begun"):
+        train_command.main(dataclasses.replace(args, seed=1))
