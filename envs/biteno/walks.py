@@ -7,10 +7,13 @@ it is estimated from the legs. The first tick of every piece is left out, becaus
 the last tick of a piece that does not end in a fall, because its outcome is unknown.
 """
 
-from functools import partial
+from collections.abc import Mapping
+from functools import cache, partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 
 from envs import sensing
@@ -24,6 +27,7 @@ from jaxtune.types import Trajectory
 
 _NEEDED = ("q", "dq", "target", "action", "phase", "cmd", "gyro", "gravity", "vel")
 _READINGS = {"velocity": "vel", "gyro": "gyro", "gravity": "gravity", "joint": "q", "joint_velocity": "dq"}
+_AT_LIMIT = 1e-4  # rad from the end of a joint's range: a target that was clipped
 _UP_S = 0.5  # time for which a robot must be up after a fall to count as standing again
 
 
@@ -55,6 +59,7 @@ def episodes(log: Log, steps: int) -> Recorded:
     found, leads = [], []
     for index, run in enumerate(log.runs):
         ticks = _at_ticks(run, order)
+        ticks["meant"] = _meant(log.policy or {}, ticks)
         pieces = _pieces(ticks)
         # A run without a walk is refused, because every run of the result must have an episode.
         if not pieces:
@@ -112,6 +117,28 @@ def _wanted_torque(run: Run, seen: dict[str, np.ndarray], order: list[int]) -> n
     return run.controller.impedance()[order].torque(target, seen["q"], seen["dq"])
 
 
+def _meant(policy: Mapping[str, Any], seen: dict[str, np.ndarray]) -> np.ndarray:
+    """The targets that the policy meant and observed, [ticks, joints] rad.
+
+    A robot's player clips what it sends to the joints' ranges, where a simulator does not.
+    """
+    target = seen["target"]
+    if "action_scale" not in policy:
+        return target
+    raibert = policy.get("base", "raibert") == "raibert"
+    base = jax.vmap(gait.joint_reference)(seen["phase"], seen["cmd"]) if raibert else constants.STAND_RAD
+    meant = base + policy["action_scale"] * np.clip(seen["action"], -env.ACTION_LIMIT, env.ACTION_LIMIT)
+    low, high = _joint_ranges()
+    return np.where((target <= low + _AT_LIMIT) | (target >= high - _AT_LIMIT), meant, target)
+
+
+@cache
+def _joint_ranges() -> np.ndarray:
+    """Least and largest position of every joint, [2, joints] rad."""
+    model = mujoco.MjModel.from_xml_path(str(constants.MODEL_PATH))
+    return np.array([model.joint(name).range for name in constants.JOINTS]).T
+
+
 def _pieces(ticks: dict[str, np.ndarray]) -> list[tuple[np.ndarray, bool]]:
     """Finds pieces of consecutive ticks with the robot on its feet, and whether each ends in a fall."""
     up = ticks["up"]
@@ -138,7 +165,7 @@ def _steps(ticks: dict[str, np.ndarray], rows: np.ndarray, fell: bool) -> dict:
     last = None if fell else -1
     places = {"before": rows[:-1][:last], "now": rows[1:][:last], "after": rows[1:][:last] + 1}
     moments = {
-        moment: {name: ticks[name][at].astype(np.float32) for name in (*_NEEDED, "tau")}
+        moment: {name: ticks[name][at].astype(np.float32) for name in (*_NEEDED, "tau", "meant")}
         for moment, at in places.items()
     }
     ends = np.zeros(len(places["now"]), bool)
@@ -155,7 +182,7 @@ def _as_simulated(steps: dict, lead: int) -> Recorded:
         **{name: now[signal] for name, signal in _READINGS.items()},
         command=now["cmd"],
         last_action=before["action"],
-        joint_error=before["target"] - now["q"],
+        joint_error=before["meant"] - now["q"],
         phase=now["phase"],
     )
     values = each(rewards.terms)(

@@ -94,6 +94,19 @@ def test_windows_are_those_of_the_simulator(simulated, tmp_path, suffix):
     np.testing.assert_allclose(found.score[known], trajectory.score[:, 2:][known], rtol=1e-3, atol=1e-5)
 
 
+def test_targets_that_a_robot_clips_are_observed_as_the_policy_meant_them(simulated):
+    _, log = simulated
+    low, high = walks._joint_ranges()
+    runs, cut = [], 0.0
+    for run in log.runs:
+        sent = np.clip(run.signals["target"], low, high)
+        cut = max(cut, np.abs(sent - run.signals["target"]).max())
+        runs.append(replace(run, signals=run.signals | {"target": sent}))
+    assert cut > 0.03
+    found, expected = (walks.episodes(one, STEPS).trajectory for one in (replace(log, runs=tuple(runs)), log))
+    np.testing.assert_allclose(found.obs, expected.obs, atol=1e-5)
+
+
 def test_joints_may_come_in_another_order(simulated):
     trajectory, log = simulated
     order = [3, 1, 5, 0, 4, 2]
