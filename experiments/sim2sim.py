@@ -3,7 +3,7 @@
 The simulator starts at its nominal model, in which the starting policy was trained. The target's parameters are the
 nominal ones divided by `start`, so the simulator starts at `start` times the target. The tables' error is
 |estimate / truth - 1| for multipliers, which is 0.5 at both of the paper's starts, 0.5X and 1.5X; for offsets it is
-|estimate - truth| in the parameter's unit.
+|estimate - truth| in half widths of their bounds.
 """
 
 import dataclasses

@@ -61,7 +61,8 @@ def errors(
 ) -> dict[str, np.ndarray]:
     """Computes errors of physical values by name.
 
-    They are relative for multipliers, |estimate / truth - 1|, and absolute for offsets, which may be zero.
+    They are relative for multipliers, |estimate / truth - 1|. For offsets, which may be zero, they are
+    |estimate - truth| in half widths of the parameter's bounds: numbers that may be averaged with the others.
 
     Args:
       entries: the parameter table.
@@ -69,7 +70,7 @@ def errors(
       truth: values by name; every name of the estimate.
     """
     off = {name: np.abs(np.asarray(value) - truth[name]) for name, value in estimate.items()}
-    return {name: error / truth[name] if entries[name].log else error for name, error in off.items()}
+    return {name: error / (truth[name] if entries[name].log else entries[name].unit) for name, error in off.items()}
 
 
 def checked_case(

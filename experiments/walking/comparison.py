@@ -147,7 +147,7 @@ def _methods_table(summary: dict) -> Table:
 
 
 def _parameters_table(summary: dict, results: dict[str, list[dict]]) -> Table:
-    table = Table(title="|estimate / truth - 1| after the last tuning (~: not identifiable in it)")
+    table = Table(title="relative error after the last tuning (~: not identifiable in it)")
     table.add_column("parameter")
     for name in summary["methods"]:
         table.add_column(name, justify="right")

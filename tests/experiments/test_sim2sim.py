@@ -12,7 +12,7 @@ from experiments.common import checkpoint, plots
 from experiments.common.cli import bars
 from experiments.common.config import PRESETS
 from experiments.walking import comparison
-from experiments.walking.cases import CASES
+from experiments.walking.cases import CASES, errors
 from experiments.walking.robots import BITENO
 
 
@@ -50,6 +50,15 @@ def test_states_that_nobody_would_read_are_refused(options):
     with pytest.raises(ValueError, match="states: got true, expected method ours with the update posterior"):
         sim2sim.check(sim2sim.Args(states=True, **options))
     sim2sim.check(sim2sim.Args(states=True))
+
+
+def test_errors_of_offsets_are_in_half_widths_of_their_bounds():
+    entries = BITENO.chosen("trunk_mass,action_delay_s")
+    low, high = entries["action_delay_s"].bounds
+    truth = {"trunk_mass": 0.8, "action_delay_s": 0.01}
+    found = errors(entries, {"trunk_mass": 1.0, "action_delay_s": 0.0}, truth)
+    assert found["trunk_mass"] == pytest.approx(0.25)
+    assert found["action_delay_s"] == pytest.approx(0.01 / (0.5 * (high - low)))
 
 
 def test_sweep_checks_every_combination():

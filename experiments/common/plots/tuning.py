@@ -232,7 +232,7 @@ def _errors(path: Path, results: dict[str, list[dict]], off: Sequence[str]) -> N
     for name, runs in results.items():
         values = np.array([[np.mean([line["param_error"][p] for p in off]) for line in run["lines"]] for run in runs])
         spread(axis, np.arange(values.shape[1]), values, name)
-    axis.set(xlabel="tunings", ylabel="mean of |estimate / truth - 1|", ylim=(0, None))
+    axis.set(xlabel="tunings", ylabel="mean relative error of parameters", ylim=(0, None))
     axis.set_title(textwrap.fill(f"over {', '.join(off)}", 100), fontsize=7)
     axis.legend()
     save(figure, path)
@@ -249,7 +249,7 @@ def _each_error(path: Path, results: dict[str, list[dict]]) -> None:
             spread(axis, np.arange(values.shape[1]), values, name)
         axis.set_title(parameter, fontsize=9)
         axis.set_xlabel("tunings")
-    axes[0, 0].set(ylabel="|estimate / truth - 1|", ylim=(0, None))
+    axes[0, 0].set(ylabel="relative error", ylim=(0, None))
     axes[0, -1].legend(fontsize=8)
     save(figure, path)
 
