@@ -32,8 +32,8 @@ from jaxtune.types import Trajectory
 
 _STRIDE = 2
 _LAYERS = 4  # they shorten a window of 50 steps to 25, 13, 7 and 4
-# A channel without noise (the gait clock) would otherwise raise the ELBO without limit as its learned noise shrinks.
 _AWAY = 1e4  # where references lie that there are no windows for: within no reach
+# A channel without noise (the gait clock) would otherwise raise the ELBO without limit as its learned noise shrinks.
 _MIN_LOG_STD = -3.0
 
 

@@ -389,7 +389,8 @@ def posterior_update(
     The intervals hold together: all truths at once lie in them with probability `coverage`, if the measured set is a
     draw like the held-out ones. It no longer is where a narrower box than the truth's was drawn from, and every
     refinement draws from a narrower one. So the box is narrowed to `wide`, which misses a tenth as often, and the
-    quantile Q is by as much higher as all refinements may miss: `1 - (1 - coverage) (1 - refinements / 10)`.
+    quantile of `interval` is by as much higher as the refinements (five at most) may miss:
+    `1 - (1 - coverage) (1 - refinements / 10)`.
 
     A coordinate that is not identifiable keeps centre and radius. Where the interval of one that is reaches past the
     box, and not merely past a bound, all keep their radii, and centres move.

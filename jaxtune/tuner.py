@@ -211,9 +211,9 @@ class Tuner:
       verify: scores a measured set against simulated ones (`rules.Verify`).
       update: moves the distribution after an accepted set (`rules.Update`).
       replay: simulates pieces of episodes from measured states (`jaxtune.replay`), for a last, more exact estimate.
+        Simulated and measured episodes must hold states then (`Trajectory.state`).
       phase: where in its cycle a step is, such as a gait's clock says; the share of its episode if not given. Only
         `misfits` asks for it.
-        Simulated and measured episodes must hold states then (`Trajectory.state`).
     """
 
     config: TunerConfig
@@ -285,7 +285,7 @@ class Tuner:
             # Every round simulates new robots and trains its models anew, because the distribution has changed.
             key_collect, key_verify, key_update = jax.random.split(jax.random.fold_in(key, carry["rounds"]), 3)
             collected = self.collect(key_collect, state.policy, carry["dist"])
-            # Once for gate and update, and for neither where they do not read it.
+            # Once for gate and update; left out of the program where neither reads it.
             collected = collected.replace(reading=examine(self.config, collected, measured))
             carry, last = counted(carry, collected), carry["left"] <= 0
             # Branches, so that (unless vmapped) no model is trained that is not needed.

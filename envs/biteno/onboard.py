@@ -1,10 +1,20 @@
 """What BITeno's computer must know around an exported policy; `player.py` is the code that runs there."""
 
+from functools import cache
+
 import mujoco
+import numpy as np
 
 from envs import sensing
 from envs.biteno import constants
 from envs.biteno.env import ACTION_LIMIT, TaskConfig
+
+
+@cache
+def joint_ranges() -> np.ndarray:
+    """Least and largest position of every joint, [2, joints] rad, to which the robot clips its targets."""
+    model = mujoco.MjModel.from_xml_path(str(constants.MODEL_PATH))
+    return np.array([model.joint(name).range for name in constants.JOINTS]).T
 
 
 def meta(task: TaskConfig) -> dict:
@@ -27,7 +37,7 @@ def meta(task: TaskConfig) -> dict:
             {"name": name, "size": len(scale), "scale": scale.tolist()} for name, scale in sensing.LAYOUT.items()
         ],
         "stand_rad": constants.STAND_RAD.tolist(),
-        "joint_range_rad": [model.joint(name).range.tolist() for name in constants.JOINTS],
+        "joint_range_rad": joint_ranges().T.tolist(),
         "action_limit": ACTION_LIMIT,
         "action_scale": task.action_scale,
         "base": task.base,

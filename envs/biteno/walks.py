@@ -8,16 +8,16 @@ the last tick of a piece that does not end in a fall, because its outcome is unk
 """
 
 from collections.abc import Mapping
-from functools import cache, partial
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 
 from envs import sensing
 from envs.biteno import constants, env, gait, rewards
+from envs.biteno.onboard import joint_ranges
 from envs.logs import Log, Run
 from envs.logs.format import JOINT_SIGNALS
 from envs.logs.sampling import HELD, sampled
@@ -128,15 +128,8 @@ def _meant(policy: Mapping[str, Any], seen: dict[str, np.ndarray]) -> np.ndarray
     raibert = policy.get("base", "raibert") == "raibert"
     base = jax.vmap(gait.joint_reference)(seen["phase"], seen["cmd"]) if raibert else constants.STAND_RAD
     meant = base + policy["action_scale"] * np.clip(seen["action"], -env.ACTION_LIMIT, env.ACTION_LIMIT)
-    low, high = _joint_ranges()
+    low, high = joint_ranges()
     return np.where((target <= low + _AT_LIMIT) | (target >= high - _AT_LIMIT), meant, target)
-
-
-@cache
-def _joint_ranges() -> np.ndarray:
-    """Least and largest position of every joint, [2, joints] rad."""
-    model = mujoco.MjModel.from_xml_path(str(constants.MODEL_PATH))
-    return np.array([model.joint(name).range for name in constants.JOINTS]).T
 
 
 def _pieces(ticks: dict[str, np.ndarray]) -> list[tuple[np.ndarray, bool]]:

@@ -3,6 +3,7 @@
 import hashlib
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from operator import itemgetter
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -128,9 +129,9 @@ def digest(log: Log, spec: mujoco.MjSpec) -> str:
         told = (run.name, run.condition, run.split, run.controller.kind, run.controller.rate_hz)
         found.update(repr((*told, run.controller.between_rows)).encode())
         facts = {f"{signal}.{name}": value for signal, known in run.known.items() for name, value in known.items()}
-        for name, values in sorted(
-            [("t", run.time), *run.controller.gains.items(), *run.signals.items(), *facts.items()]
-        ):
+        # A gain may have the name of a signal (`volts`).
+        numbers = [("t", run.time), *run.controller.gains.items(), *run.signals.items(), *facts.items()]
+        for name, values in sorted(numbers, key=itemgetter(0)):
             found.update(name.encode())
             found.update(np.ascontiguousarray(values, float))
     return found.hexdigest()

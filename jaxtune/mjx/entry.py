@@ -128,12 +128,7 @@ class Entry:
                 raise ValueError(f"column: got {column[0]} of '{name}', which has {math.prod(array.shape[1:])}")
             rows, _ = self.rows(model, name)
             met.append(np.asarray(array)[(rows, *column)])
-            self._check_solved(model, (name, *column), rows)
-            if name == "dof_frictionloss" and not self.log and not met[-1].all():
-                raise ValueError(
-                    "fields: MJX solves for dof_frictionloss only in joints that had some when the model was put on "
-                    "the device; give all of these joints 1e-6 in the MuJoCo model, and put it there again"
-                )
+            self._check_compiled(model, (name, *column), rows, met[-1])
             smallest = met[-1].min(initial=np.inf)
             if not self.log and name in _NOT_NEGATIVE and smallest + self.bounds[0] < 0:
                 raise ValueError(
@@ -145,9 +140,14 @@ class Entry:
                 "changes nothing; add to it (offset=True)"
             )
 
-    def _check_solved(self, model: mjx.Model, cell: tuple, rows: np.ndarray) -> None:
+    def _check_compiled(self, model: mjx.Model, cell: tuple, rows: np.ndarray, values: np.ndarray) -> None:
         """Refuses what a compiled model can no longer express."""
         name = cell[0]
+        if name == "dof_frictionloss" and not self.log and not values.all():
+            raise ValueError(
+                "fields: MJX solves for dof_frictionloss only in joints that had some when the model was put on the "
+                "device; give all of these joints 1e-6 in the MuJoCo model, and put it there again"
+            )
         if name in ("body_ipos", "body_iquat") and np.asarray(model.body_simple)[rows].any():
             raise ValueError(
                 f"fields: {name} of a body that is alone and has its centre of mass at its origin: the compiler left "

@@ -278,3 +278,9 @@ def test_a_log_that_was_corrected_is_another_question(tmp_path, good):
         digest(replace(log, runs=(replace(log.runs[0], split="sealed"), *log.runs[1:])), spec),
     ]
     assert len({digest(log, spec), *others}) == 6
+    # The supply of a servo may be given and recorded too.
+    both = gains(log, volts=np.full(2, 7.4))
+    both = replace(
+        both, runs=tuple(replace(r, signals=r.signals | {"volts": np.full(len(r.time), 7.4)}) for r in both.runs)
+    )
+    assert len(digest(both, spec)) == 64

@@ -10,6 +10,7 @@ import pytest
 
 from envs import logs, sensing
 from envs.biteno import constants, walks
+from envs.biteno.onboard import joint_ranges
 from envs.logs import Controller, Log, Run
 from envs.logs.sampling import HELD
 from envs.targets import mujoco_c, recorded
@@ -96,7 +97,7 @@ def test_windows_are_those_of_the_simulator(simulated, tmp_path, suffix):
 
 def test_targets_that_a_robot_clips_are_observed_as_the_policy_meant_them(simulated):
     _, log = simulated
-    low, high = walks._joint_ranges()
+    low, high = joint_ranges()
     runs, cut = [], 0.0
     for run in log.runs:
         sent = np.clip(run.signals["target"], low, high)
