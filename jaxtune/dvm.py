@@ -28,6 +28,7 @@ from flax import linen as nn
 from jaxtyping import Array, Bool, Float
 
 from jaxtune import devices, windows
+from jaxtune.descent import descend
 from jaxtune.types import Trajectory
 
 _STRIDE = 2
@@ -166,15 +167,7 @@ def train(key: jax.Array, config: DVMConfig, trajectory: Trajectory) -> tuple[DV
         elbo, _ = network.apply(variables, scaler(window), noise)
         return -scale * elbo.mean()
 
-    def descend(carry, key):
-        variables, opt_state = carry
-        value, grads = jax.value_and_grad(loss)(variables, key)
-        updates, opt_state = optimizer.update(grads, opt_state, variables)
-        return (optax.apply_updates(variables, updates), opt_state), value
-
-    (variables, _), losses = jax.lax.scan(
-        descend, (variables, optimizer.init(variables)), jax.random.split(key_train, config.train_steps)
-    )
+    variables, last = descend(key_train, loss, variables, optimizer, config.train_steps)
     # Not one of them twice, or copies would be each other's neighbours.
     window, valid = windows.choose(key_reference, trajectory, config.references, config.window)
     elbo, latent = _evaluate(config, variables, scaler, window)
@@ -183,7 +176,7 @@ def train(key: jax.Array, config: DVMConfig, trajectory: Trajectory) -> tuple[DV
     own, _ = jax.lax.top_k(-_distances(latent, latent), config.neighbours + 1)
     reach = jnp.nanquantile(jnp.where(valid, -own[:, -1], jnp.nan), config.reach)
     dvm = DVM(variables=variables, scaler=scaler, latent=latent, elbo=elbo, reach=reach)
-    return dvm, -losses[-max(config.train_steps // 10, 1) :].mean() / scale
+    return dvm, -last / scale
 
 
 def novelty(

@@ -39,6 +39,7 @@ from flax import linen
 from jaxtune import devices
 
 _LEARNING_RATE_RANGE = (1e-5, 1e-2)  # smallest and largest step size that the divergence may steer to
+_CONSTANT = 2e-6  # standard deviation of an observation that never changed, as a multiple of its size, from one up
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -205,7 +206,7 @@ class PPO:
         env_state, data, env_metrics = self.collect(keys, state, env, env_state)
         data = devices.gather(data)
         # As in Brax's own training, the loss already reads observations with the updated statistics.
-        normalizer = running_statistics.update(state.normalizer, data.observation)
+        normalizer = _bounded(running_statistics.update(state.normalizer, data.observation))
         normalizer = optax.tree.where(_finite(normalizer), normalizer, state.normalizer)
         (params, opt_state), learned = jax.lax.scan(
             lambda carry, key: self._pass(key, carry, normalizer, data),
@@ -297,6 +298,15 @@ class PPO:
         faster = jnp.minimum(learning_rate * 1.5, high)
         target = self.config.target_kl
         return jnp.where(kl > 2 * target, slower, jnp.where((kl < target / 2) & (kl > 0), faster, learning_rate))
+
+
+def _bounded(normalizer: running_statistics.RunningStatisticsState) -> running_statistics.RunningStatisticsState:
+    """Leaves observations unscaled that did not change in training.
+
+    Brax divides them by 1e-6, so one that is a little different on the robot would drown all others.
+    """
+    varies = normalizer.std > _CONSTANT * jnp.maximum(jnp.abs(normalizer.mean), 1.0)
+    return normalizer.replace(std=jnp.where(varies, normalizer.std, 1.0))
 
 
 def _finite(values: Any) -> jax.Array:

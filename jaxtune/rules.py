@@ -282,8 +282,10 @@ def _share_up(episodes: Trajectory) -> jax.Array:
 
 def of_all_sets(function: Callable, shared: tuple, collected: Collected, measured: Trajectory):
     """What a function `(*shared, set)` returns for every held-out set and, last, for the measured one."""
-    held_out = devices.in_chunks(function, (collected.held_out,), SETS, shared=shared)
-    return jax.tree.map(lambda sets, one: jnp.concatenate([sets, one[None]]), held_out, function(*shared, measured))
+    held_out, measured = (episodes.replace(state=None) for episodes in (collected.held_out, measured))
+    # Put together first, so that the function is compiled once.
+    every = jax.tree.map(lambda sets, one: jnp.concatenate([sets, one[None]]), held_out, measured)
+    return devices.in_chunks(function, (every,), SETS, shared=shared)
 
 
 def fit(config: TunerConfig, collected: Collected) -> tuple[regression.Regression, surface.Surface]:

@@ -31,6 +31,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxtune import devices, windows
 from jaxtune import dist as dists
+from jaxtune.descent import descend
 from jaxtune.types import Coords, ParamDist, Trajectory
 
 _SCALED = 2048  # windows from which mean and standard deviation of the moments are computed
@@ -153,20 +154,11 @@ def train(
         guesses = jax.random.uniform(key_guess, shape, minval=low, maxval=high).at[:, 0].set(0.0)
         logits = network.apply(variables, _read(steps, moments, window), guesses)
         label = truth[episode][:, None] > guesses
-        # The mean over windows and guesses, summed over coordinates; `tail` is per coordinate again.
+        # The mean over windows and guesses, summed over coordinates; what is reported is per coordinate again.
         return optax.sigmoid_binary_cross_entropy(logits, label).mean(axis=(0, 1)).sum()
 
-    def descend(carry, key):
-        variables, opt_state = carry
-        value, grads = jax.value_and_grad(loss)(variables, key)
-        updates, opt_state = optimizer.update(grads, opt_state, variables)
-        return (optax.apply_updates(variables, updates), opt_state), value
-
-    (variables, _), losses = jax.lax.scan(
-        descend, (variables, optimizer.init(variables)), jax.random.split(key_train, config.train_steps)
-    )
-    tail = losses[-max(config.train_steps // 10, 1) :].mean() / truth.shape[-1]
-    return SPM(variables=variables, steps=steps, moments=moments, dist=dist), tail
+    variables, last = descend(key_train, loss, variables, optimizer, config.train_steps)
+    return SPM(variables=variables, steps=steps, moments=moments, dist=dist), last / truth.shape[-1]
 
 
 def logits(

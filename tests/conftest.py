@@ -2,6 +2,8 @@
 
 import datetime
 import os
+import shutil
+import tempfile
 import warnings
 
 import jax
@@ -23,7 +25,20 @@ for name, examples in {"quick": 300, "thorough": 2000}.items():
 settings.load_profile("quick")
 
 
+_CACHE = "JAX_COMPILATION_CACHE_DIR"
+_KEPT = pytest.StashKey[str]()
+
+
 def pytest_configure(config):
+    # Programs that several tests compile, in this process and in those that they start. The user's own cache, which a
+    # command takes unless it is told otherwise, would hide what does not compile.
+    if not hasattr(config, "workerinput"):
+        os.environ[_CACHE] = config.stash[_KEPT] = tempfile.mkdtemp(prefix="jaxtune-tests-")
+        os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.5"
+    jax.config.update("jax_compilation_cache_dir", os.environ[_CACHE])
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+    # Another process may be writing it; then it is compiled.
+    config.addinivalue_line("filterwarnings", "ignore:Error reading persistent compilation cache entry:UserWarning")
     # Brax imports JAXopt wherever its environments are imported.
     config.addinivalue_line("filterwarnings", "ignore:JAXopt is no longer maintained:DeprecationWarning")
     # What tests compile they run briefly. Flags are read when JAX makes its first array.
@@ -33,6 +48,10 @@ def pytest_configure(config):
     os.environ.setdefault("XLA_FLAGS", f"{QUICK_COMPILATION} --xla_cpu_parallel_codegen_split_count=1")
     # As `experiments.common.checkpoint.set_up_compiler` does.
     os.environ.setdefault("NPROC", "8")
+
+
+def pytest_unconfigure(config):
+    shutil.rmtree(config.stash.get(_KEPT, ""), ignore_errors=True)
 
 
 # The fixtures import for themselves, since the line above rules only after this file has been read.

@@ -1,7 +1,6 @@
 """Commands in processes of their own, and whether two runs of them found the same."""
 
 import json
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -24,12 +23,7 @@ DISCOVER = "from experiments import discover as command"
 STUB = "from experiments import robot_stub as command"
 
 
-def with_cache(folder):
-    """An environment in which programs are compiled once for all processes."""
-    return {**os.environ, "JAX_COMPILATION_CACHE_DIR": str(folder)}
-
-
-def start(imports, options, environment):
+def start(imports, options, environment=None):
     code = f"import sys; {imports}; from experiments.common.cli import run; run(command.main, command.Args)"
     return subprocess.Popen(
         [sys.executable, "-W", "ignore", "-c", code, *options],

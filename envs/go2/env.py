@@ -106,7 +106,7 @@ class Go2:
 
 
 def simulator() -> Simulator:
-    """Makes the robot that `--robot go2` names: episodes of 5 s, and the parameters that may be wrong."""
+    """Makes the robot that `--robot go2` names: episodes of 20 s, and the parameters that may be wrong."""
     links = {part: [f"{leg}_{part}" for leg in LEGS] for part in ("hip", "thigh", "calf")}
     table = {
         "base_mass": mass("base", bounds=(0.5, 2.0)),
@@ -117,4 +117,4 @@ def simulator() -> Simulator:
         "dry_friction": field("dof_frictionloss", joints=JOINTS, bounds=(0.3, 5.0)),
         "delay": action_delay(bounds_s=(0.0, 0.04)),
     }
-    return Simulator(Go2(), steps=250, parameters=table)
+    return Simulator(Go2(), steps=1000, parameters=table)

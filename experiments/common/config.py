@@ -50,7 +50,7 @@ class Preset:
     tunings: int = 5
     """Tunings in a run: verify and update the distribution, then train the policy in it."""
     evaluation_episodes: int = 32
-    """Episodes, each as long as the task's time limit, that a return is averaged over."""
+    """Whole episodes, of the robot's own length and at most the task's time limit, that a return is averaged over."""
     scratch_updates: int = 3000
     """PPO updates of a policy trained from scratch."""
     foreseen_episodes: int = 100

@@ -83,11 +83,13 @@ class Learner:
         self._hidden = hidden
         self.states = states
         self.robot = kind.make(preset, {**entries, **hidden}, correction)
-        self.longest = round(preset.task.episode_s / kind.control_s)
-        """Control steps of an episode of the full time limit."""
+        self.longest = min(round(preset.task.episode_s / kind.control_s), kind.episode_steps)
+        """Control steps of a whole episode: the robot's own, up to the preset's time limit."""
         trained = kind.make(kind.trained(preset), self.robot.entries, correction)
         self._env = TrainingBatch(trained, self.robot.entries, self.longest)
         self._ppo = PPO(preset.ppo, self.robot.observation_size, self.robot.action_size)
+        # Op by op, a reset would be hundreds of programs, compiled in every process anew.
+        self._init = jax.jit(self._fresh)
         # One compiled program serves all methods, because they differ only in its arguments.
         self._train = devices.on_all(jax.jit(lambda key, policy, dist: self.train(key, policy, dist, preset.epochs)))
 
@@ -103,19 +105,19 @@ class Learner:
         """
         return parameters.distribution(self.entries, radius, centre)
 
-    def init(self, key: jax.Array, ppo: PPOState | None = None) -> Policy:
-        """Starts a policy on freshly reset training robots.
+    def init(self, key: jax.Array) -> Policy:
+        """Starts a policy with new networks on freshly reset training robots.
 
         Args:
           key: random key (`jax.random.PRNGKey`, as Brax's wrappers need it).
-          ppo: a learnt state to continue from; None means new networks.
         """
+        return self._init(key)
+
+    def _fresh(self, key):
         key_learner, key_robots = jax.random.split(key)
-        ppo = self._ppo.init(key_learner) if ppo is None else ppo
-        count = self.preset.ppo.num_envs
-        robots = self._env.reset(jax.random.split(key_robots, count))
+        robots = self._env.reset(jax.random.split(key_robots, self.preset.ppo.num_envs))
         return Policy(
-            learner=ppo,
+            learner=self._ppo.init(key_learner),
             # Strong types, as training returns them; with weak ones its second call would compile again.
             robots=jax.tree.map(lambda leaf: jnp.asarray(leaf, leaf.dtype), robots),
             radius=jnp.asarray(self.preset.policy_radius, jnp.float32),

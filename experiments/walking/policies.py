@@ -157,5 +157,5 @@ def starting_policy(name: str, learner: Learner, out: Path | None = None) -> Pol
         if not checkpoint.exists(place / "config.json"):
             trained(jax.random.PRNGKey(0), learner, learner.preset.scratch_updates, place)
     ppo = checkpoint.load(place, fresh.learner, policy_config(learner))
-    # Disk holds networks, optimiser and statistics alone. Robots are reset, so they may have another model by now.
-    return learner.init(jax.random.PRNGKey(0), ppo)
+    # Disk holds networks, optimiser and statistics alone. Robots are new, so they may have another model by now.
+    return fresh.replace(learner=ppo)

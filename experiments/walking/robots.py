@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 
 from envs import corrected, go2, sensing
-from envs.biteno import constants, gait, onboard, walks
+from envs.biteno import TaskConfig, constants, gait, onboard, walks
 from envs.corrected import Correction
 from envs.diagnosis import Finding, diagnose_log, shared_findings
 from envs.logs import Log, read, read_observed
@@ -33,7 +33,7 @@ from jaxtune.misfits import Phase, share_of_episode
 from jaxtune.mjx import Entry, Robot, Simulator, model_of, parameters_of, select
 
 _IMPLEMENTATIONS = {"playground": "jax", "playground-warp": "warp"}  # of MJX, for environments of Playground
-_LONGEST = 1000  # control steps of a compared episode, where a preset has no fewer
+_LONGEST = 1000  # control steps of an episode, where the robot is an environment alone
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,6 +62,8 @@ class Kind:
     """Makes episodes of as many control steps of a log."""
     findings: Callable[[Log], list[tuple[Finding, list[str]]]]
     """What the log doctor suspects, with the names of the runs that share it."""
+    episode_steps: int
+    """Control steps of an episode; a preset may have fewer."""
     phase: Phase = share_of_episode
     """Where in its gait's cycle a step is."""
     trained: Callable[[Preset], Preset] = lambda preset: preset
@@ -74,8 +76,6 @@ class Kind:
     """A file that is exported beside a policy, to run it on the robot's computer."""
     policy: Path | None = None
     """Folder of a policy that ships with the robot."""
-    episode_steps: int = _LONGEST
-    """Largest number of control steps of an episode that the tuner compares; a preset may have fewer."""
 
     def chosen(self, parameters: str | None) -> dict[str, Entry]:
         """Returns the rows of the robot's parameter table that `--parameters` names.
@@ -214,6 +214,7 @@ BITENO = Kind(
     make=lambda preset, entries, correction: corrected.make(preset.task, entries, correction),
     engines=TARGETS,
     control_s=constants.POLICY_DT_S,
+    episode_steps=round(TaskConfig().episode_s / constants.POLICY_DT_S),
     power=lambda motion: gait.power(motion.torque, motion.qvel[6:]),
     phase=lambda episodes: sensing.phase(episodes.obs),
     trained=lambda preset: replace(preset, task=replace(preset.task, push_mps=preset.push_mps)),

@@ -53,6 +53,11 @@ def set_const(model: mjx.Model) -> mjx.Model:
       ValueError: the model is not of MJX's JAX implementation, the only one that has these stages.
     """
     check_implementation(model)
+    return _recomputed(model)
+
+
+@jax.jit  # traced once, however many programs it is part of
+def _recomputed(model: mjx.Model) -> mjx.Model:
     # Where the default precision of products is a shortened one (on GPUs), weights would be off by a thousandth.
     with jax.default_matmul_precision("highest"):
         model = model.replace(body_subtreemass=_subtree_mass(model))

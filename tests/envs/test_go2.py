@@ -1,5 +1,7 @@
 """The Go2: its figures, and that it stands; the commands are tried on it in `tests/experiments/test_robots.py`."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -25,7 +27,7 @@ def test_its_figures_are_the_published_ones():
 
 @pytest.fixture(scope="module")
 def play():
-    sim = go2.simulator()
+    sim = replace(go2.simulator(), steps=250)
     params = nominal(sim.parameters)
 
     def play(act, **changes):

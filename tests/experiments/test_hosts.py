@@ -2,21 +2,21 @@
 
 import itertools
 import json
+import os
 import socket
 
 import numpy as np
 import pytest
-from processes import ROBOT, SIM2SIM, TRAIN, end, networks, read, same, start, with_cache
+from processes import ROBOT, SIM2SIM, TRAIN, end, networks, read, same, start
 
 from experiments.common import hosts
 from experiments.common.hosts import HostArgs
 
 
 @pytest.fixture(scope="module")
-def environment(tmp_path_factory):
+def environment():
     flags = "--xla_force_host_platform_device_count={} --xla_backend_optimization_level=0"
-    found = with_cache(tmp_path_factory.mktemp("cache"))
-    return {count: {**found, "XLA_FLAGS": flags.format(count)} for count in (1, 2)}
+    return {count: {**os.environ, "XLA_FLAGS": flags.format(count)} for count in (1, 2)}
 
 
 def on_two(imports, options, environment, outs):

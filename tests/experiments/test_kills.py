@@ -7,35 +7,30 @@ import time
 
 import numpy as np
 import pytest
-from processes import DISCOVER, ROBOT, SIM2REAL, SIM2SIM, STUB, TRAIN, end, networks, read, same, start, with_cache
+from processes import DISCOVER, ROBOT, SIM2REAL, SIM2SIM, STUB, TRAIN, end, networks, read, same, start
 
 from experiments.discovery.field.bench import FieldBench
 
 
-@pytest.fixture(scope="module")
-def environment(tmp_path_factory):
-    return with_cache(tmp_path_factory.mktemp("cache"))
-
-
-def killed(imports, options, environment, begun, kills, rng):
+def killed(imports, options, begun, kills, rng):
     """Runs a command, killed so many times at random once `begun` says that it works, and then to its end."""
     for _ in range(kills):
-        process = start(imports, options, environment)
+        process = start(imports, options)
         while process.poll() is None and not begun():
             time.sleep(0.01)
         time.sleep(rng.uniform(0.0, 2.0))
         if process.poll() is None:
             os.killpg(process.pid, signal.SIGKILL)
         process.communicate()
-    end(start(imports, options, environment))
+    end(start(imports, options))
 
 
-def check_train(environment, tmp_path, kills, updates=60):
+def check_train(tmp_path, kills, updates=60):
     options = ["--robot", ROBOT, "--preset", "smoke", "--updates", str(updates), "--out"]
-    end(start(TRAIN, [*options, str(tmp_path / "whole")], environment))
+    end(start(TRAIN, [*options, str(tmp_path / "whole")]))
     out = tmp_path / "killed"
     kept = out / "training" / "config.json"
-    killed(TRAIN, [*options, str(out)], environment, kept.exists, kills, np.random.default_rng(kills))
+    killed(TRAIN, [*options, str(out)], kept.exists, kills, np.random.default_rng(kills))
     same(read(out / "curve.json"), read(tmp_path / "whole" / "curve.json"))
     ours, theirs = (read(place / "config.json") for place in (out, tmp_path / "whole"))
     assert ours["config"] == theirs["config"]
@@ -46,21 +41,21 @@ def check_train(environment, tmp_path, kills, updates=60):
 
 
 @pytest.mark.slow
-def test_a_training_that_is_killed_five_times(environment, tmp_path):
-    check_train(environment, tmp_path, kills=5, updates=120)
+def test_a_training_that_is_killed_five_times(tmp_path):
+    check_train(tmp_path, kills=5, updates=120)
 
 
-def test_a_training_that_is_killed_once(environment, tmp_path):
-    check_train(environment, tmp_path, kills=1)
+def test_a_training_that_is_killed_once(tmp_path):
+    check_train(tmp_path, kills=1)
 
 
 @pytest.mark.slow
-def test_a_comparison_that_is_killed_five_times(environment, tmp_path):
+def test_a_comparison_that_is_killed_five_times(tmp_path):
     options = ["--preset", "smoke", "--methods", "ours", "spm", "--out"]
-    end(start(SIM2SIM, [*options, str(tmp_path / "whole")], environment))
+    end(start(SIM2SIM, [*options, str(tmp_path / "whole")]))
     out = tmp_path / "killed"
     begun = (out / "metrics.jsonl").exists
-    killed(SIM2SIM, [*options, str(out)], environment, begun, 5, np.random.default_rng(5))
+    killed(SIM2SIM, [*options, str(out)], begun, 5, np.random.default_rng(5))
     same(read(out / "summary.json"), read(tmp_path / "whole" / "summary.json"))
     lines = [
         [json.loads(line) for line in (place / "metrics.jsonl").read_text().splitlines()]
@@ -70,14 +65,14 @@ def test_a_comparison_that_is_killed_five_times(environment, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_transfer_that_is_killed_five_times(environment, tmp_path):
+def test_a_transfer_that_is_killed_five_times(tmp_path):
     options = ["--preset", "smoke", "--rounds", "2", "--walk-s", "0.8", "--force", "--timeout-s", "600", "--out"]
-    robot = start(STUB, ["--folder", str(tmp_path)], environment)
+    robot = start(STUB, ["--folder", str(tmp_path)])
     try:
-        end(start(SIM2REAL, [*options, str(tmp_path / "whole")], environment))
+        end(start(SIM2REAL, [*options, str(tmp_path / "whole")]))
         out = tmp_path / "killed"
         begun = (out / "round_000" / "prediction.json").exists
-        killed(SIM2REAL, [*options, str(out)], environment, begun, 5, np.random.default_rng(5))
+        killed(SIM2REAL, [*options, str(out)], begun, 5, np.random.default_rng(5))
     finally:
         os.killpg(robot.pid, signal.SIGKILL)
         robot.communicate()
@@ -85,14 +80,14 @@ def test_a_transfer_that_is_killed_five_times(environment, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_discovery_that_is_killed_five_times(environment, tmp_path):
+def test_a_discovery_that_is_killed_five_times(tmp_path):
     bench = FieldBench(tmp_path / "bench", "field_smoke", 0, 0.1)
     log = bench.write(next(case for case in bench.cases if case.effects))
     options = ["--logs", str(log), "--trust-log", "--out"]
-    end(start(DISCOVER, [*options, str(tmp_path / "whole")], environment))
+    end(start(DISCOVER, [*options, str(tmp_path / "whole")]))
     out = tmp_path / "killed"
     begun = (out / "state.json").exists
-    killed(DISCOVER, [*options, str(out)], environment, begun, 5, np.random.default_rng(5))
+    killed(DISCOVER, [*options, str(out)], begun, 5, np.random.default_rng(5))
     for name in ("summary.json", "details.json"):
         same(read(out / name), read(tmp_path / "whole" / name))
     for name in ("model.xml", "effects.json"):

@@ -249,6 +249,23 @@ def test_what_is_not_finite_is_counted_and_nothing_is_learnt_from_it():
     assert np.abs(answer(learner) - answer(first)).max() > 1e-3
 
 
+class Still(Probe):
+    """A probe that sees the same number for ever."""
+
+    def _see(self, key):
+        return jnp.full((1,), 30.1)
+
+
+def test_what_never_changed_in_training_is_no_reason_for_large_actions(trained):
+    (learner, _), _ = trained
+    np.testing.assert_allclose(learner.normalizer.std, 3**-0.5, rtol=0.05)  # of what the others see
+    env = wrap(Still(), episode_length=10)
+    learner, _, _ = LEARNER.update(jax.random.PRNGKey(2), LEARNER.init(jax.random.PRNGKey(1)), env, begin(env))
+    np.testing.assert_array_equal(learner.normalizer.std, 1.0)
+    seen = jnp.array([[30.1], [30.2]])
+    np.testing.assert_allclose(*answer(learner, seen), atol=0.1)
+
+
 def test_minibatches_must_divide_the_environments():
     with pytest.raises(ValueError, match="minibatches: got 3, expected a divisor of num_envs, 64"):
         PPOConfig(num_envs=64, minibatches=3)

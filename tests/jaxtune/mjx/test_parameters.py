@@ -212,10 +212,14 @@ def general():
     return model
 
 
+def traced(model, table, **params):
+    """The model changed in MJX."""
+    return jax.jit(lambda params: parameters.apply(mjx.put_model(model), params, table))(params)
+
+
 def both(model, table, **params):
     """The model changed in MJX, and in MuJoCo C."""
-    changed = jax.jit(lambda params: parameters.apply(mjx.put_model(model), params, table))(params)
-    return changed, parameters.apply_mujoco(model, params, table)
+    return traced(model, table, **params), parameters.apply_mujoco(model, params, table)
 
 
 def test_fields_of_a_joint_have_rows_by_joint_or_by_degree_of_freedom(general):
@@ -230,7 +234,7 @@ def test_fields_of_a_joint_have_rows_by_joint_or_by_degree_of_freedom(general):
 
 def test_one_value_per_target_reaches_all_degrees_of_freedom_of_its_joint(general):
     table = {"damping": entry(targets=("wheel", "arm"), fields=("dof_damping",), bounds=(0.1, 9.0))}
-    model = parameters.apply(mjx.put_model(general), {"damping": jnp.array([10.0, 3.0])}, table)
+    model = traced(general, table, damping=jnp.array([10.0, 3.0]))
     np.testing.assert_allclose(model.dof_damping, [0.0] * 6 + [0.9] * 3 + [0.5, 7.0], rtol=1e-6)
 
 
@@ -244,7 +248,7 @@ def test_an_actuator_may_be_named_by_its_joint():
     xml = GENERAL.replace("""<motor name="wheel" joint="wheel"/>""", """<motor joint="wheel"/><motor joint="wheel"/>""")
     model = mujoco.MjModel.from_xml_string(xml)
     table = {"strength": entry(kind="actuator", targets=("wheel", "sled"), fields=("actuator_gainprm",))}
-    changed = parameters.apply(mjx.put_model(model), {"strength": jnp.array([0.5, 0.7])}, table)
+    changed = traced(model, table, strength=jnp.array([0.5, 0.7]))
     np.testing.assert_allclose(changed.actuator_gainprm[:, 0], [0.7, 0.5, 0.5], rtol=1e-6)
 
 
