@@ -10,10 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 from mujoco import mjx
 
+from jaxtune import devices
+
 _TINY = 1e-20  # in place of the curvature along a direction of no length, where the search has ended
 
 
 @jax.jit  # traced once, however many programs it is part of
+@devices.precisely
 def step(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """Simulates one step of semi-implicit Euler, as `mjx.step` does; sensors are not computed.
 

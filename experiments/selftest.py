@@ -72,6 +72,12 @@ class Args:
     """Of everything random."""
 
 
+def _overlap(one: Entry, other: Entry) -> bool:
+    """Whether two rows change the same field of the same target; without targets a row changes that of all."""
+    everywhere = one.targets is None or other.targets is None
+    return bool(set(one.fields) & set(other.fields)) and (everywhere or bool(set(one.targets) & set(other.targets)))
+
+
 def other_cases(robot: Kind, tuned: Mapping[str, Entry], options: Sequence[str]) -> dict[str, dict[str, float]]:
     """Reads the differences that the gate should notice.
 
@@ -87,12 +93,11 @@ def other_cases(robot: Kind, tuned: Mapping[str, Entry], options: Sequence[str])
       ValueError: an option is not of the form, or names no parameter, or a value is out of bounds.
     """
     if not options:
-        fields = {(field, target) for entry in tuned.values() for field in entry.fields for target in entry.targets}
         return {
             f"{name}={_different(entry):g}": {name: _different(entry)}
             for name, entry in robot.entries.items()
             # One that changes what is tuned already is no other effect.
-            if name not in tuned and not fields & {(f, t) for f in entry.fields for t in entry.targets}
+            if name not in tuned and not any(_overlap(entry, other) for other in tuned.values())
         }
     cases = {}
     for option in options:
@@ -219,13 +224,13 @@ def _rate(rate: Rate) -> str:
 
 def main(args: Args) -> None:
     """Runs the self-test, prints tables, and writes `selftest.json` and a plot."""
-    robot, entries, others, numbers = check(args)
     checkpoint.set_up_compiler(preset(args.preset).xla_flags)
+    robot, entries, others, numbers = check(args)
     identity = {name: value for name, value in vars(args).items() if name != "out"}
     # A policy that is trained first is kept in the folder, and is another one for other sizes.
     checkpoint.open_run(args.out, identity | {"sizes": preset(args.preset)})
     begin = time.monotonic()
-    with bars() as progress:
+    with checkpoint.lock(args.out / "selftest.json"), bars() as progress:
         reports = {number: tested(args, robot, entries, others, number, progress) for number in numbers}
     show(reports)
     result = {

@@ -138,11 +138,13 @@ def lane(args: Args, learner: Learner, truth: Mapping[str, float], policy: Polic
     if args.fixed_policy:
         machine = dataclasses.replace(machine, train_policy=tuner.keep)
     dist = learner.dist(parameters.nominal(learner.entries), 1.0)  # each lane sets a radius of its own
+    ends = dist.lower, dist.upper
 
     def one(settings):
         step_size, widen_factor, radius, level, seed = settings
         knobs = tuner.knobs().replace(step_size=step_size, widen_factor=widen_factor, level=level)
-        begin = dist.replace(radius=dict.fromkeys(dist.radius, radius))
+        # As `dist.make` has it: no wider than the bounds.
+        begin = dist.replace(radius=jax.tree.map(lambda low, high: jnp.minimum(radius, high - low), *ends))
         state = machine.init(policy, begin, knobs)
         # Lanes are rows of one float array, so the seed comes as a float.
         key = jax.random.PRNGKey(seed.astype(int))
@@ -271,7 +273,8 @@ def _draw(args: Args, mean: np.ndarray) -> None:
 
 def _table(args: Args, summary: dict) -> None:
     count, seconds = summary["lanes"], summary["seconds"]["total"]
-    table = Table(title=f"case {args.case}, start {args.start:g}X: {count} runs in {seconds:.0f} s, one program")
+    case = " ".join(args.truth) or f"case {args.case}, start {args.start:g}X"
+    table = Table(title=f"{case}: {count} runs in {seconds:.0f} s, one program")
     columns = "step size", "widening factor", "first radius", "level"
     for column in (*columns, "error at the end", "return in target", "gate calls", "accepted"):
         table.add_column(column, justify="right")

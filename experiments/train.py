@@ -54,7 +54,7 @@ def main(args: Args) -> None:
     updates = sizes.scratch_updates if args.updates is None else args.updates
     if updates < 1:
         raise ValueError(f"updates: got {updates}, expected 1 or more")
-    _check_folder(args)
+    hosts.from_first(lambda: _check_folder(args))
     learner = Learner(sizes, entries, correction=args.model and corrected.read(args.model), kind=robot)
     memory.check(learner)
     _, curve = trained(jax.random.PRNGKey(args.seed), learner, updates, args.out)
@@ -76,7 +76,7 @@ def _check_folder(args: Args) -> None:
         raise ValueError(f"out: {args.out} holds a run of another command, expected a new folder")
     # Without options it was killed before its last line.
     there, now = read_json(args.out / "curve.json").get("args", {}), as_json(args)
-    for name in there.keys() & now.keys() - {"out"}:
+    for name in there.keys() & now.keys() - {"out", *hosts.OPTIONS}:
         if there[name] != now[name]:
             raise ValueError(f"{name}: got {now[name]}, but {args.out} holds a policy with {there[name]}")
 

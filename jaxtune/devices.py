@@ -121,6 +121,20 @@ def share(batch: Any, *, axis: int = 0) -> Any:
     return jax.lax.with_sharding_constraint(batch, PartitionSpec(*[None] * axis, AXIS))
 
 
+def precisely(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Has the products in a function computed in full single precision, where GPUs shorten them (TF32) by default.
+
+    Physics, distances and sums of terms that cancel need it; networks that learn do not.
+    """
+
+    @wraps(function)
+    def call(*args, **kwargs):
+        with jax.default_matmul_precision("highest"):
+            return function(*args, **kwargs)
+
+    return call
+
+
 def gather(values: Any) -> Any:
     """Puts a pytree on every device, whole: what was simulated in shares, before batches are drawn from it."""
     return values if count() == 1 else jax.lax.with_sharding_constraint(values, PartitionSpec())

@@ -60,6 +60,7 @@ class Regression:
     high: jax.Array  # [coords]
 
 
+@devices.precisely
 def train(config: RegressionConfig, trajectory: Trajectory, coords: Coords, dist: ParamDist) -> Regression:
     """Fits a regression to simulated episodes of known coordinates.
 
@@ -138,6 +139,7 @@ def estimate(config: RegressionConfig, model: Regression, trajectory: Trajectory
     return jnp.clip(answer, model.low, model.high)
 
 
+@devices.precisely
 def answers(
     config: RegressionConfig, model: Regression, trajectory: Trajectory
 ) -> tuple[Float[Array, " coords"], Float[Array, " moments"], Float[Array, ""]]:

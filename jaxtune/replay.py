@@ -111,6 +111,7 @@ class _Fit:
     normal: jax.Array  # [coords, coords] there, of Gauss-Newton
 
 
+@devices.precisely
 def estimate(
     config: ReplayConfig,
     replay: Replay,

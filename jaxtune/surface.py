@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxtune import devices
 from jaxtune.regression import Regression
 
 _EPISODES_EACH = 4  # for every coefficient; with fewer, the polynomial has a lower degree
@@ -36,6 +37,7 @@ class Surface:
     count: jax.Array  # n
 
 
+@devices.precisely
 def train(model: Regression) -> Surface:
     """Fits a surface to the episodes that a regression was fitted to."""
     known = model.known[:, None]
@@ -51,6 +53,7 @@ def train(model: Regression) -> Surface:
     return Surface(coefficients=coefficients, residual=residual, inverse=inverse, penalty=penalty, count=count)
 
 
+@devices.precisely
 def misfit(surface: Surface, moments: Float[Array, " moments"], coords: Float[Array, " coords"]) -> Float[Array, ""]:
     """Computes how far a set's moments lie from what robots of these coordinates show.
 
@@ -67,6 +70,7 @@ def misfit(surface: Surface, moments: Float[Array, " moments"], coords: Float[Ar
     return rest @ rest / surface.penalty + surface.count * (a @ a)
 
 
+@devices.precisely
 def unexplained(
     surface: Surface, moments: Float[Array, " moments"], coords: Float[Array, " coords"]
 ) -> Float[Array, " moments"]:

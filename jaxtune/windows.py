@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxtune import devices
 from jaxtune.types import Trajectory
 
 _FAR = 10.0  # standard deviations
@@ -181,6 +182,7 @@ def involved(channels: int) -> Float[Array, "channels moments"]:
     return jnp.concatenate([one, one, one, jnp.maximum(one[:, first], one[:, second]), ahead], axis=1)
 
 
+@devices.precisely
 def square_distances(a: Float[Array, "n moments"], b: Float[Array, "m moments"]) -> Float[Array, "n m"]:
     """Computes all squared distances, from |a|^2 + |b|^2 - 2 a b, which needs no array [n, m, moments]."""
     square = jnp.sum(a**2, axis=-1)[:, None] + jnp.sum(b**2, axis=-1) - 2.0 * a @ b.T

@@ -291,14 +291,17 @@ class Biteno:
         return self._readings(state)
 
     def _observe(self, state: State, key: jax.Array) -> jax.Array:
-        readings = self.perceive(state)
+        readings, joint_error = self.perceive(state), state.joint_error
         if self.config.noise > 0.0:
-            readings = sensing.disturb(key, readings, self.config.noise)
+            noisy = sensing.disturb(key, readings, self.config.noise)
+            # The robot subtracts the same reading that it observes; before the first target there is no error.
+            joint_error += jnp.where(state.steps > 0, readings["joint"] - noisy["joint"], 0.0)
+            readings = noisy
         return sensing.observe(
             **readings,
             command=state.command,
             last_action=state.action,
-            joint_error=state.joint_error,
+            joint_error=joint_error,
             phase=state.phase,
             stand=jnp.asarray(constants.STAND_RAD),
         )

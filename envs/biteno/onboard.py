@@ -9,6 +9,10 @@ from envs import sensing
 from envs.biteno import constants
 from envs.biteno.env import ACTION_LIMIT, TaskConfig
 
+# In training an episode ends at a tilt of 45 degrees and begins within 0.1 rad of the stand; readings may be off.
+_TILT_LIMIT_RAD = 1.0
+_START_RAD = 0.4
+
 
 @cache
 def joint_ranges() -> np.ndarray:
@@ -24,8 +28,8 @@ def meta(task: TaskConfig) -> dict:
       task: in which the policy was trained.
 
     Returns:
-      Joints, rate, layout and scales of the observation, the gait clock, the reference that an action is added to, and
-      the joint controller's gains; all of it JSON.
+      Joints, rate, layout and scales of the observation, the gait clock, the reference that an action is added to, the
+      joint controller's gains, and beyond what the policy must not be used; all of it JSON.
     """
     model = mujoco.MjModel.from_xml_path(str(constants.MODEL_PATH))
     kp, kd, limit = model.actuator_gainprm[:, 0], -model.actuator_biasprm[:, 2], model.actuator_forcerange[:, 1]
@@ -38,6 +42,9 @@ def meta(task: TaskConfig) -> dict:
         ],
         "stand_rad": constants.STAND_RAD.tolist(),
         "joint_range_rad": joint_ranges().T.tolist(),
+        "start_rad": _START_RAD,
+        "tilt_limit_rad": _TILT_LIMIT_RAD,
+        "command_max": list(task.command_max),
         "action_limit": ACTION_LIMIT,
         "action_scale": task.action_scale,
         "base": task.base,

@@ -5,6 +5,7 @@
         target = player.step(velocity=..., command=..., gyro=..., gravity=..., joint=..., joint_velocity=...)
         player.tick()
 
+Where `step` raises an error the robot has fallen, or a sensor has failed: switch its motors to damping then.
 `python -m experiments.export` writes the policy with all numbers that are needed here. Observation, clock and reference
 exist a second time in this file, without JAX; tests compare them with the simulator's own.
 """
@@ -62,7 +63,7 @@ class Player(Network):
 
         Args:
           velocity: [3] m/s, of the trunk's origin, body frame.
-          command: [3] forward in m/s, sideways in m/s, turning in rad/s.
+          command: [3] forward in m/s, sideways in m/s, turning in rad/s; clipped to what the policy was trained with.
           gyro: [3] rad/s, body frame.
           gravity: [3] direction of gravity, unit vector in the body frame.
           joint, joint_velocity: [joints] rad, rad/s, in the order of `meta["joints"]`.
@@ -71,15 +72,32 @@ class Player(Network):
           Joint targets [joints], rad. `action` and `phase` are those of this step until `tick` is called.
 
         Raises:
-          ValueError: a reading is not finite. The player's memory is unchanged, so the step can be repeated.
+          ValueError: a reading is not finite, gravity is no unit vector, the trunk is tilted as far as after a fall,
+            or the robot does not stand before its first step. The player's memory is unchanged, so the step can be
+            repeated.
         """
         meta = self.meta
+        self._check(np.asarray(gravity), np.asarray(joint))
+        command = np.clip(command, -np.array(meta["command_max"]), meta["command_max"])
         error = np.zeros(len(joint)) if self.target is None else self.target - joint
         obs = self.observe(velocity, command, gyro, gravity, joint, joint_velocity, self.action, error, self.phase)
         self.action = np.clip(self(obs), -meta["action_limit"], meta["action_limit"])
         base = self.reference(self.phase, command) if meta["base"] == "raibert" else np.array(meta["stand_rad"])
         self.target = base + meta["action_scale"] * self.action
         return np.clip(self.target, *np.array(meta["joint_range_rad"]).T)
+
+    def _check(self, gravity: np.ndarray, joint: np.ndarray) -> None:
+        """Checks that the robot is where the policy has been in training; what is not finite is found later."""
+        length = np.linalg.norm(gravity)
+        if not 0.8 < length < 1.2 and np.isfinite(length):
+            raise ValueError(f"gravity: got a length of {length:.2f}, expected 1")
+        tilt, limit = np.arccos(np.clip(-gravity[2] / max(length, 1e-9), -1.0, 1.0)), self.meta["tilt_limit_rad"]
+        if tilt > limit:
+            raise ValueError(f"gravity: got a tilt of {tilt:.2f} rad, expected at most {limit:g}: the robot has fallen")
+        off, limit = np.abs(joint - np.array(self.meta["stand_rad"])), self.meta["start_rad"]
+        if self.target is None and off.max() > limit:
+            name = self.meta["joints"][off.argmax()]
+            raise ValueError(f"joint: {name} is {off.max():.2f} rad off the stand, expected at most {limit:g} at first")
 
     def tick(self) -> None:
         """Advances the gait clock by one policy period; call it once after every `step`."""

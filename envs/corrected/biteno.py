@@ -29,10 +29,14 @@ class CorrectedBiteno(Biteno):
       correction: the MJCF and the effects.
 
     Raises:
-      ValueError: an effect is on a place, or has a parameter, that the robot does not have.
+      ValueError: the MJCF is not BITeno's, or an effect is on a place, or has a parameter, that the robot does not
+        have.
     """
 
     def __init__(self, config: TaskConfig, entries: Mapping[str, parameters.Entry], correction: Correction):
+        spec = mujoco.MjSpec.from_file(str(correction.path))
+        if {joint.name for joint in spec.joints} < set(constants.JOINTS) or not spec.key("home"):
+            raise ValueError(f"model: {correction.path} lacks joints of BITeno's or its keyframe home, expected BITeno")
         self._rows = correction.rows
         super().__init__(config, entries, correction.path)
         model = self.mj_model

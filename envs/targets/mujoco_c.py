@@ -45,6 +45,8 @@ class MujocoC:
         model = spec.compile()
         model.opt.timestep = robot.mj_model.opt.timestep
         model.opt.iterations = _ITERATIONS
+        # MuJoCo puts a robot whose simulation broke back on its feet; here the episode ends.
+        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         for name, value in options.items():
             setattr(model.opt, name, value)
         ratio = robot.mj_model.opt.timestep / model.opt.timestep

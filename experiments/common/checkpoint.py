@@ -26,6 +26,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
+from jax._src import compilation_cache
 
 from experiments.common import hosts
 from experiments.common.cli import console
@@ -34,6 +35,7 @@ _PACKAGES = ("jaxtune", "jax", "mujoco", "mujoco-mjx", "brax", "flax", "optax", 
 
 _DRAFT = ".tmp"  # suffix of a file that is being written, or that a killed run left behind
 _LEAST_THREADS = 8  # of XLA's pool on a CPU
+_LATEST = 4  # programs that may be unfinished
 _DEVICES = "--xla_force_host_platform_device_count"
 _LOCK = ".lock"  # suffix of a file whose lock says that a process works on a piece
 
@@ -65,9 +67,20 @@ def set_up_compiler(xla_flags: str, most: int = 8) -> None:
     if not kept.is_dir() or not any(kept.iterdir()):
         text = f"first run: programs are compiled, which takes minutes; later runs find them in {kept}"
         console.print(text, highlight=False, markup=False, soft_wrap=True)
+    _drop_torn_programs(kept)
     if not chosen:
         jax.config.update("jax_compilation_cache_dir", str(kept))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
+
+
+def _drop_torn_programs(kept: Path) -> None:
+    """Deletes compiled programs that a killed process left unfinished: JAX would neither read nor replace them."""
+    latest = sorted(kept.glob("*-cache"), key=lambda file: file.stat().st_mtime)[-_LATEST:]
+    for file in latest:
+        try:
+            compilation_cache.decompress_executable(file.read_bytes())
+        except Exception:  # of whichever library has compressed it
+            file.unlink(missing_ok=True)
 
 
 def cores() -> int:
@@ -334,7 +347,8 @@ def load(path: Path, like: Any, config: Any) -> Any:
       The pytree, with arrays on JAX's default device.
 
     Raises:
-      ValueError: there is no checkpoint, a damaged one, or one of another config; names the first field that differs.
+      ValueError: there is no checkpoint, a damaged one, or one of another config or of other shapes; names the first
+        that differs.
     """
     stored = path / "config.json"
     if not stored.exists():
@@ -350,6 +364,12 @@ def load(path: Path, like: Any, config: Any) -> Any:
     # What was left out is None, and stays as it is.
     fill = lambda leaf, new: leaf if new is None else jnp.asarray(new)  # noqa: E731
     whole = jax.tree.map(fill, _plain(like), found, is_leaf=lambda leaf: leaf is None)
+    for (where, leaf), new in zip(jax.tree.leaves_with_path(_plain(like)), jax.tree.leaves(whole), strict=True):
+        if jnp.shape(leaf) != jnp.shape(new):
+            raise ValueError(
+                f"policy: {path}: {jax.tree_util.keystr(where)} has shape {jnp.shape(new)} there, expected "
+                f"{jnp.shape(leaf)}: it is of another robot"
+            )
     return ocp.tree.deserialize_tree(whole, like, keep_empty_nodes=True)
 
 

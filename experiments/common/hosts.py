@@ -11,6 +11,7 @@ be visible to them, and what decides how a run goes on is decided once.
 import os
 import pickle
 import types
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import wraps
@@ -29,6 +30,7 @@ OPTIONS = ("coordinator", "hosts", "host")
 """Names of the options; results do not depend on them."""
 
 _PATIENCE_S = 3600
+_FAREWELL_S = 10  # that a host which ends waits for the others, also where it ends with an error
 _reading = False  # whether the first host is in a function that the others do not call
 
 
@@ -63,10 +65,20 @@ def join(args: HostArgs) -> None:
     if not name or not port.isdecimal() or int(port) > 65535:
         raise ValueError(f"coordinator: got {args.coordinator!r}, expected NAME:PORT of host 0")
     # Between CPUs JAX waits half a minute only, but one host may still compile what another begins to run.
-    flags = (f"--xla_cpu_collective_{name}_seconds={_PATIENCE_S}" for name in ("timeout", "call_terminate_timeout"))
+    flags = [f"--xla_cpu_collective_{name}_seconds={_PATIENCE_S}" for name in ("timeout", "call_terminate_timeout")]
+    # GPUs would share the search for the fastest kernels, and wait for a host that has found its program on disk.
+    flags.append("--xla_gpu_shard_autotuning=false")
     os.environ["XLA_FLAGS"] = " ".join((os.environ.get("XLA_FLAGS", ""), *flags))
+    # JAX would ignore a polite kill, to save its state first; ours is saved all along.
+    jax.config.update("jax_enable_preemption_service", False)
     console.print(f"host {args.host} of {args.hosts}: waiting for the others at {args.coordinator}", highlight=False)
-    jax.distributed.initialize(args.coordinator, args.hosts, args.host)
+    jax.distributed.initialize(args.coordinator, args.hosts, args.host, shutdown_timeout_seconds=_FAREWELL_S)
+    each = Counter(device.process_index for device in jax.devices())
+    if len(set(each.values())) > 1:
+        raise ValueError(
+            f"hosts: got {', '.join(str(each[host]) for host in sorted(each))} devices, expected as many on each host; "
+            "on CPUs XLA_FLAGS=--xla_force_host_platform_device_count=N says how many"
+        )
     console.quiet = args.host > 0
     _keep_models_here()
     # Connections are made now, while all are here: for these no patience can be set.

@@ -92,6 +92,8 @@ class Robot:
         model.opt.iterations, model.opt.ls_iterations = 100, 50
         # The model's own actuators are off, because torques with lag and limits are applied by `_push`.
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION
+        # A simulation that broke is seen as such, and not put back on its feet.
+        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         self.model = model
         joints = [model.joint(name) for name in constants.JOINTS]
         self._qpos = np.array([joint.qposadr[0] for joint in joints])

@@ -18,6 +18,7 @@ from brax.envs.base import State
 from envs.corrected import Correction
 from envs.targets.mjx import MjxTarget, rollout, simulate
 from envs.targets.protocol import Act, Commands, Target
+from experiments.common import hosts
 from experiments.common.config import Preset
 from experiments.walking.robots import BITENO, Kind
 from jaxtune import devices, mjx
@@ -191,7 +192,9 @@ class Learner:
         def play(key, policy, count, steps):
             return target.episodes(key, self.act(policy), count, steps, self.states)
 
-        return devices.on_all(jax.jit(play, static_argnums=(2, 3))) if isinstance(target, MjxTarget) else play
+        # The rounding of other engines may differ between hosts, and all must go on with the same episodes.
+        shared = hosts.on_first(lambda *args: jax.device_get(play(*args)))
+        return devices.on_all(jax.jit(play, static_argnums=(2, 3))) if isinstance(target, MjxTarget) else shared
 
     def evaluate(self, key: jax.Array, policy: Policy, play: Callable[..., Trajectory]) -> tuple[float, int]:
         """Measures a policy's return and falls in a target, over `evaluation_episodes` episodes of the full time limit.

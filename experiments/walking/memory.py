@@ -6,6 +6,7 @@ analysis of BITeno's programs on a CPU, between 64 and 256 environments and betw
 
 import math
 import os
+from pathlib import Path
 
 import jax
 
@@ -15,6 +16,7 @@ _TRAINING = 14.0  # of a PPO update's rollout: its batches, their gradients, the
 _TUNING = 2.0  # of a tuning's episodes: windows, and batches of them
 _MODELS = 100e6  # B, of both models while they are trained
 _USABLE = 0.9  # share of a device's memory
+_LIMIT = Path("/sys/fs/cgroup/memory.max")  # of a container, in bytes; `max` where there is none
 
 
 def needed(learner: Learner) -> dict[str, float]:
@@ -65,4 +67,7 @@ def available() -> float:
     own = jax.local_devices()
     if own[0].platform != "cpu":
         return (own[0].memory_stats() or {}).get("bytes_limit", math.inf)
-    return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / len(own)
+    there = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    # A container may have less than its machine.
+    limit = _LIMIT.read_text().strip() if _LIMIT.exists() else ""
+    return min(there, int(limit) if limit.isdecimal() else there) / len(own)

@@ -152,6 +152,8 @@ def starting_policy(name: str, learner: Learner, out: Path | None = None) -> Pol
         place = learner.kind.policy
         if place is None:
             raise ValueError(f"policy: got 'walk', but {learner.kind.name} ships none; expected scratch or a folder")
+    if name == "scratch" and out is None:
+        raise ValueError("policy: got 'scratch', expected a policy that exists, such as a folder of experiments.train")
     if name == "scratch":
         place = out / "policy"
         if not checkpoint.exists(place / "config.json"):

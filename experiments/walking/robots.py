@@ -110,7 +110,7 @@ def kind(name: str) -> Kind:
     if colon and place.endswith(".py"):
         if not Path(place).is_file():
             raise ValueError(f"robot: {place} does not exist")
-        return _foreign(name, _from_file(Path(place).resolve(), what))
+        return _foreign(name, _from_file(Path(place).resolve(), what), saved=f"{Path(place).name}:{what}")
     raise ValueError(
         f"robot: got '{name}', expected {', '.join(_SHIPPED)}, playground:NAME, playground-warp:NAME or "
         "path/to/file.py:function"

@@ -10,6 +10,8 @@ import jax.numpy as jnp
 import mujoco
 from mujoco import mjx
 
+from jaxtune import devices
+
 DERIVED = (
     "body_subtreemass",
     "body_invweight0",
@@ -57,24 +59,23 @@ def set_const(model: mjx.Model) -> mjx.Model:
 
 
 @jax.jit  # traced once, however many programs it is part of
+@devices.precisely
 def _recomputed(model: mjx.Model) -> mjx.Model:
-    # Where the default precision of products is a shortened one (on GPUs), weights would be off by a thousandth.
-    with jax.default_matmul_precision("highest"):
-        model = model.replace(body_subtreemass=_subtree_mass(model))
-        data = mjx.make_data(model).replace(qpos=model.qpos0)
-        # The stages of MuJoCo's pipeline that the fields below read from: poses, the inertia M, and moment arms.
-        for stage in (mjx.kinematics, mjx.com_pos, mjx.tendon, mjx.crb, mjx.transmission):
-            data = stage(model, data)
-        diagonal = jnp.diagonal(mjx.full_m(model, data))
-        inverse = jnp.linalg.inv(mjx.full_m(model, mjx.tendon_armature(model, data)))
-        return model.replace(
-            body_invweight0=_body_weight(model, data, inverse),
-            dof_M0=diagonal,
-            dof_invweight0=_dof_weight(model, inverse),
-            tendon_invweight0=jnp.einsum("ti,ij,tj->t", data._impl.ten_J, inverse, data._impl.ten_J),
-            actuator_acc0=jnp.linalg.norm(data._impl.actuator_moment @ inverse, axis=-1),
-            stat=model.stat.replace(meaninertia=diagonal.mean()),
-        )
+    model = model.replace(body_subtreemass=_subtree_mass(model))
+    data = mjx.make_data(model).replace(qpos=model.qpos0)
+    # The stages of MuJoCo's pipeline that the fields below read from: poses, the inertia M, and moment arms.
+    for stage in (mjx.kinematics, mjx.com_pos, mjx.tendon, mjx.crb, mjx.transmission):
+        data = stage(model, data)
+    diagonal = jnp.diagonal(mjx.full_m(model, data))
+    inverse = jnp.linalg.inv(mjx.full_m(model, mjx.tendon_armature(model, data)))
+    return model.replace(
+        body_invweight0=_body_weight(model, data, inverse),
+        dof_M0=diagonal,
+        dof_invweight0=_dof_weight(model, inverse),
+        tendon_invweight0=jnp.einsum("ti,ij,tj->t", data._impl.ten_J, inverse, data._impl.ten_J),
+        actuator_acc0=jnp.linalg.norm(data._impl.actuator_moment @ inverse, axis=-1),
+        stat=model.stat.replace(meaninertia=diagonal.mean()),
+    )
 
 
 def check_implementation(model: mjx.Model) -> None:

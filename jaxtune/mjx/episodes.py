@@ -52,6 +52,7 @@ class Robot(Protocol):
         """Makes a state of what was kept of one, or measured."""
 
 
+@devices.precisely
 def rollout(
     robot: Robot,
     key: jax.Array,

@@ -12,6 +12,7 @@ from brax.envs.base import Env as BraxEnv
 from brax.envs.base import State as BraxState
 from mujoco import mjx
 
+from jaxtune import devices
 from jaxtune.mjx.entry import Entry
 from jaxtune.mjx.episodes import Robot
 from jaxtune.mjx.parameters import Params, nominal
@@ -40,6 +41,7 @@ class TrainingBatch(BraxEnv):
         params = {name: jnp.full(count, value, jnp.float32) for name, value in nominal(self._entries).items()}
         return self.start(params, rng)
 
+    @devices.precisely
     def start(self, params: Params, keys: jax.Array) -> BraxState:
         """Resets a batch of robots with the given parameters.
 
@@ -60,6 +62,7 @@ class TrainingBatch(BraxEnv):
         params = {name: jnp.asarray(value, jnp.float32) for name, value in params.items()}
         return state.replace(info={**state.info, "params": params})
 
+    @devices.precisely
     def step(self, state: BraxState, action: jax.Array) -> BraxState:
         """Moves every robot by one control step under its action [batch, act].
 

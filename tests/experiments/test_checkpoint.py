@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from faults import Killed, killed_at
+from jax._src import compilation_cache
 
 from experiments.common import checkpoint
 from experiments.common.config import PRESETS
@@ -44,6 +45,23 @@ def test_a_checkpoint_is_the_old_or_the_new_one_whenever_it_is_killed(monkeypatc
     assert set(found) == {1.0, 2.0}
     assert len(found) > 10
     assert checkpoint.load(tmp_path, state(0.0), CONFIG)["kernel"][0, 0] == 2.0
+
+
+def test_a_state_of_other_shapes_is_refused(tmp_path):
+    checkpoint.save(tmp_path, state(1.0), CONFIG)
+    wider = state(0.0) | {"kernel": jnp.zeros((4, 2))}
+    with pytest.raises(ValueError, match=r"\['kernel'\] has shape \(3, 2\) there, expected \(4, 2\)"):
+        checkpoint.load(tmp_path, wider, CONFIG)
+
+
+def test_a_program_that_a_killed_process_left_unfinished_is_compiled_again(tmp_path, monkeypatch):
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path))
+    monkeypatch.setenv("XLA_FLAGS", "")
+    whole, torn = tmp_path / "whole-cache", tmp_path / "torn-cache"
+    whole.write_bytes(compilation_cache.compress_executable(bytes(1000)))
+    torn.write_bytes(whole.read_bytes()[:-5])
+    checkpoint.set_up_compiler("")
+    assert whole.exists() and not torn.exists()
 
 
 def test_json_is_the_old_or_the_new_one_whenever_it_is_killed(monkeypatch, tmp_path):

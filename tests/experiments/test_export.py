@@ -111,18 +111,49 @@ def test_the_player_walks_as_the_simulator_does(folder, played):
             np.testing.assert_allclose(target, np.clip(drive.target[robot, step], low, high), atol=1e-4)
 
 
-def test_the_player_refuses_what_is_no_number(folder):
+UPRIGHT = {name: np.zeros(3) for name in ("velocity", "command", "gyro")} | {
+    "gravity": np.array([0, 0, -1.0]),
+    "joint": np.array(constants.STAND_RAD),
+    "joint_velocity": np.zeros(6),
+}
+
+
+@pytest.mark.parametrize(
+    ("readings", "message"),
+    [
+        ({"gyro": [0.0, np.nan, 0.0]}, "gyro: got a number that is not finite"),
+        ({"gravity": [0.0, np.nan, -1.0]}, "gravity: got a number that is not finite"),
+        ({"gravity": [0.0, 0.0, 0.0]}, "gravity: got a length of 0.00, expected 1"),
+        ({"gravity": [0.0, 0.9, -0.4]}, "gravity: got a tilt of 1.15 rad, expected at most 1: the robot has fallen"),
+        ({"gravity": [0.0, 0.0, 1.0]}, "gravity: got a tilt of 3.14 rad"),
+    ],
+)
+def test_the_player_refuses_what_no_standing_robot_reads(folder, readings, message):
     player = Player(folder / "policy.npz")
-    fine = {name: np.zeros(3) for name in ("velocity", "command", "gyro")}
-    fine |= {
-        "gravity": np.array([0, 0, -1.0]),
-        "joint": np.array(player.meta["stand_rad"]),
-        "joint_velocity": np.zeros(6),
-    }
-    before = player.step(**fine)
-    with pytest.raises(ValueError, match="gyro: got a number that is not finite"):
-        player.step(**fine | {"gyro": np.array([0.0, np.nan, 0.0])})
+    before = player.step(**UPRIGHT)
+    with pytest.raises(ValueError, match=message):
+        player.step(**UPRIGHT | {name: np.array(value) for name, value in readings.items()})
     np.testing.assert_array_equal(player.target, before)
+
+
+def test_a_walk_begins_near_the_stand(folder):
+    player = Player(folder / "policy.npz")
+    sitting = UPRIGHT | {"joint": UPRIGHT["joint"] + np.array([0, 0, 1.0, 0, 0, 0])}
+    with pytest.raises(ValueError, match=r"joint: left_knee is 1.00 rad off the stand, expected at most 0.4 at first"):
+        player.step(**sitting)
+    assert player.target is None
+    player.step(**UPRIGHT)
+    player.step(**sitting)
+
+
+def test_no_command_is_larger_than_in_training(folder):
+    player = Player(folder / "policy.npz")
+    targets = []
+    for factor in (0.0, 1.0, 5.0):
+        player.reset()
+        targets.append(player.step(**UPRIGHT | {"command": factor * np.array(env.TaskConfig().command_max)}))
+    np.testing.assert_array_equal(targets[1], targets[2])
+    assert np.abs(targets[1] - targets[0]).max() > 0.01
 
 
 def test_no_target_leaves_the_joints_ranges(folder):
@@ -132,8 +163,10 @@ def test_no_target_leaves_the_joints_ranges(folder):
     # Readings of a robot that was thrown make large actions.
     rng, left = np.random.default_rng(0), 0
     for _ in range(200):
-        parts = {name: 5.0 * rng.normal(size=3) for name in ("velocity", "command", "gyro", "gravity")}
-        target = player.step(**parts, joint=rng.normal(size=6), joint_velocity=30.0 * rng.normal(size=6))
+        parts = {name: 5.0 * rng.normal(size=3) for name in ("velocity", "command", "gyro")}
+        joint = UPRIGHT["joint"] + (rng.normal(size=6) if player.target is not None else 0.0)
+        parts |= {"gravity": UPRIGHT["gravity"], "joint": joint, "joint_velocity": 30.0 * rng.normal(size=6)}
+        target = player.step(**parts)
         assert ((low <= target) & (target <= high)).all()
         left += bool((target != player.target).any())
     assert left > 50

@@ -3,6 +3,8 @@ import shutil
 import sys
 from pathlib import Path
 
+import jax
+import numpy as np
 import pytest
 
 from experiments import gpu_bench
@@ -80,6 +82,25 @@ def test_what_its_commands_wrote_is_read(kept):
 
 def test_every_part_has_a_command_whose_result_can_be_read(tmp_path):
     assert set(gpu_bench.commands("gpu", tmp_path)) == set(gpu_bench.RESULTS) == set(gpu_bench.Args().parts)
+
+
+def test_compilation_is_left_out_also_after_an_interruption(tmp_path):
+    # A minute of compilation at first, and again after the third of five equal lines.
+    seconds = np.cumsum([70.0, 10.0, 10.0, 70.0, 10.0])
+    curve = [{"steps": 100 * number, "seconds": end} for number, end in enumerate(seconds, 1)]
+    (tmp_path / "policy").mkdir()
+    (tmp_path / "policy" / "curve.json").write_text(json.dumps({"curve": curve}))
+    found = gpu_bench.RESULTS["policy"](tmp_path)
+    assert found == {"steps": 500, "with_compilation_s": 170.0, "without_s": 50.0}
+
+
+def test_a_container_may_have_less_memory_than_its_machine(monkeypatch, tmp_path):
+    limit = tmp_path / "memory.max"
+    monkeypatch.setattr(memory, "_LIMIT", limit)
+    machine = memory.available()
+    for text, expected in (("max", machine), (str(2**28), 2**28 / len(jax.local_devices()))):
+        limit.write_text(f"{text}\n")
+        assert memory.available() == expected
 
 
 def test_a_run_that_does_not_fit_into_memory_is_refused(monkeypatch):

@@ -11,7 +11,7 @@ from experiments import train as train_command
 from experiments.common import checkpoint
 from experiments.common.config import PRESETS, WALK
 from experiments.walking.learner import Learner
-from experiments.walking.policies import policy_config, trained, walk
+from experiments.walking.policies import policy_config, starting_policy, trained, walk
 from experiments.walking.robots import BITENO
 from jaxtune.mjx import parameters
 
@@ -97,6 +97,11 @@ def test_shipped_policy_loads_and_has_learnt(learner):
     assert np.ptp(shipped.normalizer.std) > 0.1
 
 
+def test_a_policy_from_scratch_needs_a_folder():
+    with pytest.raises(ValueError, match="policy: got 'scratch', expected a policy that exists"):
+        starting_policy("scratch", Learner(PRESETS["smoke"], {}))
+
+
 def test_a_training_overwrites_no_other_policy_and_no_other_run(tmp_path, monkeypatch):
     monkeypatch.setattr(train_command, "Learner", lambda *_, **__: pytest.fail("it was begun"))
     args = train_command.Args(out=tmp_path, preset="smoke")
@@ -107,6 +112,9 @@ def test_a_training_overwrites_no_other_policy_and_no_other_run(tmp_path, monkey
     for field, other in (("seed", 1), ("robot", "go2"), ("updates", 7)):
         with pytest.raises(ValueError, match=f"{field}: got {other}, but .* holds a policy with"):
             train_command.main(dataclasses.replace(args, **{field: other}))
+    with pytest.raises(pytest.fail.Exception, match="it was begun"):
+        monkeypatch.setattr(train_command.hosts, "join", lambda args: None)
+        train_command.main(dataclasses.replace(args, hosts=2, host=1, coordinator="first:1"))
     # The same again, and one that was killed: between its two last lines, or earlier.
     for written in ({"args": args}, {"curve": []}):
         checkpoint.write_json(tmp_path / "curve.json", written)

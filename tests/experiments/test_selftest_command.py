@@ -6,7 +6,7 @@ from rich.console import Console
 
 from experiments import selftest
 from experiments.common import plots
-from experiments.walking.robots import BITENO
+from experiments.walking.robots import BITENO, kind
 from jaxtune.selftest import Rate, SelfTest, Tuned
 
 LEGS = BITENO.chosen("legs6")
@@ -22,6 +22,16 @@ def test_other_cases_are_all_parameters_that_nobody_tunes():
     # Tied masses change what is tuned already.
     assert "thigh_mass" not in named
     assert "trunk_mass" in named
+
+
+def test_a_row_for_all_overlaps_every_row_of_its_field():
+    robot = kind("go2")
+    assert robot.entries["strength"].targets is None
+    named = {name for values in selftest.other_cases(robot, robot.chosen("base_mass"), ()).values() for name in values}
+    assert named == set(robot.entries) - {"base_mass"}
+    every = replace(robot.entries["base_mass"], targets=None)
+    assert not {"calf_mass", "hip_mass"} & {*selftest.other_cases(robot, {"masses": every}, ())}
+    assert selftest.other_cases(robot, {"masses": every}, ()).keys() < selftest.other_cases(robot, {}, ()).keys()
 
 
 def test_other_cases_may_be_given_and_a_pattern_stands_for_tuned_parameters():

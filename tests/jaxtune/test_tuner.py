@@ -64,6 +64,16 @@ def test_double_precision_is_traced():
     assert after.dist.centre["mass"].dtype == jnp.float32
 
 
+def test_products_of_a_reading_are_not_shortened():
+    """Distances and sums of large weights cancel; a GPU would round what goes into them to ten bits."""
+    collected = toys.collect(jax.random.key(0), toys.uniform(TWO), toys.TINY)
+    measured = SLIDER.measure(TWO, toys.TINY.set_episodes)(jax.random.key(1), toys.policy())
+    text = jax.jit(lambda: rules.examine(toys.TINY, collected, measured)).lower().as_text()
+    products = [line for line in text.splitlines() if "dot_general" in line]
+    assert products
+    assert all("HIGHEST, HIGHEST" in line for line in products)
+
+
 @pytest.mark.slow
 def test_intervals_hold_after_every_refinement():
     """Each reading draws robots from a box that a reading before has narrowed, which may have lost the truth."""

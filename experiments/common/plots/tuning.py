@@ -222,7 +222,7 @@ def _returns(path: Path, results: dict[str, list[dict]], epochs: int) -> None:
     for name, runs in results.items():
         values = np.array([[line["return"] for line in run["lines"]] for run in runs])
         spread(axis, np.arange(values.shape[1]) * epochs, values, name)
-    axis.set(xlabel="PPO epochs (dots: tunings)", ylabel="return in the target, Table I weights (at most 70)")
+    axis.set(xlabel="PPO epochs (dots: tunings)", ylabel="return in the target")
     axis.legend()
     save(figure, path)
 

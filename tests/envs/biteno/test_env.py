@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 import reference
 
-from envs import stepping
+from envs import sensing, stepping
 from envs.biteno import Biteno, Motion, TaskConfig, constants
 from jaxtune.mjx import TrainingBatch
+from jaxtune.mjx.episodes import rollout
 
 NOMINAL = reference.params()
 STILL = np.zeros(6, np.float32)
@@ -17,6 +18,7 @@ STILL = np.zeros(6, np.float32)
 # (double precision 1e-15 and 1e-13).
 POSITION_ATOL = 1e-6
 VELOCITY_ATOL = 1e-4
+JOINT, ERROR = slice(12, 18), slice(30, 36)  # of an observation
 # One robot of each kind, which a batch of Brax steps at once.
 WELL, FALLEN, BROKEN, LATE = range(4)
 
@@ -100,6 +102,15 @@ def test_a_step_of_mjx_is_ten_of_mujoco(engines):
         # The torque of the last sub-step, to which 3e-5 rad/s are 6e-5 Nm in some 10.
         expected = np.sum(data.qfrc_actuator[6:] ** 2)
         np.testing.assert_allclose(state.terms["torque"], expected, rtol=2e-5, err_msg=scene)
+
+
+def test_products_of_the_physics_are_not_shortened(robot):
+    """A GPU would round what goes into them to ten bits, unless it is told otherwise."""
+    params = {name: jnp.ones(1) for name in NOMINAL}
+    play = jax.jit(lambda key: rollout(robot, key, lambda obs, key: obs[:6], params, 1))
+    products = [line for line in play.lower(jax.random.key(0)).as_text().splitlines() if "dot_general" in line]
+    assert products
+    assert all("HIGHEST, HIGHEST" in line for line in products)
 
 
 def test_those_scenes_touch_the_floor_land_and_fly(engines):
@@ -431,6 +442,18 @@ def test_a_step_remembers_its_action_and_the_error_it_left(start, step):
 def idle(monkeypatch, move=lambda model, data: data):
     """Has another physics stand in, for the sake of a quick compilation."""
     monkeypatch.setattr(stepping, "step", move)
+
+
+def test_the_error_of_a_joint_is_of_the_reading_that_is_observed(start):
+    noisy, clean = (Biteno(TaskConfig(noise=noise)) for noise in (1.0, 0.0))
+    later = start.replace(steps=jnp.asarray(3), joint_error=jnp.linspace(-0.1, 0.1, 6))
+    off = noisy._observe(later, jax.random.key(1)) - clean._observe(later, jax.random.key(1))
+    joint, error = (off[part] / sensing.LAYOUT[name] for name, part in (("joint", JOINT), ("joint_error", ERROR)))
+    assert np.abs(joint).max() > 1e-3
+    np.testing.assert_allclose(error, -joint, atol=1e-6)
+    # Before the first target there is none.
+    first = noisy._observe(start, jax.random.key(1))
+    np.testing.assert_array_equal(first[ERROR], 0.0)
 
 
 def test_raiberts_base_is_the_reference_of_phase_and_command(start, monkeypatch):

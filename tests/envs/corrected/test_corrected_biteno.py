@@ -136,3 +136,9 @@ def test_an_unknown_effect_or_place_is_refused_by_name(tmp_path):
         robot(encoder_bias={"left_knee": {"degrees": 3.0}})
     with pytest.raises(ValueError, match="is missing"):
         corrected.read(tmp_path / "nowhere")
+
+
+def test_a_model_of_another_robot_is_refused():
+    arm = constants.MODEL_PATH.parents[2] / "experiments" / "arm.xml"
+    with pytest.raises(ValueError, match=r"model: .*arm\.xml lacks joints of BITeno's or its keyframe home"):
+        CorrectedBiteno(TaskConfig(), ENTRIES, Correction(arm, {}))

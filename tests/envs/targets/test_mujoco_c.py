@@ -106,6 +106,19 @@ def test_a_state_that_is_not_finite_ends_its_episode_alone(robot, monkeypatch):
     assert np.isfinite(trajectory.obs).all()
 
 
+def test_a_robot_that_explodes_is_not_put_back_on_its_feet(robot, monkeypatch):
+    target = mujoco_c.target(robot, VALUES, threads=1)
+    move, calls = target._engine.move, []
+
+    def thrown(state, drive):
+        calls.append(None)
+        return move(state.replace(qvel=state.qvel.at[1, 8].set(1e11)) if len(calls) == 5 else state, drive)
+
+    monkeypatch.setattr(target._engine, "move", thrown)
+    trajectory = target.episodes(KEY, restless, COUNT, 10)
+    np.testing.assert_array_equal(trajectory.not_finite, [False, True, False])
+
+
 def test_options_make_it_another_engine(robot):
     plain = mujoco_c.target(robot, VALUES, threads=1).record(KEY, restless, COUNT, 20)[1]
     finer = mujoco_c.target(robot, VALUES, threads=1, timestep=0.0005).record(KEY, restless, COUNT, 20)[1]
