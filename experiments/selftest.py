@@ -152,7 +152,8 @@ def tested(args: Args, robot: Kind, entries, others, episodes: int, progress: Pr
     sizes = replace(sizes, tuner=replace(sizes.tuner, set_episodes=episodes))
     hidden = {name: robot.entries[name] for values in others.values() for name in values if name not in entries}
     learner = Learner(sizes, entries, hidden, kind=robot)
-    memory.check(learner)
+    # The robots of every case: inside, outside in a parameter, and the others.
+    memory.check(learner, sets=args.robots * (1 + len(entries) + len(others)))
     policy = starting_policy(args.policy or default_policy(robot), learner, args.out)
     dist = learner.dist(parameters.nominal(entries), args.radius)
     machine = learner.tuner()

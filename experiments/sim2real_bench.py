@@ -221,8 +221,10 @@ def main(args: Args) -> None:
     with bars() as progress:
         task = progress.add_task("runs", total=len(args.seeds) * len(args.methods))
         for seed in args.seeds:
-            prepare(args, nominal, seed)
-            before = evaluate(args, programs, args.out / f"start_{seed}" / "learner")
+            # Another process may play other methods of this seed.
+            with checkpoint.lock(args.out / f"start_{seed}"):
+                prepare(args, nominal, seed)
+                before = evaluate(args, programs, args.out / f"start_{seed}" / "learner")
             for name in args.methods:
                 transfer = transfer_of(args, name, seed)
                 last = transfer.out / f"round_{args.rounds:03d}"

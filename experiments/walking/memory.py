@@ -14,19 +14,22 @@ from experiments.walking.learner import Learner
 
 _TRAINING = 14.0  # of a PPO update's rollout: its batches, their gradients, the physics of a step
 _TUNING = 2.0  # of a tuning's episodes: windows, and batches of them
+_SCORED = 20.0  # of sets that are scored side by side: their windows, and what networks make of them
 _MODELS = 100e6  # B, of both models while they are trained
 _USABLE = 0.9  # share of a device's memory
 _LIMIT = Path("/sys/fs/cgroup/memory.max")  # of a container, in bytes; `max` where there is none
 
 
-def needed(learner: Learner) -> dict[str, float]:
-    """Estimates the memory that training and a tuning take, each by itself.
+def needed(learner: Learner, sets: int = 0) -> dict[str, float]:
+    """Estimates the memory that training, a tuning and the scoring of many sets take, each by itself.
 
     Args:
       learner: robot and sizes.
+      sets: measured sets that are scored side by side, as a self-test does.
 
     Returns:
-      Bytes by name: `training` over all devices, and `tuning` on each, as every device learns from all episodes.
+      Bytes by name: `training` over all devices, and `tuning` and `scoring` on each, as every device learns from all
+      episodes.
     """
     sizes, tuner = learner.preset, learner.preset.tuner
     step = 4.0 * (learner.robot.observation_size + learner.robot.action_size)
@@ -35,21 +38,23 @@ def needed(learner: Learner) -> dict[str, float]:
         kept = jax.eval_shape(lambda key: learner.robot.kept(learner.robot.reset({}, key)), jax.random.PRNGKey(0))
         step += 4.0 * sum(leaf.size for leaf in jax.tree.leaves(kept))
     episodes = step * sizes.episode_steps * (tuner.episodes + tuner.held_out_sets * tuner.set_episodes)
-    return {"training": _TRAINING * rollout, "tuning": _TUNING * episodes + _MODELS}
+    scores = _SCORED * step * sizes.episode_steps * sets * tuner.set_episodes
+    return {"training": _TRAINING * rollout, "tuning": _TUNING * episodes + _MODELS, "scoring": scores}
 
 
-def check(learner: Learner, lanes: int = 1) -> None:
+def check(learner: Learner, lanes: int = 1, sets: int = 0) -> None:
     """Checks that a run fits.
 
     Args:
       learner: robot and sizes.
       lanes: runs side by side, spread over devices.
+      sets: measured sets that are scored side by side.
 
     Raises:
       ValueError: it does not; says how much is needed for what, and how much there is.
     """
     there, devices = available(), len(jax.devices())
-    for what, size in needed(learner).items():
+    for what, size in needed(learner, sets).items():
         # Lanes are whole on a device; the training of a single run is shared, its tuning is not.
         size *= math.ceil(lanes / devices) if lanes > 1 else 1.0 / devices if what == "training" else 1.0
         if size > _USABLE * there:

@@ -925,10 +925,17 @@ def find():
     return find
 
 
-@pytest.mark.parametrize(("friction", "mass"), [(0.5, -0.5), pytest.param(-0.5, 0.5, marks=pytest.mark.slow)])
-def test_tuner_finds_a_truth_beyond_its_first_distribution(find, friction, mass):
+@pytest.mark.parametrize(
+    ("friction", "mass", "seeds"),
+    [
+        (0.5, -0.5, (0, 1)),
+        pytest.param(0.5, -0.5, (2, 3), marks=pytest.mark.slow),
+        pytest.param(-0.5, 0.5, (0, 1, 2, 3), marks=pytest.mark.slow),
+    ],
+)
+def test_tuner_finds_a_truth_beyond_its_first_distribution(find, friction, mass, seeds):
     errors = []
-    for seed in range(4):
+    for seed in seeds:
         state, info = find(seed, friction=friction, mass=mass)
         # The first radius cannot contain the truth, so a faithful run rejects and widens first.
         assert info.verdicts[0, 0] == Verdict.WIDEN
