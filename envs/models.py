@@ -5,6 +5,7 @@ measured and contact is chaotic.
 """
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import mujoco
@@ -75,7 +76,8 @@ def without_files(spec: mujoco.MjSpec) -> mujoco.MjSpec:
 
     Inertias that follow from a mesh are written out. So are all that the compiler computes anew each time, from
     geometries, a total mass or fused bodies: they would undo what is changed in them. Bodies stay as they are, also
-    where the model asks for static ones to be fused. Contacts of meshes are lost; on a test rig there are none.
+    where the model asks for static ones to be fused. Contacts of meshes are lost, and sensors that name one; on a test
+    rig there are none.
 
     Args:
       spec: of the robot; it may be changed.
@@ -97,13 +99,14 @@ def without_files(spec: mujoco.MjSpec) -> mujoco.MjSpec:
     whole.compiler.fusestatic = whole.compiler.discardvisual = False
     model = whole.compile()
     filed = (mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtGeom.mjGEOM_HFIELD)
+    lost_geoms = []
     for body, compiled in zip(spec.bodies, whole.bodies, strict=True):
         # A primitive may be fitted to a mesh, which it then names.
         mine = [geom for geom in body.geoms if geom.type in filed or geom.meshname]
         if (mine or anew) and body.name != "world":
             _write_inertia(body, model, compiled.id)
-        for geom in mine:
-            spec.delete(geom)
+        lost_geoms += mine
+    _delete_geoms(spec, lost_geoms)
     compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
     compiler.settotalmass, compiler.fusestatic = -1.0, False
     lost = {texture.name for texture in textures}
@@ -112,6 +115,19 @@ def without_files(spec: mujoco.MjSpec) -> mujoco.MjSpec:
     for element in elements:
         spec.delete(element)
     return spec
+
+
+def _delete_geoms(spec: mujoco.MjSpec, geoms: Sequence[mujoco.MjsGeom]) -> None:
+    """Deletes geoms, and before them the contact pairs and sensors that name one."""
+    names = {geom.name for geom in geoms} - {""}
+    kind = mujoco.mjtObj.mjOBJ_GEOM
+    named = [pair for pair in spec.pairs if names & {pair.geomname1, pair.geomname2}]
+    for sensor in spec.sensors:
+        objects = ((sensor.objtype, sensor.objname), (sensor.reftype, sensor.refname))
+        if any(of == kind and name in names for of, name in objects):
+            named.append(sensor)
+    for element in (*named, *geoms):
+        spec.delete(element)
 
 
 def _write_inertia(body: mujoco.MjsBody, model: mujoco.MjModel, number: int) -> None:

@@ -46,6 +46,8 @@ def main(args: Args) -> None:
     )
     worst = max(log.runs, key=lambda one: len(found[one.name]))
     plots.suspicions(out / "doctor.png", worst, log.joints, [one.sentence for one in found[worst.name]])
+    for note in log.notes:
+        console.print(note, highlight=False, markup=False)
     if not said:
         console.print(f"nothing is suspected in {len(log.runs)} run(s); plot in {out}")
         return

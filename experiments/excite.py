@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from envs import models
-from envs.logs import Controller, Log, Run, read_any, write
+from envs.logs import Controller, Convention, Log, Run, read_any, write
 from experiments.common.cli import console, run
 from experiments.discovery.excitation import MOTIONS, excitation, scaled
 
@@ -30,7 +30,7 @@ class Args:
     """Robot: biteno (the default), pendulum, or the path of an MJCF file."""
     like: Path | None = None
     """Folder of a log of the robot. Its joints and first run's controller are taken, in the place of kp, kd,
-    torque_limit_nm and control_hz, and its model unless robot is given."""
+    torque_limit_nm and control_hz, and its model unless robot is given. Targets are written in its units and signs."""
     runs: int = 6
     """Number of runs; 4 or more, so that they can be split into train, select and sealed."""
     seconds: float = 3.0
@@ -59,7 +59,7 @@ def main(args: Args) -> None:
       ValueError: an option is wrong, or the model cannot be read.
     """
     _check(args)
-    robot, joints, controller = _described(args) if args.like is None else _alike(args.like, args.robot)
+    robot, joints, controller, convention = _described(args) if args.like is None else _alike(args.like, args.robot)
     spec = models.spec(robot)
     runs = tuple(
         Run(
@@ -72,15 +72,24 @@ def main(args: Args) -> None:
         )
         for one in excitation(spec, joints, args.runs, args.seconds, args.rate_hz, args.seed, args.motion)
     )
-    write(Log(robot=robot, base="fixed", rate_hz=args.rate_hz, joints=joints, policy=None, runs=runs), args.out)
+    log = Log(
+        robot=robot,
+        base="fixed",
+        rate_hz=args.rate_hz,
+        joints=joints,
+        policy=None,
+        runs=runs,
+        convention=convention,
+    )
+    write(log, args.out)
     console.print(
         f"wrote {len(runs)} runs of {args.seconds:g} s for {', '.join(joints)} to {args.out}. Play each run's targets "
         "on the robot, and add the measured columns to its file or a copy of it: q.*, and dq.* if there is a sensor."
     )
 
 
-def _described(args: Args) -> tuple[str, tuple[str, ...], Controller]:
-    """Robot, joints and controller as the options say."""
+def _described(args: Args) -> tuple[str, tuple[str, ...], Controller, Convention]:
+    """Robot, joints and controller as the options say, in the model's units and signs."""
     # A free joint is the base, which is held, and a ball joint has no scalar target.
     kinds = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
     robot = args.robot or "biteno"
@@ -89,13 +98,13 @@ def _described(args: Args) -> tuple[str, tuple[str, ...], Controller]:
         raise ValueError(f"robot: got '{robot}' with joints {joints}, expected hinges or slides that have names")
     gains = {"kp": args.kp, "kd": args.kd, "torque_limit_nm": args.torque_limit_nm}
     every = {name: np.full(len(joints), value) for name, value in gains.items()}
-    return robot, joints, Controller(kind="pd", rate_hz=args.control_hz, gains=every)
+    return robot, joints, Controller(kind="pd", rate_hz=args.control_hz, gains=every), Convention()
 
 
-def _alike(folder: Path, robot: str | None) -> tuple[str, tuple[str, ...], Controller]:
-    """Robot, joints and controller of a log, which may be read with another model."""
+def _alike(folder: Path, robot: str | None) -> tuple[str, tuple[str, ...], Controller, Convention]:
+    """Robot, joints, controller, and units and signs of a log, which may be read with another model."""
     log = read_any(folder, robot and Path(robot))
-    return log.robot, log.joints, log.runs[0].controller
+    return log.robot, log.joints, log.runs[0].controller, log.convention
 
 
 def _check(args: Args) -> None:

@@ -22,7 +22,7 @@ from envs.logs import Log, Run
 from envs.logs.format import JOINT_SIGNALS
 from envs.logs.sampling import HELD, sampled
 from envs.targets.protocol import Commands
-from envs.targets.recorded import HOLE, Recorded, cut, find_ticks
+from envs.targets.recorded import Recorded, cut, find_ticks, holes
 from jaxtune.types import Trajectory
 
 _NEEDED = ("q", "dq", "target", "action", "phase", "cmd", "gyro", "gravity", "vel")
@@ -135,7 +135,7 @@ def _meant(policy: Mapping[str, Any], seen: dict[str, np.ndarray]) -> np.ndarray
 def _pieces(ticks: dict[str, np.ndarray]) -> list[tuple[np.ndarray, bool]]:
     """Finds pieces of consecutive ticks with the robot on its feet, and whether each ends in a fall."""
     up = ticks["up"]
-    hole = np.append(False, np.diff(ticks["time"]) > HOLE * constants.POLICY_DT_S)
+    hole = np.append(False, holes(ticks["time"], constants.POLICY_DT_S))
     found, down = [], False
     # Split at holes, and wherever the robot falls or stands up.
     for rows in np.split(np.arange(len(up)), np.flatnonzero(hole | np.append(False, up[1:] != up[:-1]))):

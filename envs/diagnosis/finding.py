@@ -10,6 +10,7 @@ MISLEADING = (
     "flipped sign",
     "degrees",
     "radians twice",
+    "millimetres",
     "millinewtonmetres",
     "missing rows",
     "clock jump",
@@ -17,9 +18,10 @@ MISLEADING = (
     "contact",
 )
 """Kinds of findings that would make a discovery name something else, so that it refuses the log. All others (a low
-rate, repeated rows, quantisation, clipping, drift, a delay, an offset) limit what can be learnt, or are effects."""
+rate, short gaps, repeated rows, quantisation, clipping, drift, a delay, an offset) limit what can be learnt, or are
+effects."""
 
-_WRONG = ("swapped joints", "flipped sign", "degrees", "radians twice", "millinewtonmetres")
+_WRONG = ("swapped joints", "flipped sign", "degrees", "radians twice", "millimetres", "millinewtonmetres")
 
 
 @dataclass(frozen=True)

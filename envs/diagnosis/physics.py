@@ -21,9 +21,10 @@ _BETTER = 0.25  # in units of one joint's whole signal
 _SHARE = 0.1  # of the disagreement before
 _MOST_REPAIRS = 3
 _KEPT_ROWS = 1500  # of a long run; more take time and change nothing
-_UNITS = ("degrees", "radians twice", "millinewtonmetres")
+_UNITS = ("degrees", "radians twice", "millimetres", "millinewtonmetres")
 _LEAST_UNITS = 1.0  # by which a change of units must lower `Disagreement.magnitudes` to be tried with another repair
 _DELAYS_S = (0.004, 0.008, 0.012, 0.016, 0.024, 0.032, 0.045)
+_LONGEST_DELAY = 0.25  # of the rows, so that most of them remain
 _LEAST_OFFSET_RAD = 0.025
 _LEAST_DRIFT = 0.015
 _COARSE = 0.004  # largest step of an encoder, as a share of the joint's range of motion
@@ -55,14 +56,16 @@ def physics(run: Run, joints: tuple[str, ...], model: mujoco.MjModel, held: bool
     run, done = _thinned(run), []
     # With coarse encoders accelerations are mostly rounding errors, so the inverse dynamics are not compared.
     disagreement = Disagreement(run, joints, model, held and not _is_coarse(run))
+    turns = np.array([model.joint(name).type[0] == mujoco.mjtJoint.mjJNT_HINGE for name in joints])
     now = disagreement(run)
     for _ in range(_MOST_REPAIRS):
-        repairs = _repairs(run, disagreement)
+        repairs = _repairs(run, disagreement, turns)
         chain, repaired, then = _best([[repair] for repair in repairs], run, disagreement)
         if chain[0].kind in _UNITS or not _believed(now, then):
             # Nothing agrees in wrong units, so a second error shows only once the units are repaired: try both at once.
             size = disagreement.magnitudes(run) - _LEAST_UNITS
-            units = [one for one in repairs if one.kind in _UNITS and disagreement.magnitudes(one.apply(run)) < size]
+            units = [one for one in repairs if one.kind in _UNITS and not one.joints]
+            units = [one for one in units if disagreement.magnitudes(one.apply(run)) < size]
             others = [repair for repair in repairs if repair.kind in ("swapped joints", "flipped sign")]
             both = [[unit, other] for unit in units for other in others]
             if both and _believed(min(now, then), (best := _best(both, run, disagreement))[2]):
@@ -105,8 +108,8 @@ def _thinned(run: Run) -> Run:
     return replace(run, time=run.time[rows], signals={name: values[rows] for name, values in run.signals.items()})
 
 
-def _repairs(run: Run, disagreement: Disagreement) -> list[_Repair]:
-    """Lists every repair to be tried."""
+def _repairs(run: Run, disagreement: Disagreement, turns: np.ndarray) -> list[_Repair]:
+    """Lists every repair to be tried; `turns` [joints] tells hinges from slides."""
     count = run.signals["q"].shape[1]
     # An error may be in one signal, in all signals of sensors (a mistake in the driver), or in targets as well.
     measured = tuple(name for name in MEASURED if name in run.signals)
@@ -124,11 +127,28 @@ def _repairs(run: Run, disagreement: Disagreement) -> list[_Repair]:
             found.append(_Repair("flipped sign", label, (joint,), -1.0, _on(names, lambda v, sign=sign: v * sign)))
         # Torques are not angles, so a group is converted without them.
         angles = tuple(name for name in names if name != "tau")
-        for kind, factor in (("degrees", np.pi / 180.0), ("radians twice", 180.0 / np.pi)) if angles else ():
-            found.append(_Repair(kind, label, (), factor, _on(angles, lambda v, factor=factor: v * factor)))
+        found += _positions(label, angles, turns) if angles else []
     if "tau" in run.signals:
         found.append(_Repair("millinewtonmetres", "tau", (), 1e-3, _on(("tau",), lambda v: v * 1e-3)))
     return found + _delays(run, measured) + _offsets(run, disagreement)
+
+
+def _positions(label: str, names: tuple[str, ...], turns: np.ndarray) -> list[_Repair]:
+    """Repairs of the units of positions: of all hinges or all slides, and of one joint alone."""
+    found = []
+    for kind, factor, own in (
+        ("degrees", np.pi / 180.0, turns),
+        ("radians twice", 180.0 / np.pi, turns),
+        ("millimetres", 1e-3, ~turns),
+    ):
+        places = tuple(np.flatnonzero(own))
+        alone = [(joint,) for joint in places] if len(places) > 1 and kind != "radians twice" else []
+        for joints in filter(None, (places, *alone)):
+            factors = np.where(np.isin(np.arange(len(turns)), joints), factor, 1.0)
+            # `units` in meta.yaml is about all hinges, so these are not named.
+            named = () if len(joints) == turns.sum() and kind != "millimetres" else joints
+            found.append(_Repair(kind, label, named, factor, _on(names, lambda v, factors=factors: v * factors)))
+    return found
 
 
 def _on(names: tuple[str, ...], change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Run], Run]:
@@ -145,7 +165,7 @@ def _delays(run: Run, measured: tuple[str, ...]) -> list[_Repair]:
     for label, names in groups.items():
         for delay in _DELAYS_S if "target" in run.signals and set(names) <= set(measured) else ():
             rows = round(delay / period)
-            if rows:
+            if 0 < rows <= _LONGEST_DELAY * len(run.time):
                 found.append(_Repair("late", label, (), rows * period, partial(_earlier, names, rows)))
     return found
 
@@ -215,7 +235,9 @@ _SENTENCES: Mapping[str, str] = {
     "swapped joints": "{signal}: {joints} are swapped; map their `columns` in meta.yaml",
     "flipped sign": "{signal}: {joints} has a flipped sign; set its `sign` in meta.yaml, or negate the column",
     "degrees": "{signal}: degrees for radians; set `units: {{angle: deg}}` in meta.yaml",
+    "degrees of one": "{signal}: {joints} alone is in degrees; multiply its columns by pi / 180",
     "radians twice": "{signal}: angles are 57 times too small; they were converted to radians twice",
+    "millimetres": "{signal}: {joints} in mm, expected m; divide the columns by 1000",
     "millinewtonmetres": "{signal}: torques are in mNm; set `units: {{torque: mNm}}` in meta.yaml",
     "late": "{signal}: an apparent delay of {size:.0f} ms",
     "offset": "{signal}: {joints} has a constant offset of {size:+.3f} rad",
@@ -225,5 +247,6 @@ _SENTENCES: Mapping[str, str] = {
 def _as_finding(repair: _Repair, joints: tuple[str, ...]) -> Finding:
     names = tuple(joints[joint] for joint in repair.joints)
     size = 1e3 * repair.size if repair.kind == "late" else repair.size
-    sentence = _SENTENCES[repair.kind].format(signal=repair.signal, joints=" and ".join(names), size=size)
+    kind = "degrees of one" if repair.kind == "degrees" and names else repair.kind
+    sentence = _SENTENCES[kind].format(signal=repair.signal, joints=" and ".join(names), size=size)
     return Finding(repair.kind, repair.signal, names, size, sentence)

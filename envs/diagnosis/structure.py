@@ -11,6 +11,9 @@ from envs.readings import noise, quantum_of
 
 _LEAST_RATE_HZ = 100.0
 _LEAST_HOLE = 1.6  # usual steps of the clock
+_SHORT = 3.25  # usual steps: the longest gap over which readings can be interpolated
+_FEW = 0.01  # share of the steps that may be short gaps
+_SOON, _IN_STEP = 3, 0.3  # rows after a late one, and usual steps from their place, by which the clock is in step again
 _APART = 1.4  # ratio of two steps, one of which is a hole and the other none
 
 
@@ -21,8 +24,8 @@ def structure(run: Run) -> tuple[list[Finding], Run]:
       run: as it was read; its time stamps increase.
 
     Returns:
-      The findings, and the longest piece of the run without any of these defects, for checks that need consecutive
-      rows.
+      The findings, and the longest piece of the run without any of these defects (but short gaps), for checks that need
+      consecutive rows.
     """
     found = []
     steps = np.diff(run.time)
@@ -38,6 +41,18 @@ def structure(run: Run) -> tuple[list[Finding], Run]:
         )
         found.append(Finding("duplicated rows", "t", (), float(twice.sum()), text))
     holes = np.flatnonzero(steps > max(_LEAST_HOLE * period, _longest_usual(steps)))
+    # A row that was read late, with the time at which it was read, is no defect.
+    short = [row for row in holes if steps[row] <= _SHORT * period]
+    gaps = [row for row in short if not _in_step_again(run.time, row, period)]
+    if len(gaps) > _FEW * len(steps):
+        short = np.setdiff1d(short, gaps)
+    elif gaps:
+        text = (
+            f"short gaps: {len(gaps)} of up to {steps[gaps].max():.4g} s, where {period:.4g} s from row to row are "
+            f"usual, the first after row {gaps[0] + 1}"
+        )
+        found.append(Finding("short gaps", "t", (), float(len(gaps)), text))
+    holes = np.setdiff1d(holes, short)
     for row in holes:
         moved = _moves_on(run, row)
         kind, what = ("missing rows", "rows are missing") if moved else ("clock jump", "the clock jumps")
@@ -54,6 +69,12 @@ def _longest_usual(steps: np.ndarray) -> float:
     longer = np.sort(steps[steps >= np.median(steps)])
     apart = np.flatnonzero(longer[1:] > _APART * longer[:-1])
     return float(longer[apart[0]] if len(apart) else longer[-1])
+
+
+def _in_step_again(time: np.ndarray, row: int, period: float) -> bool:
+    """Whether one of the rows after a long step comes when it would have come without that step."""
+    later = time[row + 2 : row + 2 + _SOON] - time[row]
+    return bool((np.abs(later / period - np.arange(2, 2 + len(later))) < _IN_STEP).any())
 
 
 def _moves_on(run: Run, row: int) -> bool:

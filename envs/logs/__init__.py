@@ -8,11 +8,12 @@ those of the model: joint positions and targets in rad, velocities in rad/s, tor
 
 from envs.logs.controller import Controller, Impedance
 from envs.logs.files import read, read_observed, write
-from envs.logs.format import Log, Run, splits, with_halves_swapped, with_splits
+from envs.logs.format import Convention, Log, Run, splits, with_halves_swapped, with_splits
 from envs.logs.xl330 import read_any, read_xl330
 
 __all__ = [
     "Controller",
+    "Convention",
     "Impedance",
     "Log",
     "Run",

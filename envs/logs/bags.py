@@ -11,7 +11,10 @@ A bag has a clock per topic, a run has one for all signals. These rules make one
 - Other topics are sampled at these times. What a policy sends on other topics belongs to the tick whose action is
   nearest. (A tick is one step of the policy.)
 - Time is the stamp in the headers if all messages have one, else the recorder's; it starts at zero.
-- A run begins where the last of its topics begins, and ends where the first measured one ends.
+- A run begins where the last of its topics begins, and ends where the first measured one ends. A note says what is
+  lost of its rows by that; if measured topics cost more than a tenth of them, the bag is refused.
+- Topics of commands may end early. Topics that are sent on change (`enabled`, `cmd`, `contact`) may also begin late:
+  before its first message the first value is taken.
 - Rows continue for a while after the last action, because a policy may stop before its robot falls.
 - Rows in a hole of a measured topic are left out, which leaves a hole in the time stamps.
 """
@@ -25,7 +28,7 @@ from typing import Any
 import numpy as np
 
 from envs.logs.containment import TooLarge, check_size
-from envs.logs.sampling import COMMANDED, HELD, SENT, held, sampled
+from envs.logs.sampling import HELD, ON_CHANGE, SENT, held, sampled
 
 SUFFIXES = (".bag", ".mcap", ".db3")
 """Suffixes of bags that are files; a folder with a `metadata.yaml` is a bag as well."""
@@ -33,6 +36,7 @@ SUFFIXES = (".bag", ".mcap", ".db3")
 _PLACE = re.compile(r"(?P<topic>/[^.\[\]\s]+)\.(?P<field>\w+(?:\.\w+)*)(?:\[(?P<index>[^\[\]]+)\])?")
 _MESSAGE_BYTES = 512  # that the values of a message take until all are read
 _HOLE = 3.5  # periods of a topic without a message that count as a hole
+_NOTED, _MOST_LOST = 0.01, 0.1  # shares of a run's time at its ends
 _MORE_ROWS = 500  # at most, after the last message of the topic that gives the rows
 
 
@@ -55,8 +59,11 @@ class _Place:
             value = getattr(value, name)
         if self.index is None:
             return float(value)
-        digits = self.index.isdecimal()
-        return float(value[int(self.index) if digits else list(message.name).index(self.index)])
+        names = getattr(message, "name", None)
+        names = names if isinstance(names, list) else []
+        # The name of a joint may be a number.
+        is_index = self.index.isdecimal() and self.index not in names
+        return float(value[int(self.index) if is_index else names.index(self.index)])
 
 
 @dataclass(frozen=True)
@@ -78,7 +85,7 @@ def _signal(column: str) -> str:
     return column.partition(".")[0]
 
 
-def read_bag(path: Path, columns: Mapping[str, str]) -> dict[str, np.ndarray]:
+def read_bag(path: Path, columns: Mapping[str, str]) -> tuple[dict[str, np.ndarray], list[str]]:
     """Reads the columns that `meta.yaml` maps to places in a bag.
 
     Args:
@@ -86,7 +93,7 @@ def read_bag(path: Path, columns: Mapping[str, str]) -> dict[str, np.ndarray]:
       columns: place in the bag by the format's name of the column.
 
     Returns:
-      Columns [rows] by their place, and `t` in s.
+      Columns [rows] by their place, and `t` in s; and notes about what was lost at the ends.
 
     Raises:
       ValueError: names the topic, and the message (from 1) and field where it is about one.
@@ -106,7 +113,7 @@ def read_bag(path: Path, columns: Mapping[str, str]) -> dict[str, np.ndarray]:
         raise ValueError(f"{path}: columns: got none of 'q.*', expected where in the bag the positions are")
     topics = _read_topics(path, places)
     ticks = places[of_rows[0]].topic
-    period, start, time = _rows(path, topics, ticks)
+    period, start, time, notes = _rows(path, topics, ticks)
     found = {"t": time}
     for name, topic in topics.items():
         at = 1e-9 * (topic.time - start)
@@ -117,19 +124,22 @@ def read_bag(path: Path, columns: Mapping[str, str]) -> dict[str, np.ndarray]:
                 found[columns[ours]] = held(at, values, time + late if _signal(ours) in SENT else time)
             else:
                 found[columns[ours]] = sampled(at, values, time, period)
-    return found
+    return found, notes
 
 
-def _rows(path: Path, topics: Mapping[str, _Topic], of_rows: str) -> tuple[float, int, np.ndarray]:
-    """Returns the period of the rows in s, the first stamp in ns, and the times [rows] in s from there."""
+def _rows(path: Path, topics: Mapping[str, _Topic], of_rows: str) -> tuple[float, int, np.ndarray, list[str]]:
+    """Returns the period of the rows in s, the first stamp in ns, the times [rows] in s from there, and notes."""
     # A command holds until the next one, so its topic may end early or have holes; a measurement may not.
-    measured = {name: topic for name, topic in topics.items() if topic.signals - {*COMMANDED}}
+    measured = {name: topic for name, topic in topics.items() if topic.signals - {*SENT, *ON_CHANGE}}
+    sent = {name: topic for name, topic in topics.items() if topic.signals & {*SENT}}
     for name in dict.fromkeys([of_rows, *measured]):
         if len(topics[name].time) < 2:
             raise ValueError(f"{path}, topic '{name}': got 1 message, expected 2 or more")
-    start = max(int(topic.time[0]) for topic in topics.values())
-    end = min(int(topic.time[-1]) for topic in measured.values())
+    # The rows come from positions or actions, so there is one topic or more.
+    start = max(int(topic.time[0]) for topic in (measured | sent).values())
     stamps = topics[of_rows].time
+    whole = int(stamps[0]), int(stamps[-1])
+    end = min((int(topic.time[-1]) for topic in measured.values()), default=whole[1])
     period = int(np.median(np.diff(stamps)))
     more = min((end - int(stamps[-1])) // period, _MORE_ROWS)
     stamps = np.append(stamps, stamps[-1] + period * np.arange(1, 1 + more))
@@ -144,7 +154,44 @@ def _rows(path: Path, topics: Mapping[str, _Topic], of_rows: str) -> tuple[float
     if len(stamps) < 2:
         raise ValueError(f"{path}: the topics {', '.join(topics)} have {len(stamps)} row(s) in common, expected more")
     time = 1e-9 * (stamps - stamps[0])
-    return float(np.median(np.diff(time))), int(stamps[0]), time
+    return float(np.median(np.diff(time))), int(stamps[0]), time, _lost(path, whole, measured, sent)
+
+
+def _lost(path: Path, whole: tuple[int, int], measured: Mapping[str, _Topic], sent: Mapping[str, _Topic]) -> list[str]:
+    """Says what a run loses at its ends because topics begin late or end early.
+
+    Args:
+      path: of the bag.
+      whole: first and last stamp of the topic that gives the rows, in ns.
+      measured: topics that sensors send.
+      sent: topics that a policy sends.
+
+    Raises:
+      ValueError: more than a tenth is lost because of a measured topic.
+    """
+    begin, end = whole
+    cuts, lost = [], []
+    if sent:
+        first, name = max((int(topic.time[0]), name) for name, topic in sent.items())
+        cuts = [(first - begin, "beginning", name)]
+        # What comes before a policy's first command is no loss: the policy had not begun.
+        begin = max(begin, first)
+    if measured:
+        first, late = max((int(topic.time[0]), name) for name, topic in measured.items())
+        last, early = min((int(topic.time[-1]), name) for name, topic in measured.items())
+        lost = [(first - begin, "beginning", late), (end - last, "end", early)]
+    if sum(max(0, time) for time, _, _ in lost) > _MOST_LOST * (end - begin):
+        time, where, name = max(lost)
+        raise ValueError(
+            f"{path}, topic '{name}': got no message in {1e-9 * time:.3g} s at the {where} of "
+            f"{1e-9 * (whole[1] - whole[0]):.3g} s, expected messages in {1 - _MOST_LOST:.0%} of the time or more: "
+            "rows without them would be lost"
+        )
+    return [
+        f"{path.stem}: {1e-9 * time:.3g} s at the {where} were dropped, in which topic '{name}' has no message"
+        for time, where, name in (*cuts, *lost)
+        if time > _NOTED * (whole[1] - whole[0])
+    ]
 
 
 def _read_topics(path: Path, places: Mapping[str, _Place]) -> dict[str, _Topic]:

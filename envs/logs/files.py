@@ -3,6 +3,7 @@
 A damaged log is refused with the file, the row and the column; it is never repaired in silence.
 """
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -82,18 +83,21 @@ def _read(folder: Path, meta: Meta, needed: str) -> Log:
     for name in meta.runs:
         if name not in stems:
             raise ValueError(f"{meta.path}: runs.{name}: there is no such run; found {', '.join(stems)}")
+    read = [_run(path, meta, needed) for path in paths]
     return Log(
         robot=meta.robot,
         base=meta.base,
         rate_hz=meta.rate_hz,
         joints=meta.joints,
         policy=meta.policy,
-        runs=tuple(_run(path, meta, needed) for path in paths),
+        runs=tuple(run for run, _ in read),
+        convention=meta.convention,
+        notes=tuple(note for _, notes in read for note in notes),
     )
 
 
 def write(log: Log, folder: Path, suffix: str = ".csv") -> None:
-    """Writes a log in the model's names, units and signs, from which `read` returns the same log.
+    """Writes a log in the model's names and its own units and signs (`Log.convention`); `read` returns the same log.
 
     `meta.yaml` is written last, and in one step, so that another program which waits for it finds all runs complete. A
     robot that is the path of an MJCF is written too, as one file, so that the folder can be moved as a whole.
@@ -128,6 +132,9 @@ def write(log: Log, folder: Path, suffix: str = ".csv") -> None:
         **_as_meta(log.runs[0].controller),
         "runs": {},
     }
+    for key in ("units", "sign"):
+        if said := dict(getattr(log.convention, key)):
+            meta[key] = said
     if known := _facts_as_meta(log):
         meta["signals"] = known
     if log.policy is not None:
@@ -137,7 +144,7 @@ def write(log: Log, folder: Path, suffix: str = ".csv") -> None:
         meta["runs"][run.name] = entry | ({"split": run.split} if run.split else {})
         columns = {"t": run.time} | dict(run.other)
         for signal, values in run.signals.items():
-            values = values.reshape(len(run.time), -1)
+            values = values.reshape(len(run.time), -1) / log.convention.factors.get(signal, 1.0)
             numbered = [f"{OBSERVATION}.{number}" for number in range(values.shape[1])]
             names = numbered if signal == OBSERVATION else column_names(signal, log.joints)
             columns |= dict(zip(names, values.T, strict=True))
@@ -166,14 +173,16 @@ def _facts_as_meta(log: Log) -> dict:
             same = signal in first.signals and np.array_equal(values, first.fact(signal, fact), equal_nan=True)
             if not same and np.isfinite(values).any():
                 raise ValueError(f"{run.name}: {signal}: got another {fact} than in {first.name}, expected one")
-            for column, value in zip(column_names(signal, log.joints), values, strict=True):
+            own = _scaled({fact: values}, 1.0 / log.convention.factors.get(signal, 1.0))[fact]
+            for column, value in zip(column_names(signal, log.joints), own, strict=True):
                 if np.isfinite(value):
                     found.setdefault(column, {})[fact] = float(value)
     return found
 
 
-def _run(path: Path, meta: Meta, needed: str) -> Run:
-    columns = read_bag(path, meta.columns) if is_bag(path) else READERS[path.suffix](path)
+def _run(path: Path, meta: Meta, needed: str) -> tuple[Run, list[str]]:
+    """Reads a run, and notes about what was made of it."""
+    columns, notes = read_bag(path, meta.columns) if is_bag(path) else (READERS[path.suffix](path), [])
     # All columns are checked, also those that the format does not know: a NaN in any of them means a damaged file.
     for name, values in columns.items():
         refuse_first(path, name, values, ~np.isfinite(values), "a finite number")
@@ -190,7 +199,7 @@ def _run(path: Path, meta: Meta, needed: str) -> Run:
         raise ValueError(f"{path}, column 't': got {rate:.6g} rows a second, expected rate_hz, {meta.rate_hz:g}")
     signals = _signals(path, columns, meta)
     entry = meta.runs.get(path.stem, {"controller": meta.controller})
-    known = {signal: dict(facts) for signal, facts in meta.facts.items() if signal in signals}
+    known = {signal: facts for signal, facts in meta.facts.items() if signal in signals}
     _convert(path, signals, known, meta, entry["controller"])
     if needed == OBSERVATION:
         for name, column in ((OBSERVATION, "obs.0"), ("action", column_names("action", meta.joints)[0])):
@@ -200,7 +209,7 @@ def _run(path: Path, meta: Meta, needed: str) -> Run:
         raise ValueError(f"{path}, column '{column_names(needed, meta.joints)[0]}': is missing")
     elif not {"target", "tau"} & set(signals):
         raise ValueError(f"{path}: there is neither '{column_names('target', meta.joints)[0]}' nor 'tau' or 'current'")
-    return Run(
+    run = Run(
         name=path.stem,
         condition=entry.get("condition", path.stem),
         split=entry.get("split"),
@@ -210,6 +219,7 @@ def _run(path: Path, meta: Meta, needed: str) -> Run:
         other=columns,
         known=known,
     )
+    return run, notes
 
 
 def _signals(path: Path, columns: dict[str, np.ndarray], meta: Meta) -> dict[str, np.ndarray]:
@@ -248,28 +258,24 @@ def _signals(path: Path, columns: dict[str, np.ndarray], meta: Meta) -> dict[str
 
 def _convert(path: Path, signals: dict, known: dict, meta: Meta, controller: Controller | None) -> None:
     """Converts signals, and what is known of them, to the model's units and signs, and currents to torques."""
-    # Actions keep their unit and sign: they are the policy's, not the model's.
-    unit = dict.fromkeys(("q", "dq", "target"), meta.angle) | dict.fromkeys(("tau", "abs_tau"), meta.torque)
-    sign = np.array([meta.signs[joint] for joint in meta.joints])
-    for signal in (*unit, "current"):
+    for signal, factor in meta.convention.factors.items():
         if signal in signals:
-            factor = unit.get(signal, 1.0)
-            signals[signal] = signals[signal] * factor * (1.0 if signal == "abs_tau" else sign)
-            _scale(known.get(signal, {}), factor)
+            signals[signal] = signals[signal] * factor
+        if signal in known:
+            known[signal] = _scaled(known[signal], factor)
     if "current" in signals and "tau" not in signals:
         if controller is None or "kt" not in controller.gains:
             name = column_names("current", meta.joints)[0]
             raise ValueError(f"{path}, column '{name}': {meta.path}: controller.kt: is missing, in Nm/A at the joint")
         signals["tau"] = controller.gains["kt"] * signals.pop("current")
         if "current" in known:
-            known["tau"] = known.pop("current")
-            _scale(known["tau"], controller.gains["kt"])
+            known["tau"] = _scaled(known.pop("current"), controller.gains["kt"])
 
 
-def _scale(facts: dict[str, np.ndarray], factor) -> None:
-    for name in ("noise_sd", "quantum"):
-        if name in facts:
-            facts[name] = facts[name] * factor
+def _scaled(facts: Mapping[str, np.ndarray], factor: np.ndarray | float) -> dict[str, np.ndarray]:
+    """Converts what is known of a signal; noise and rounding have its unit, and no sign."""
+    sized = ("noise_sd", "quantum")
+    return {name: value * np.abs(factor) if name in sized else value for name, value in facts.items()}
 
 
 def _rename(path: Path, columns: dict[str, np.ndarray], meta: Meta) -> dict[str, np.ndarray]:

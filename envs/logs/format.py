@@ -106,6 +106,19 @@ class Run:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Convention:
+    """The units and signs of a log's files, where `meta.yaml` gives any; in memory signals have those of the model."""
+
+    units: Mapping[str, str] = field(default_factory=dict)
+    """As in `meta.yaml`."""
+    sign: Mapping[str, int] = field(default_factory=dict)
+    """As in `meta.yaml`."""
+    factors: Mapping[str, np.ndarray] = field(default_factory=dict, compare=False)
+    """[joints] by signal: factors from the numbers of a file to the model's, which follow from the two; 1 for signals
+    that are not here."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Log:
     """Runs of one robot, as `envs.logs.read` returns them and `envs.logs.write` takes them.
 
@@ -123,8 +136,10 @@ class Log:
     policy: Mapping[str, Any] | None
     """`rate_hz`, `action_scale` and `base` of the policy that was running; None where none was."""
     runs: tuple[Run, ...]
+    convention: Convention = Convention()
+    """In which the log was read, and is written."""
     notes: tuple[str, ...] = ()
-    """Sentences about what was made of the log since it was read; they are not written."""
+    """Sentences about what was made of the log, as it was read and since; they are not written."""
 
 
 def splits(log: Log) -> dict[str, tuple[Run, ...]]:

@@ -22,6 +22,7 @@ from envs.logs.format import (
     SCALAR_SIGNALS,
     SPLITS,
     VECTOR_SIGNALS,
+    Convention,
     column_names,
     is_observation,
 )
@@ -102,14 +103,7 @@ class Meta:
         for joint in self.joints:
             if movable is not None and joint not in movable:
                 raise ValueError(f"{self.path}: joints: '{self.robot}' has no '{joint}'; expected {', '.join(movable)}")
-        self.signs = dict.fromkeys(self.joints, 1.0)
-        for joint, sign in self._mapping("sign", meta.get("sign"), dict.fromkeys(self.joints)).items():
-            self.signs[joint] = float(self._one_of(f"sign.{joint}", sign, (1, -1)))
-        units = self._mapping("units", meta.get("units"), {"angle": False, "torque": False})
-        angle = _ANGLE[self._one_of("units.angle", units.get("angle", "rad"), _ANGLE)]
-        # Positions of slide joints are no angles: they are always in m.
-        self.angle = np.array([1.0 if movable and not movable[joint] else angle for joint in self.joints])
-        self.torque = _TORQUE[self._one_of("units.torque", units.get("torque", "Nm"), _TORQUE)]
+        self.convention = self._read_convention(meta, movable)
         self.known = {"t": None, **dict.fromkeys(self._all_columns())}
         # An observation has as many columns as the log says.
         named = meta["columns"] if isinstance(meta.get("columns"), dict) else {}
@@ -135,6 +129,19 @@ class Meta:
         runs = meta.get("runs")
         names = dict.fromkeys(runs if isinstance(runs, dict) else ())
         self.runs = {name: self._read_run(name, entry) for name, entry in self._mapping("runs", runs, names).items()}
+
+    def _read_convention(self, meta: Mapping[str, Any], movable: Mapping[str, bool] | None) -> Convention:
+        sign = self._mapping("sign", meta.get("sign"), dict.fromkeys(self.joints))
+        signs = np.array([float(self._one_of(f"sign.{joint}", sign.get(joint, 1), (1, -1))) for joint in self.joints])
+        units = self._mapping("units", meta.get("units"), {"angle": False, "torque": False})
+        angle = _ANGLE[self._one_of("units.angle", units.get("angle", "rad"), _ANGLE)]
+        torque = _TORQUE[self._one_of("units.torque", units.get("torque", "Nm"), _TORQUE)]
+        # Positions of slide joints are no angles: they are always in m.
+        angles = np.array([1.0 if movable and not movable[joint] else angle for joint in self.joints])
+        # Actions are not among them: they are the policy's, not the model's.
+        factors = dict.fromkeys(("q", "dq", "target"), angles * signs)
+        factors |= {"tau": torque * signs, "abs_tau": np.full(len(signs), torque), "current": signs}
+        return Convention(units=units, sign=sign, factors=factors)
 
     def _all_columns(self) -> list[str]:
         signals = (*JOINT_SIGNALS, *VECTOR_SIGNALS, *SCALAR_SIGNALS)

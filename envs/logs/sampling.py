@@ -7,9 +7,9 @@ import numpy as np
 
 SENT = ("action", "target", "phase", "obs")
 """Signals that a policy sends in one of its steps (a tick)."""
-COMMANDED = (*SENT, "enabled", "cmd")
-"""Signals of commands, which hold until the next one is sent."""
-HELD = (*COMMANDED, "contact", "quat")
+ON_CHANGE = ("enabled", "cmd", "contact")
+"""Signals that may be sent only when they change."""
+HELD = (*SENT, *ON_CHANGE, "quat")
 """Signals of which the last value counts, because they hold or cannot be interpolated. They are never averaged."""
 
 _FASTER = 1.25  # a signal is averaged if it was recorded at this many times the wanted rate, or faster

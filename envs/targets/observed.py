@@ -1,8 +1,9 @@
 """Makes episodes from logs that hold the policy's own observations: of any robot, without its model.
 
 A row's observation and action belong together. Rows come at the policy's rate, and then each is a tick unless nothing
-changes for long; or they are faster, and then a tick is where observation or action changes. A run begins where the
-motors are switched on. It is cut where ticks are missing, and ends where the motors are switched off, which is a fall.
+changes for long; or they are faster, and then a tick is where observation and action have changed. A run begins where
+the motors are switched on. It is cut where ticks are missing, and ends where the motors are switched off, which is a
+fall.
 """
 
 import jax
@@ -10,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs.logs import Log, Run
-from envs.targets.recorded import HOLE, Recorded, cut, find_ticks
+from envs.targets.recorded import HOLE, Recorded, cut, find_ticks, holes
 from jaxtune.types import Trajectory
 
 
@@ -73,7 +74,7 @@ def _pieces(run: Run, control_s: float) -> list[tuple[dict, int]]:
     time = run.time[rows]
     reward = run.other.get("reward", np.full(len(run.time), np.nan))
     pieces = []
-    for part in np.split(np.arange(len(rows)), 1 + np.flatnonzero(np.diff(time) > HOLE * control_s)):
+    for part in np.split(np.arange(len(rows)), 1 + np.flatnonzero(holes(time, control_s))):
         if len(part) < 2:
             continue  # a row of a policy that stands still, before or after its walk
         at = rows[part]
@@ -96,8 +97,14 @@ def _ticks(run: Run, control_s: float, begin: int) -> np.ndarray:
     """Finds the rows at which the policy acts, from the row `begin` on."""
     # An action may stay at its limit for long, but an observation does not stay the same to the last bit.
     sent = np.concatenate([run.signals["obs"], run.signals["action"]], axis=1)
-    rows, _ = find_ticks(run.name, run.time, sent, control_s, "observation or action")
+    size = run.signals["obs"].shape[1]
+    rows, _ = find_ticks(run.name, run.time, sent, control_s, "observation or action", size)
     rows = rows[rows >= begin]
-    # The first row shows what the policy observed first, whenever that was, unless it had not begun yet.
-    first = len(rows) > 0 and run.time[rows[0]] - run.time[begin] < HOLE * control_s
+    # The first row shows what the policy observed first, whenever that was, unless it had not begun yet, or the action
+    # that answers this observation comes in a later row.
+    first = (
+        len(rows) > 0
+        and run.time[rows[0]] - run.time[begin] < HOLE * control_s
+        and (run.signals["obs"][rows[0]] != run.signals["obs"][begin]).any()
+    )
     return np.union1d(begin, rows) if first else rows

@@ -112,6 +112,7 @@ def read_logs(
     runs = first.runs
     if len(logs) > 1:
         runs = tuple(_numbered(run, number) for number, log in enumerate(logs) for run in log.runs)
+    notes += tuple(note for log in logs for note in log.notes)
     log = split_in_time(replace(first, runs=runs, notes=notes))
     return with_halves_swapped(log) if swap_halves else log, spec
 

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from functools import cache
 
+import mujoco
 import numpy as np
 import pytest
 
@@ -181,6 +182,87 @@ def test_a_log_in_pieces_is_named():
     again = rows(run, np.repeat(np.arange(len(run.time)), 2))
     again = replace(again, time=0.002 * np.arange(len(again.time)))
     assert {"duplicated rows", "in pieces"} == {kind for kind, _ in said(again)}
+
+
+@pytest.mark.parametrize("names", [("q", "dq", "target"), ("q", "dq"), ("target",)])
+@pytest.mark.parametrize("joint", [0, 1])
+def test_one_joint_in_degrees_is_named(names, joint):
+    run = undamaged(0)
+    factor = np.where(np.arange(2) == joint, 180.0 / np.pi, 1.0)
+    damaged = replace(run, signals=run.signals | {name: run.signals[name] * factor for name in names})
+    (one,) = diagnose(damaged, JOINTS, MODEL)
+    assert (one.kind, one.joints, one.wrong) == ("degrees", (JOINTS[joint],), True)
+    assert f"{JOINTS[joint]} alone is in degrees; multiply its columns by pi / 180" in one.sentence
+
+
+CRANE = """<mujoco>
+  <worldbody>
+    <body>
+      <joint name="shoulder" axis="0 1 0" range="-1.6 1.6" limited="true" armature="0.02" damping="0.2"/>
+      <geom type="capsule" fromto="0 0 0 0 0 -0.3" size="0.03" mass="1"/>
+      <body pos="0 0 -0.3">
+        <joint name="elbow" type="slide" axis="0 0 -1" range="-0.1 0.2" limited="true" damping="4"/>
+        <geom size="0.04" mass="0.8"/>
+      </body>
+    </body>
+  </worldbody>
+</mujoco>"""
+
+
+@pytest.mark.parametrize(
+    ("factors", "kind", "named"), [((1.0, 1e3), "millimetres", ("elbow",)), ((180.0 / np.pi, 1.0), "degrees", ())]
+)
+def test_a_slide_has_units_of_its_own(factors, kind, named):
+    spec = mujoco.MjSpec.from_string(CRANE)
+    gains = {"kp": np.array([40.0, 400.0]), "kd": np.array([2.0, 20.0]), "torque_limit_nm": np.array([15.0, 60.0])}
+    controller = Controller(kind="pd", rate_hz=1000.0, gains=gains)
+    motion = excitation(spec, JOINTS, 4, 3.0, 500.0, 0)[:1]
+    run = record(spec, JOINTS, motion, controller, Truth(None), 0.1, 0).runs[0]
+    wrong = lambda run: [one for one in diagnose(run, JOINTS, suspended(spec)) if one.wrong]  # noqa: E731
+    assert wrong(run) == []
+    run = replace(run, signals=run.signals | {name: run.signals[name] * factors for name in ("q", "dq", "target")})
+    (one,) = wrong(run)
+    assert (one.kind, one.signal, one.joints) == (kind, "all", named)
+
+
+def late_row(run, at, periods):
+    """The run with one row that was read late, at the time of its stamp."""
+    time = run.time.copy()
+    time[at] += (periods - 1.0) * np.median(np.diff(time))
+    read = {name: values.copy() for name, values in run.signals.items()}
+    for name in ("q", "dq"):
+        for joint in range(2):
+            read[name][at, joint] = np.interp(time[at], run.time, run.signals[name][:, joint])
+    return replace(run, time=time, signals=read)
+
+
+@pytest.mark.parametrize("periods", [1.3, 1.65, 1.9])
+@pytest.mark.parametrize("at", [10, 700, 1490])
+def test_a_row_that_is_read_late_is_no_clock_jump(periods, at):
+    assert said(late_row(undamaged(0), at, periods)) == set()
+
+
+def test_short_gaps_are_said_and_do_not_mislead():
+    run = undamaged(0)
+    keep = np.setdiff1d(np.arange(len(run.time)), [300, 700, 701])
+    (one,) = diagnose(rows(run, keep), JOINTS, MODEL)
+    assert (one.kind, one.size, one.misleading) == ("short gaps", 2.0, False)
+    assert "2 of up to 0.006 s, where 0.002 s from row to row are usual, the first after row 300" in one.sentence
+    # Every fortieth row is more than chance.
+    many = np.setdiff1d(np.arange(len(run.time)), np.arange(30, 1400, 40))
+    assert "missing rows" in {kind for kind, _ in said(rows(run, many))}
+
+
+def test_a_short_piece_at_a_high_rate_is_tried_for_short_delays_alone():
+    """100 rows at 4 kHz last for 25 ms, less than the longest delay that is tried."""
+    run = undamaged(0)
+    time = np.arange(120) / 4000.0
+    fine = {
+        name: np.stack([np.interp(time, run.time - 0.5, v) for v in values.T], axis=1)
+        for name, values in run.signals.items()
+        if values.ndim == 2
+    }
+    diagnose(replace(run, time=time, signals=fine), JOINTS, MODEL)
 
 
 def test_sizes_are_what_was_done():

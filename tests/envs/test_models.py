@@ -100,6 +100,33 @@ def test_one_file_moves_as_many_did(robot, tmp_path, compiler):
     np.testing.assert_allclose(*found, atol=1e-4)
 
 
+def test_contact_pairs_and_sensors_of_meshes_go_with_them(robot, tmp_path):
+    path = robot()
+    text = path.read_text().replace('<geom type="mesh" mesh="box"/>', '<geom name="shell" type="mesh" mesh="box"/>')
+    text = text.replace('<geom size="0.03"/>', '<geom name="ball" size="0.03"/><geom name="second" size="0.02"/>')
+    more = """
+      <contact>
+        <pair geom1="shell" geom2="ball"/>
+        <pair geom1="second" geom2="ball"/>
+        <exclude body1="thigh" body2="leg"/>
+      </contact>
+      <sensor>
+        <framepos objtype="geom" objname="shell"/>
+        <framepos objtype="geom" objname="ball" reftype="geom" refname="shell"/>
+        <framepos objtype="geom" objname="ball"/>
+        <distance geom1="ball" geom2="shell" cutoff="1"/>
+        <jointpos joint="hip"/>
+      </sensor>
+    </mujoco>"""
+    path.write_text(text.replace("</mujoco>", more))
+    mujoco.MjModel.from_xml_path(str(path))
+    spec = models.spec(str(path))
+    model = spec.compile()
+    assert (model.nmesh, model.npair, model.nexclude, model.nsensor) == (0, 1, 1, 2)
+    (tmp_path / "saved.xml").write_text(spec.to_xml())
+    assert mujoco.MjModel.from_xml_path(str(tmp_path / "saved.xml")).npair == 1
+
+
 ARM = """<mujoco>
   <compiler {compiler}/>
   <option {option}><flag {flag}/></option>

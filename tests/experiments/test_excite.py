@@ -5,7 +5,9 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
+import pyarrow.csv
 import pytest
+import yaml
 
 from envs import models
 from envs.logs import Controller, read, write
@@ -122,6 +124,28 @@ def test_targets_for_the_robot_of_a_log_have_its_model_joints_and_controller(tmp
     assert following.runs[0].controller.rate_hz == 500.0
     np.testing.assert_allclose(following.runs[0].controller.gains["kp"], 33.0)
     assert (tmp_path / "next" / "arm.xml").read_text() == ARM.read_text()
+
+
+def test_targets_for_the_robot_of_a_log_have_its_units_and_signs(tmp_path):
+    """A robot plays numbers: an elbow that its log counts backwards must not get mirrored ones."""
+    options = {"motion": "chirp", "seconds": 2.0}
+    excite.main(excite.Args(out=tmp_path / "plain", robot=str(ARM), **options))
+    log = read(tmp_path / "plain", measured=False)
+    runs = [replace(run, signals={"q": run.signals["target"], **run.signals}) for run in log.runs]
+    write(replace(log, runs=tuple(runs)), tmp_path / "measured")
+    said = {"units": {"angle": "deg"}, "sign": {"elbow": -1}}
+    meta = yaml.safe_load((tmp_path / "measured" / "meta.yaml").read_text())
+    (tmp_path / "measured" / "meta.yaml").write_text(yaml.safe_dump(meta | said))
+    excite.main(excite.Args(out=tmp_path / "next", like=tmp_path / "measured", **options))
+    written = yaml.safe_load((tmp_path / "next" / "meta.yaml").read_text())
+    assert {key: written[key] for key in said} == said
+    # Targets of the same motion, once in the model's convention and once in the log's.
+    names = [f"target.{joint}" for joint in JOINTS]
+    plain, own = (pyarrow.csv.read_csv(tmp_path / name / "run_000.csv") for name in ("plain", "next"))
+    for name, factor in zip(names, (180 / np.pi, -180 / np.pi), strict=True):
+        np.testing.assert_allclose(own[name], factor * plain[name].to_numpy(), atol=1e-9)
+    again = read(tmp_path / "next", measured=False)
+    np.testing.assert_allclose(again.runs[0].signals["target"], log.runs[0].signals["target"], atol=1e-9)
 
 
 @pytest.mark.parametrize("compiler", ["", 'inertiafromgeom="true"'])

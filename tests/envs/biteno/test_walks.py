@@ -172,6 +172,15 @@ def test_a_hole_ends_an_episode_without_a_fall(simulated):
     assert not found.fell.any()
 
 
+def test_rows_that_are_late_end_no_episode(simulated):
+    _, log = simulated
+    stays = log.runs[0]
+    time = stays.time.copy()
+    time[20:140:20] += 0.006
+    found = walks.episodes(replace(log, runs=(replace(stays, time=time),)), STEPS).trajectory
+    np.testing.assert_array_equal(found.alive.sum(axis=1), [len(time) - 2])
+
+
 def test_a_robot_that_gets_up_starts_another_episode(simulated):
     _, log = simulated
     stays = log.runs[0]

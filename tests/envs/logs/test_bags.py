@@ -141,6 +141,87 @@ def test_what_comes_after_the_last_action_is_heard(tmp_path):
     np.testing.assert_array_equal(run.signals["cmd"], np.tile([0.3, 0.1, -0.2], (len(ticks), 1)))
 
 
+def with_topic(folder, messages, columns, **meta):
+    """Writes a bag with more columns than those of `recording`."""
+    write(folder, "mcap", sorted(messages, key=lambda message: message[3]))
+    (folder / "meta.yaml").write_text(yaml.safe_dump(META | {"columns": COLUMNS | columns} | meta))
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("columns", "values"),
+    [
+        ({"enabled": "/flags.data[0]"}, {"enabled": np.ones(44)}),
+        (
+            {"contact.left": "/flags.data[0]", "contact.right": "/flags.data[1]"},
+            {"contact": np.tile([1.0, 0.0], (44, 1))},
+        ),
+        ({f"cmd.{name}": f"/flags.data[{i}]" for i, name in enumerate(("x", "y", "yaw"))}, {"cmd": None}),
+    ],
+    ids=["enabled", "contact", "cmd"],
+)
+def test_what_is_sent_on_change_costs_no_row(tmp_path, columns, values):
+    """One message at the end of the run: before it, its value is taken."""
+    messages = [*recording(), ("/flags", "std_msgs/msg/Float64MultiArray", (1.0, 0.0, 0.5), 0.47)]
+    log = logs.read(with_topic(tmp_path / "log", messages, columns))
+    (run,) = log.runs
+    np.testing.assert_allclose(run.time, 0.01 * np.arange(44), atol=1e-9)
+    ((signal, expected),) = values.items()
+    expected = np.tile([1.0, 0.0, 0.5], (44, 1)) if expected is None else expected
+    np.testing.assert_array_equal(run.signals[signal], expected)
+    assert log.notes == ()
+
+
+def test_what_a_topic_costs_at_the_ends_is_noted(tmp_path):
+    # Of the policy's rows, 0.05 to 0.49 s, the IMU lacks three at the beginning and two at the end.
+    messages = [m for m in recording() if m[0] != "/imu" or 0.065 < m[3] < 0.48]
+    log = logs.read(write(tmp_path / "log", "mcap", messages))
+    assert len(log.runs[0].time) == 45 - 5
+    assert log.notes == (
+        "run_000: 0.025 s at the beginning were dropped, in which topic '/imu' has no message",
+        "run_000: 0.015 s at the end were dropped, in which topic '/imu' has no message",
+    )
+
+
+def test_a_time_before_a_policy_is_noted_but_no_loss(tmp_path):
+    columns = {ours: theirs for ours, theirs in COLUMNS.items() if not ours.startswith("action")}
+    messages = [m for m in recording() if m[0] != "/policy" or m[3] > 0.195]
+    folder = write(tmp_path / "log", "mcap", messages)
+    (folder / "meta.yaml").write_text(yaml.safe_dump(META | {"columns": columns, "rate_hz": 1000}))
+    log = logs.read(folder)
+    assert log.notes[0] == "run_000: 0.2 s at the beginning were dropped, in which topic '/policy' has no message"
+    assert len(log.runs[0].time) == 288
+
+
+@pytest.mark.parametrize(("lacks", "where"), [((0.3, 0.6), "end"), ((0.0, 0.2), "beginning")])
+def test_a_topic_that_costs_more_than_a_tenth_is_named(tmp_path, lacks, where):
+    messages = [m for m in recording() if m[0] != "/imu" or not lacks[0] <= m[3] < lacks[1]]
+    lost = {"end": r"0\.203", "beginning": r"0\.15"}[where]  # from 0.2875 s, and to 0.2 s
+    named = rf"topic '/imu': got no message in {lost} s at the {where} of 0\.44 s, expected messages in 90%"
+    with pytest.raises(ValueError, match=named):
+        logs.read(write(tmp_path / "log", "mcap", messages))
+
+
+def test_observations_and_actions_alone_are_a_log(tmp_path):
+    folder = write(tmp_path / "log", "mcap", [m for m in recording() if m[0] == "/policy"])
+    columns = {f"action.{name}": f"/policy.data[{i}]" for i, name in enumerate(JOINTS)} | {"obs.0": "/policy.data[2]"}
+    (folder / "meta.yaml").write_text(yaml.safe_dump(META | {"columns": columns}))
+    (run,) = logs.read_observed(folder).runs
+    np.testing.assert_array_equal(run.signals["obs"][:, 0], np.arange(15, 60))
+
+
+def test_the_name_of_a_joint_may_be_a_number(tmp_path):
+    renamed = {"left_hip": "2", "left_knee": "1"}
+    messages = [
+        (topic, name, ([renamed[one] for one in fields[0]], fields[1]) if topic == "/joint_states" else fields, stamp)
+        for topic, name, fields, stamp in recording()
+    ]
+    columns = {f"q.{joint}": f"/joint_states.position[{number}]" for joint, number in renamed.items()}
+    (run,) = logs.read(with_topic(tmp_path / "log", messages, columns)).runs
+    ticks = np.arange(5, 49)
+    np.testing.assert_allclose(run.signals["q"], 0.01 * ticks[:, None] * [1, -2], atol=1e-9)
+
+
 @pytest.mark.parametrize("late_s", [-0.002, 0.00005, 0.004])
 def test_what_a_policy_says_on_two_topics_is_of_one_tick(tmp_path, late_s):
     messages = recording()

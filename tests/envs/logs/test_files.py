@@ -232,11 +232,44 @@ def test_a_run_that_is_a_link_out_of_the_folder_is_refused_unread(tmp_path):
     assert "hunter2" not in str(refused.value)
 
 
+def test_a_log_is_written_in_its_own_units_and_signs(tmp_path):
+    meta = {"units": {"angle": "deg", "torque": "mNm"}, "sign": {"left_knee": -1}}
+    facts = {"q": {"quantum": 0.5}, "tau": {"noise_sd": 3.0}}
+    log = logs.read(put(tmp_path / "log", meta=meta | {"signals": facts}))
+    logs.write(log, tmp_path / "again", ".npz")
+    written = yaml.safe_load((tmp_path / "again" / "meta.yaml").read_text())
+    assert {key: written[key] for key in meta} == meta
+    # Noise and steps have the files' units, and no sign.
+    assert written["signals"]["q.left_knee"]["quantum"] == pytest.approx(0.5)
+    assert written["signals"]["tau.left_knee"]["noise_sd"] == pytest.approx(3.0)
+    with np.load(tmp_path / "again" / "run_000.npz") as found:
+        for name, values in columns().items():
+            np.testing.assert_allclose(found[name], values, rtol=1e-12, err_msg=name)
+    (one,), (other,) = log.runs, logs.read(tmp_path / "again").runs
+    for signal, values in one.signals.items():
+        np.testing.assert_allclose(other.signals[signal], values, rtol=1e-12)
+        for fact in ("quantum", "noise_sd"):
+            np.testing.assert_allclose(other.fact(signal, fact), one.fact(signal, fact), rtol=1e-12)
+
+
 @pytest.mark.parametrize("suffix", [".csv", ".npz", ".parquet"])
 def test_a_small_file_that_fills_the_memory_is_refused(tmp_path, monkeypatch, suffix):
     folder = put(tmp_path / "log", name=f"run_001{suffix}")
     monkeypatch.setattr(containment, "LARGEST_BYTES", 100)
     with pytest.raises(ValueError, match=rf"run_001{suffix}: got .* GiB unpacked, expected at most"):
+        logs.read(folder)
+
+
+def test_a_csv_counts_by_its_cells(tmp_path, monkeypatch):
+    """Its numbers have many digits, so it is smaller in memory than as a text."""
+    table = {"t": 0.01 * np.arange(100)} | {f"{name}.left_hip": np.arange(100) / 3 for name in ("q", "target")}
+    folder = put(tmp_path / "log", table, {"joints": ["left_hip"], "controller": META["controller"] | {"kd": 2.0}})
+    cells = 8 * 3 * 101  # with the header's
+    assert (folder / "run_000.csv").stat().st_size > cells
+    monkeypatch.setattr(containment, "LARGEST_BYTES", cells)
+    assert len(logs.read(folder).runs[0].time) == 100
+    monkeypatch.setattr(containment, "LARGEST_BYTES", cells - 1)
+    with pytest.raises(ValueError, match=r"run_000.csv: got .* GiB unpacked, expected at most"):
         logs.read(folder)
 
 

@@ -67,6 +67,62 @@ def test_faster_rows_are_taken_where_the_action_changes(tmp_path):
     np.testing.assert_allclose(found.obs[0, :, 0], 0.1 * np.arange(20), rtol=1e-5, atol=1e-6)
 
 
+def lagging(count, lag, per_tick=10):
+    """Rows at 500 Hz in which the action of a step comes `lag` [steps] rows after its observation."""
+    columns = rows(count * per_tick, per_tick=per_tick)
+    step = np.arange(count * per_tick) // per_tick
+    answered = step - (np.arange(count * per_tick) % per_tick < lag[step])
+    return columns | {"action.a": np.sin(answered + 0.5), "action.b": np.cos(answered + 0.5)}
+
+
+@pytest.mark.parametrize("lag", [1, 3, 5, "1 to 5"])
+def test_an_action_that_is_logged_after_its_observation_is_of_the_same_step(tmp_path, lag):
+    lags = np.random.default_rng(0).integers(1, 6, 60) if lag == "1 to 5" else np.full(60, lag)
+    found = episodes(folder(tmp_path / "log", lagging(60, lags), rate_hz=500), steps=60)
+    np.testing.assert_array_equal(found.begin, [0])
+    assert found.trajectory.alive.all()
+    np.testing.assert_allclose(found.trajectory.obs[0, :, 0], 0.1 * np.arange(60), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(found.trajectory.action[0, :, 0], np.sin(np.arange(60) + 0.5), rtol=1e-5)
+
+
+def test_a_policy_that_is_twice_as_fast_is_refused(tmp_path):
+    columns = rows(300, per_tick=5) | {"t": np.arange(300) * PERIOD / 10}
+    with pytest.raises(ValueError, match=r"observation or action changes every 0\.01 s, expected every 0\.02 s"):
+        episodes(folder(tmp_path / "log", columns, rate_hz=500))
+
+
+def test_steps_of_all_lengths_are_refused(tmp_path):
+    """Their median is the period, but a third of them are half as long and a third half as long again."""
+    step = np.repeat(np.arange(60), np.tile([5, 10, 15], 20))
+    columns = {"t": 0.002 * np.arange(len(step))} | {f"obs.{i}": 10.0 * i + 0.1 * step for i in range(3)}
+    columns |= {"action.a": np.sin(step), "action.b": np.cos(step)}
+    named = r"run_000: observation or action changes at multiples of 0\.02 s in 3\d% of the steps, expected in 90%"
+    with pytest.raises(ValueError, match=named):
+        episodes(folder(tmp_path / "log", columns, rate_hz=500))
+
+
+@pytest.mark.parametrize("per_tick", [1, 10])
+def test_a_row_that_is_late_is_no_hole(tmp_path, per_tick):
+    columns = rows(500 * per_tick, per_tick=per_tick)
+    for tick in range(60, 420, 60):
+        if per_tick == 1:
+            columns["t"][tick] += 0.6 * PERIOD
+        else:
+            late = slice(tick * per_tick, tick * per_tick + 6)
+            for name in columns.keys() - {"t"}:
+                columns[name][late] = columns[name][tick * per_tick - 1]
+    found = episodes(folder(tmp_path / "log", columns, rate_hz=50 * per_tick), steps=500)
+    np.testing.assert_array_equal(found.begin, [0])
+    assert found.trajectory.alive.all()
+    np.testing.assert_allclose(found.trajectory.obs[0, :, 0], 0.1 * np.arange(500), rtol=1e-5, atol=1e-6)
+
+
+def test_one_missing_row_is_a_hole(tmp_path):
+    columns = {name: np.delete(values, 8) for name, values in rows(30).items()}
+    found = episodes(folder(tmp_path / "log", columns), steps=30)
+    np.testing.assert_array_equal(found.begin, [0, 9])
+
+
 @pytest.mark.parametrize("per_tick", [1, 5])
 def test_an_action_at_its_limit_leaves_no_hole(tmp_path, per_tick):
     columns = rows(60 * per_tick, per_tick=per_tick)
