@@ -75,12 +75,14 @@ def set_up_compiler(xla_flags: str, most: int = 8) -> None:
 
 def _drop_torn_programs(kept: Path) -> None:
     """Deletes compiled programs that a killed process left unfinished: JAX would neither read nor replace them."""
-    latest = sorted(kept.glob("*-cache"), key=lambda file: file.stat().st_mtime)[-_LATEST:]
-    for file in latest:
-        try:
-            compilation_cache.decompress_executable(file.read_bytes())
-        except Exception:  # of whichever library has compressed it
-            file.unlink(missing_ok=True)
+    # Others may use the same folder, delete what is found here, or be its owner.
+    with contextlib.suppress(OSError):
+        for file in sorted(kept.glob("*-cache"), key=lambda file: file.stat().st_mtime)[-_LATEST:]:
+            stored = file.read_bytes()
+            try:
+                compilation_cache.decompress_executable(stored)
+            except Exception:  # of whichever library has compressed it
+                file.unlink(missing_ok=True)
 
 
 def cores() -> int:

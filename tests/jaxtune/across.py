@@ -1,4 +1,4 @@
-"""What one, two and four devices compute by the functions that are named, as JSON.
+"""What one, two and four devices compute by the functions that are named, as JSON; some on one and four alone.
 
 It is a process of its own, since devices are made once.
 """
@@ -87,10 +87,13 @@ def pairs():
     return simulation.residuals(asked, np.eye(asked.axes)[:3] * 0.1, asked.data["train"][asked.main_horizon])
 
 
+# They share by the same two functions as episodes do.
+SHARED = {"lanes": (4,), "pairs": (4,)}
+
 found = {}
 for function in (globals()[name] for name in sys.argv[1:]):
     found[function.__name__] = [np.asarray(function(), float).ravel().tolist()]
-    for count in (2, 4):
+    for count in SHARED.get(function.__name__, (2, 4)):
         with jax.set_mesh(devices.mesh(count)):
             found[function.__name__].append(np.asarray(function(), float).ravel().tolist())
 print(json.dumps(found))

@@ -15,7 +15,7 @@ PATH = os.pathsep.join(map(str, (TESTS.parent, TESTS, TESTS / "jaxtune" / "disco
 
 
 def across(*functions):
-    """What `across.py` computes: by function, numbers without a mesh, on two devices and on four."""
+    """What `across.py` computes: by function, numbers without a mesh, and on several devices."""
     done = subprocess.run(
         [sys.executable, "-W", "ignore", str(Path(__file__).with_name("across.py")), *functions],
         env={**os.environ, "PYTHONPATH": PATH},
@@ -45,7 +45,7 @@ def test_the_number_of_devices_changes_no_tuning():
 
 def check_alike(found, rounding):
     alone, *shared = np.array(found, float)
-    assert len(shared) == 2
+    assert shared
     assert np.isfinite(alone).any() and np.ptp(alone[np.isfinite(alone)]) > 0
     for numbers in shared:
         np.testing.assert_allclose(numbers, alone, rtol=rounding, atol=rounding)
