@@ -33,7 +33,7 @@ from envs.logs.sampling import HELD, ON_CHANGE, SENT, held, sampled
 SUFFIXES = (".bag", ".mcap", ".db3")
 """Suffixes of bags that are files; a folder with a `metadata.yaml` is a bag as well."""
 
-_PLACE = re.compile(r"(?P<topic>/[^.\[\]\s]+)\.(?P<field>\w+(?:\.\w+)*)(?:\[(?P<index>[^\[\]]+)\])?")
+_PLACE = re.compile(r"(?P<topic>/[^.\[\]\s]+)\.(?P<field>\w+(?:(?:\[\d+\])?\.\w+)*)(?:\[(?P<index>[^\[\]]+)\])?")
 _MESSAGE_BYTES = 512  # that the values of a message take until all are read
 _HOLE = 3.5  # periods of a topic without a message that count as a hole
 _NOTED, _MOST_LOST = 0.01, 0.1  # shares of a run's time at its ends
@@ -47,16 +47,16 @@ def is_bag(path: Path) -> bool:
 
 @dataclass(frozen=True)
 class _Place:
-    """Where a column is found in a bag: topic, field of the message, and index in the field."""
+    """Where a column is found in a bag: topic, names and indices on the way to a field, and index in the field."""
 
     topic: str
-    fields: tuple[str, ...]
+    way: tuple[str | int, ...]
     index: str | None
 
     def __call__(self, message: Any) -> float:
         value = message
-        for name in self.fields:
-            value = getattr(value, name)
+        for step in self.way:
+            value = value[step] if isinstance(step, int) else getattr(value, step)
         if self.index is None:
             return float(value)
         names = getattr(message, "name", None)
@@ -103,10 +103,12 @@ def read_bag(path: Path, columns: Mapping[str, str]) -> tuple[dict[str, np.ndarr
         match = _PLACE.fullmatch(theirs)
         if ours == "t" or not match:
             raise ValueError(
-                f"{path}: columns.{ours}: got '{theirs}', expected /topic.field, /topic.field[3] or /topic.field[name] "
+                f"{path}: columns.{ours}: got '{theirs}', expected /topic.field, /topic.field[3], "
+                "/topic.field[name] or /topic.field[3].field "
                 "of something other than the time, which comes with the messages"
             )
-        places[ours] = _Place(match["topic"], tuple(match["field"].split(".")), match["index"])
+        way = tuple(int(part) if part.isdecimal() else part for part in re.findall(r"\w+", match["field"]))
+        places[ours] = _Place(match["topic"], way, match["index"])
     # Actions first, so that rows are the policy's own steps.
     of_rows = [ours for first in ("action.", "q.") for ours in places if ours.startswith(first)]
     if not of_rows:
@@ -233,7 +235,8 @@ def _read(message: Any, recorded: int, topic: str, number: int, places: Mapping[
             try:
                 values.append(place(message))
             except (AttributeError, IndexError, TypeError, ValueError) as error:
-                field = ".".join(place.fields) + (f"[{place.index}]" if place.index else "")
+                field = "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in place.way)[1:]
+                field += f"[{place.index}]" if place.index else ""
                 raise ValueError(f"topic '{topic}', message {number}, '{field}': {error}") from error
     return stamp.sec * 10**9 + stamp.nanosec if stamp else 0, recorded, values
 

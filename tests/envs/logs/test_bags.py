@@ -82,6 +82,11 @@ def as_message(store, name, fields, stamp, one):
             linear_acceleration=vector(fields),
             linear_acceleration_covariance=none,
         )
+    if name == "geometry_msgs/msg/PoseArray":
+        point = lambda values: types["geometry_msgs/msg/Point"](**dict(zip("xyz", map(float, values), strict=True)))  # noqa: E731
+        turned = types["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0)
+        poses = [types["geometry_msgs/msg/Pose"](position=point(values), orientation=turned) for values in fields]
+        return types[name](header=header, poses=poses)
     layout = types["std_msgs/msg/MultiArrayLayout"](dim=[], data_offset=0)
     return types[name](layout=layout, data=np.array(fields, float))
 
@@ -114,6 +119,19 @@ def test_topics_meet_on_the_policys_clock(tmp_path, kind):
     # Positions and rates grow along a line, which neither the mean over 10 ms nor the line between two rows changes.
     np.testing.assert_allclose(run.signals["q"], 0.01 * ticks[:, None] * [1, -2], atol=1e-9)
     np.testing.assert_allclose(run.signals["gyro"], 0.01 * ticks[:, None] * [1, 2, 3], atol=1e-9)
+
+
+def test_fields_of_messages_in_an_array_are_found(tmp_path):
+    stamps = 0.0125 * np.arange(40)
+    feet = [("/feet", "geometry_msgs/msg/PoseArray", ((9, 9, 9), (s, 2 * s, 3 * s)), s) for s in stamps]
+    places = {f"gyro.{axis}": f"/feet.poses[1].position.{axis}" for axis in "xyz"}
+    (run,) = logs.read(with_topic(tmp_path / "log", [*recording(), *feet], places)).runs
+    np.testing.assert_allclose(run.signals["gyro"], 0.01 * np.arange(5, 49)[:, None] * [1, 2, 3], atol=1e-9)
+    absent = places | {"gyro.x": "/feet.poses[2].position.x"}
+    with pytest.raises(
+        ValueError, match=r"topic '/feet', message 1, 'poses\[2\]\.position\.x': list index out of range"
+    ):
+        logs.read(with_topic(tmp_path / "other", [*recording(), *feet], absent))
 
 
 def test_a_hole_of_a_measured_topic_is_a_hole_in_time(tmp_path):
