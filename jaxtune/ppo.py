@@ -206,7 +206,7 @@ class PPO:
         env_state, data, env_metrics = self.collect(keys, state, env, env_state)
         data = devices.gather(data)
         # As in Brax's own training, the loss already reads observations with the updated statistics.
-        normalizer = _bounded(running_statistics.update(state.normalizer, data.observation))
+        normalizer = _with_constants_unscaled(running_statistics.update(state.normalizer, data.observation))
         normalizer = optax.tree.where(_finite(normalizer), normalizer, state.normalizer)
         (params, opt_state), learned = jax.lax.scan(
             lambda carry, key: self._pass(key, carry, normalizer, data),
@@ -300,7 +300,9 @@ class PPO:
         return jnp.where(kl > 2 * target, slower, jnp.where((kl < target / 2) & (kl > 0), faster, learning_rate))
 
 
-def _bounded(normalizer: running_statistics.RunningStatisticsState) -> running_statistics.RunningStatisticsState:
+def _with_constants_unscaled(
+    normalizer: running_statistics.RunningStatisticsState,
+) -> running_statistics.RunningStatisticsState:
     """Leaves observations unscaled that did not change in training.
 
     Brax divides them by 1e-6, so one that is a little different on the robot would drown all others.

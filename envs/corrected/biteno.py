@@ -35,7 +35,7 @@ class CorrectedBiteno(Biteno):
 
     def __init__(self, config: TaskConfig, entries: Mapping[str, parameters.Entry], correction: Correction):
         spec = mujoco.MjSpec.from_file(str(correction.path))
-        if {joint.name for joint in spec.joints} < set(constants.JOINTS) or not spec.key("home"):
+        if not {*constants.JOINTS} <= {joint.name for joint in spec.joints} or not spec.key("home"):
             raise ValueError(f"model: {correction.path} lacks joints of BITeno's or its keyframe home, expected BITeno")
         self._rows = correction.rows
         super().__init__(config, entries, correction.path)

@@ -76,7 +76,7 @@ def join(args: HostArgs) -> None:
     each = Counter(device.process_index for device in jax.devices())
     if len(set(each.values())) > 1:
         raise ValueError(
-            f"hosts: got {', '.join(str(each[host]) for host in sorted(each))} devices, expected as many on each host; "
+            f"hosts: got {' and '.join(str(each[host]) for host in sorted(each))} devices, expected as many on each; "
             "on CPUs XLA_FLAGS=--xla_force_host_platform_device_count=N says how many"
         )
     console.quiet = args.host > 0

@@ -138,7 +138,11 @@ def test_an_unknown_effect_or_place_is_refused_by_name(tmp_path):
         corrected.read(tmp_path / "nowhere")
 
 
-def test_a_model_of_another_robot_is_refused():
-    arm = constants.MODEL_PATH.parents[2] / "experiments" / "arm.xml"
-    with pytest.raises(ValueError, match=r"model: .*arm\.xml lacks joints of BITeno's or its keyframe home"):
-        CorrectedBiteno(TaskConfig(), ENTRIES, Correction(arm, {}))
+@pytest.mark.parametrize(("old", "new"), [('"left_knee"', '"third_knee"'), ('"home"', '"start"')])
+def test_a_model_of_another_robot_is_refused(tmp_path, old, new):
+    text = constants.MODEL_PATH.read_text()
+    assert old in text
+    path = tmp_path / "model.xml"
+    path.write_text(text.replace(old, new))
+    with pytest.raises(ValueError, match=r"model: .*model\.xml lacks joints of BITeno's or its keyframe home"):
+        CorrectedBiteno(TaskConfig(), ENTRIES, Correction(path, {}))
