@@ -13,6 +13,7 @@ from envs.smoothing import smoothed
 
 _MOST = 2.0  # disagreement of two signals that have opposite signs
 _ROWS = 250  # at which inverse dynamics are evaluated, at most
+_STOP = 0.02  # of a joint's range at either end, where a mechanical stop may carry any torque
 
 
 class Disagreement:
@@ -24,7 +25,7 @@ class Disagreement:
         torque     tau against the controller's torque
         target     target against q, weighted by half because joints lag behind
         range      share of rows outside the joint's range, times 2
-        dynamics   the controller's (or the measured) torque against the model's inverse dynamics
+        dynamics   the controller's (or the measured) torque against the model's inverse dynamics, away from stops
 
     Make it once for a run and call it with every repaired version of it.
 
@@ -91,8 +92,9 @@ class Disagreement:
         given = commanded if commanded is not None else run.signals.get("tau")
         if self.dynamics and given is not None:
             needed, rows = self.needed(run)
+            free = self.free(run)[rows]
             # Averaged like the accelerations behind `needed`, so that both are equally smooth.
-            found["dynamics"] = _together(given)[rows], needed
+            found["dynamics"] = free * _together(given)[rows], free * needed
         return found
 
     def motion(self, run: Run) -> tuple[np.ndarray, np.ndarray]:
@@ -120,6 +122,16 @@ class Disagreement:
             return None
         speed = run.signals["dq"] if "dq" in run.signals else self.motion(run)[1]
         return run.impedance().torque(run.signals["target"], run.signals["q"], speed)
+
+    def free(self, run: Run) -> np.ndarray:
+        """Tells where a joint is away from the ends of its range, so that no stop carries its torque.
+
+        Returns:
+          [rows, joints]; False also a few rows before and after, since `needed` is smoothed.
+        """
+        position, (low, high) = self.motion(run)[0], self._range
+        ends = _STOP * np.where(np.isfinite(high - low), high - low, 0.0)
+        return _together((low + ends < position) & (position < high - ends)) > 0.99
 
     def needed(self, run: Run) -> tuple[np.ndarray, np.ndarray]:
         """Computes the torque that the model needs for the measured motion, by MuJoCo's inverse dynamics.

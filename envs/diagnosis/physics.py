@@ -185,8 +185,8 @@ def _offsets(run: Run, disagreement: Disagreement) -> list[_Repair]:
     if commanded is None or not disagreement.dynamics:
         return []
     needed, rows = disagreement.needed(run)
-    # A torque at its limit, or of motors that are off, says nothing of the offset.
-    free = np.abs(commanded[rows]) < 0.98 * run.controller.gains["torque_limit_nm"]
+    # A torque at its limit, at a stop or of motors that are off says nothing of the offset.
+    free = disagreement.free(run)[rows] & (np.abs(commanded[rows]) < 0.98 * run.controller.gains["torque_limit_nm"])
     on = run.signals.get("enabled", np.ones(len(run.time)))[rows, None] > 0
     lacks = np.where(free & on, commanded[rows] - needed, np.nan)
     found = []

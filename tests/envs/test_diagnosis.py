@@ -195,6 +195,27 @@ def test_one_joint_in_degrees_is_named(names, joint):
     assert f"{JOINTS[joint]} alone is in degrees; multiply its columns by pi / 180" in one.sentence
 
 
+@pytest.mark.parametrize("joint", [0, 1])
+@pytest.mark.parametrize("share", [0.05, 0.3])
+def test_a_joint_that_is_pressed_against_its_stop_is_no_defect(joint, share):
+    # Half a centirad of difference in where the stop is makes hundreds of Nm in the model.
+    motion = excitation(SPEC, JOINTS, 4, 3.0, 500.0, 0)[:1]
+    position = undamaged(0).signals["q"][:, joint]
+    stopped, stop = mujoco.MjSpec.from_file(str(ARM)), float(np.quantile(position, 1.0 - share))
+    stopped.joint(JOINTS[joint]).limited = True
+    stopped.joint(JOINTS[joint]).range = [position.min() - 0.5, stop]
+    run = record(stopped, JOINTS, motion, Controller(kind="pd", rate_hz=1000.0, gains=GAINS), Truth(None), 0.1, 0).runs[
+        0
+    ]
+    stopped.joint(JOINTS[joint]).range = [position.min() - 0.5, stop - 0.005]
+    model = suspended(stopped)
+    assert diagnose(run, JOINTS, model) == []
+    # What is wrong elsewhere still shows.
+    factor = np.where(np.arange(2) == joint, 1.0, -1.0)
+    (one,) = diagnose(measured(run, lambda values: values * factor), JOINTS, model)
+    assert (one.kind, one.joints) == ("flipped sign", (JOINTS[1 - joint],))
+
+
 CRANE = """<mujoco>
   <worldbody>
     <body>
