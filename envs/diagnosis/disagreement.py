@@ -13,6 +13,7 @@ from envs.smoothing import smoothed
 
 _MOST = 2.0  # disagreement of two signals that have opposite signs
 _ROWS = 250  # at which inverse dynamics are evaluated, at most
+_LEAST_FREE = 0.1  # share of rows away from stops; of a joint with fewer the dynamics are unknown
 _STOP = 0.02  # of a joint's range at either end, where a mechanical stop may carry any torque
 
 
@@ -59,6 +60,10 @@ class Disagreement:
         pairs = self._pairs(run)
         weights = {"target": 0.5}
         found = {name: weights.get(name, 1.0) * relative_difference(*pair) for name, pair in pairs.items()}
+        if "dynamics" in found:
+            # A repair must not seem good because it moves a joint into its stop.
+            known = self.free(run).mean(axis=0) >= _LEAST_FREE
+            found["dynamics"] = np.where(known, found["dynamics"], 1.0)
         position = self.motion(run)[0]
         low, high = self._range
         return found | {"range": _MOST * ((position < low - 0.1) | (position > high + 0.1)).mean(axis=0)}

@@ -216,6 +216,18 @@ def test_a_joint_that_is_pressed_against_its_stop_is_no_defect(joint, share):
     assert (one.kind, one.joints) == ("flipped sign", (JOINTS[1 - joint],))
 
 
+def test_a_repair_does_not_seem_good_because_it_moves_a_joint_into_its_stop():
+    # The dynamics do not fit, and in degrees the elbow would rest at its stop, where nothing is known of them.
+    run = undamaged(0)
+    shift = np.array([0.0, 0.1 - run.signals["q"][:, 1].min()])
+    shifted = replace(run, signals=run.signals | {name: run.signals[name] + shift for name in ("q", "target")})
+    spec = mujoco.MjSpec.from_file(str(ARM))
+    spec.joint("elbow").limited = True
+    spec.joint("elbow").range = [0.0, float(shifted.signals["q"][:, 1].max() + 0.5)]
+    (one,) = diagnose(shifted, JOINTS, suspended(spec))
+    assert (one.kind, one.joints) == ("offset", ("elbow",))
+
+
 CRANE = """<mujoco>
   <worldbody>
     <body>
