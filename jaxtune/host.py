@@ -25,7 +25,7 @@ import numpy as np
 
 from jaxtune.checks import check_measured, check_set
 from jaxtune.misfits import Misfits, Phase, misfits, share_of_episode
-from jaxtune.rules import TunerConfig, Update, Verify, calibrated_gate, posterior_update
+from jaxtune.rules import TunerConfig, Update, Verify, calibrated_gate, examine, posterior_update
 from jaxtune.tuner import Info, Measure, TrainPolicy, Tuner, TunerState, counted, keep, make_info
 from jaxtune.types import Trajectory, Verdict
 
@@ -93,6 +93,8 @@ class HostTuner:
             key_collect, key_verify, key_update = jax.random.split(jax.random.fold_in(key, carry["rounds"]), 3)
             collected = self._tuner.collect(key_collect, state.policy, carry["dist"])
             check_measured(measured, collected.trajectory, self.config)
+            # Once for gate and update.
+            collected = collected.replace(reading=self._examine(collected, measured))
             carry = counted(carry, collected)
             if carry["verdict"] == Verdict.WIDEN:
                 gate = self._verify(key_verify, collected, measured, state.knobs)
@@ -112,6 +114,10 @@ class HostTuner:
             return self.simulate(key, policy, {name: np.asarray(values) for name, values in coords.items()})
 
         return Tuner(config=self.config, train_policy=self.train_policy, simulate=simulate, measure=self.measure)
+
+    @cached_property
+    def _examine(self):
+        return jax.jit(partial(examine, self.config))
 
     @cached_property
     def _verify(self):
