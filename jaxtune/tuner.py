@@ -80,7 +80,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from jaxtune import conformal
+from jaxtune import conformal, windows
 from jaxtune import dist as dists
 from jaxtune import replay as replays
 from jaxtune.checks import check_measured, check_simulated, check_states
@@ -458,6 +458,7 @@ class Tuner:
         every = jax.tree.map(lambda a, b: jnp.concatenate([a, jnp.repeat(b, each)]), coords, held_out_coords)
         trajectory = self.simulate(key_simulate, policy, every)
         check_simulated(trajectory, self.config.episodes + sets * each, self.config)
+        trajectory = windows.without_broken(trajectory)
         return Collected(
             trajectory=jax.tree.map(lambda leaf: leaf[: self.config.episodes], trajectory.replace(state=None)),
             sampled_coords=coords,

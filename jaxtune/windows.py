@@ -17,6 +17,7 @@ from jaxtune import devices
 from jaxtune.types import Trajectory
 
 _FAR = 10.0  # standard deviations
+_APART, _CHANNELS = 1e3, 0.25  # how many times as far as usual how many channels of a robot go that flies apart
 
 _LEAST = 1e-3  # smallest standard deviation by which values are divided, of values whose typical size is one
 _CONSTANT = 1e-5  # of a channel's largest value: a standard deviation that rounding may give
@@ -28,6 +29,28 @@ def steps(trajectory: Trajectory) -> Float[Array, "... time channels"]:
     These `obs + act` numbers are the channels of every window.
     """
     return jnp.concatenate([trajectory.obs, trajectory.action], axis=-1)
+
+
+def without_broken(simulated: Trajectory) -> Trajectory:
+    """Masks whole episodes in which the simulation broke, and marks those that flew apart with finite numbers.
+
+    A robot whose simulation breaks moves a million times as far as others before it does. A few such steps among many
+    thousands would set the scale of every channel, and a gate would not see anything any more.
+
+    Args:
+      simulated: [episodes, time].
+
+    Returns:
+      The same with `alive` False in these episodes, and `not_finite` True.
+    """
+    alive, values = simulated.alive[..., None], steps(simulated)
+    values = jnp.where(alive & jnp.isfinite(values), values, 0.0)
+    centre = jnp.median(values.sum(axis=1) / jnp.maximum(alive.sum(axis=1), 1), axis=0)
+    farthest = jnp.where(alive, jnp.abs(values - centre), 0.0).max(axis=1)
+    usual = jnp.median(farthest, axis=0)
+    times = jnp.where(usual > 0.0, farthest / jnp.where(usual > 0.0, usual, 1.0), 0.0)
+    broken = simulated.not_finite | (jnp.quantile(times, 1.0 - _CHANNELS, axis=1) > _APART)
+    return simulated.replace(alive=simulated.alive & ~broken[:, None], not_finite=broken)
 
 
 def valid_starts(alive: Bool[Array, "*episodes time"], length: int) -> Bool[Array, "*episodes starts"]:

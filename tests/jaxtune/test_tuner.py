@@ -555,6 +555,19 @@ def test_a_living_step_that_is_not_finite_leaves_no_score(gate):
     assert np.isfinite(score.novelty[1:]).all()
 
 
+def test_a_robot_that_flies_apart_in_simulation_does_not_blind_the_gate():
+    def simulate(key, policy, coords):
+        found = SLIDER.simulate(key, policy, coords)
+        return found.replace(obs=found.obs * jnp.where(jnp.arange(len(found.obs)) == 3, 1e6, 1.0)[:, None, None])
+
+    machine = Tuner(config=toys.TINY, train_policy=tuners.keep, simulate=simulate)
+    collected = machine.collect(jax.random.key(0), toys.policy(), toys.uniform(TWO, 0.2))
+    assert collected.trajectory.not_finite.sum() == 1
+    far = SLIDER.measure({name: value + 1.0 for name, value in TWO.items()}, 2)(jax.random.key(1), toys.policy())
+    score = tiny_gate(toys.TINY, collected, far, knobs())
+    assert score.misfit > score.threshold
+
+
 @pytest.mark.parametrize("value", [0.3, 1e4])
 def test_observations_that_never_change_leave_no_score(value):
     dist = toys.uniform(TWO, 0.2)

@@ -49,6 +49,26 @@ def test_nothing_after_a_fall_is_valid_even_where_the_mask_comes_back():
     np.testing.assert_array_equal(windows.valid_starts(alive, LENGTH)[0], [True, True] + [False] * 6)
 
 
+def test_whole_episodes_in_which_the_simulation_broke_are_masked():
+    rng = np.random.default_rng(0)
+    values = rng.normal(size=(9, TIME, 5))
+    values[2, 7:] *= 1e6  # flies apart, with finite numbers
+    values[3, 7:] *= 100.0  # falls
+    values[4, :, 0] += 1e6  # one sensor that nobody else sees anything with
+    values[:, :, 1] = np.arange(9)[:, None] == 5  # a flag that one robot alone ever sets
+    broke = np.arange(9) == 6
+    alive = ~broke[:, None] | (np.arange(TIME) < 5)
+    before = episodes(lived=[TIME] * 9).replace(
+        obs=jnp.asarray(values, jnp.float32), alive=jnp.asarray(alive), not_finite=jnp.asarray(broke)
+    )
+    # What follows an end may be anything.
+    before = before.replace(obs=before.obs.at[6, 6:].set(jnp.nan))
+    after = windows.without_broken(before)
+    np.testing.assert_array_equal(after.not_finite, np.isin(np.arange(9), [2, 6]))
+    np.testing.assert_array_equal(after.alive, ~np.isin(np.arange(9), [2, 6])[:, None] & np.ones(TIME, bool))
+    np.testing.assert_array_equal(after.obs, before.obs)
+
+
 def test_draw_returns_only_valid_windows_and_all_of_them_alike():
     count = 4800
     cut, episode = windows.draw(jax.random.key(1), episodes(), count, LENGTH)
