@@ -21,7 +21,10 @@ def quantile(values: jax.Array, level: jax.Array | float) -> jax.Array:
     """Computes a bound that one more draw like `values` [n, ...] exceeds with probability at most `1 - level`.
 
     It is the ceil((n + 1) level)-th smallest value. The guarantee needs n of at least `level / (1 - level)`; with
-    fewer, the largest value is returned.
+    fewer, the largest value is returned. Values that are nan are left out, of `values` and of n: they are draws of
+    another kind than the one more.
     """
-    rank = jnp.ceil((len(values) + 1) * level).astype(int) - 1
-    return jnp.sort(values, axis=0)[jnp.minimum(rank, len(values) - 1)]
+    count = (~jnp.isnan(values)).sum(axis=0)
+    rank = jnp.ceil((count + 1) * level).astype(int) - 1
+    place = jnp.maximum(jnp.minimum(rank, count - 1), 0)
+    return jnp.take_along_axis(jnp.sort(values, axis=0), place[None], axis=0)[0]

@@ -104,7 +104,8 @@ def in_chunks(function: Callable[..., Any], inputs: tuple, sizes: Mapping[str, i
         fill = jnp.arange(chunks * size) % count
         inputs = jax.tree.map(lambda x: x[fill].reshape(chunks, size, *x.shape[1:]), inputs)
         stacked = jax.lax.map(lambda item: several(*shared, *item), inputs)
-        return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:count], stacked)
+        # Not -1: leaves may have no elements, such as a model's activations without muscles.
+        return jax.tree.map(lambda x: x.reshape(chunks * size, *x.shape[2:])[:count], stacked)
 
     return spread(in_turn, inputs, shared=shared)
 

@@ -411,7 +411,10 @@ def posterior_update(
     held_out, estimate = estimates[:-1], estimates[-1]
     # The errors on robots with known coordinates stand for the error on the measured one.
     truth = dists.normalise(dist, collected.held_out_coords)
-    error = jnp.abs(held_out - truth)
+    # A set without a window is answered blindly; the measured one has some.
+    known = ~jnp.isnan(reading.misfit[:-1, None])
+    off = jnp.where(known, held_out - truth, 0.0)
+    error = jnp.where(known, jnp.abs(off), jnp.nan)
     # What scales the errors must not come from the sets that calibrate them.
     scale = jnp.maximum(model.error, LEAST_ERROR)
     missed = 1.0 - config.coverage
@@ -419,7 +422,7 @@ def posterior_update(
         scale * conformal.quantile((error / scale).max(axis=-1), 1.0 - share * missed)
         for share in (1.0 - _EACH * min(config.refinements, _MOST), _EACH)
     )
-    ignorant = conformal.quantile(jnp.abs((low + high) / 2 - truth), config.coverage)
+    ignorant = conformal.quantile(jnp.where(known, jnp.abs((low + high) / 2 - truth), jnp.nan), config.coverage)
     identifiable = conformal.quantile(error, config.coverage) < _IDENTIFIABLE * ignorant
     step = jnp.where(identifiable, estimate, 0.0)
     # Held-out truths all lie in the box, so their errors say nothing of truths beyond it. One that is outside in one
@@ -438,7 +441,7 @@ def posterior_update(
         loss=model.error.mean(),
         p_value=conformal.p_value(jnp.fmax(excess["misfit"], excess["beyond"])),
         p_misfit=conformal.p_value(excess["misfit"]),
-        errors=(held_out - truth).T @ (held_out - truth) / len(truth),
+        errors=off.T @ off / jnp.maximum(known.sum(), 1),
     )
 
 

@@ -20,6 +20,11 @@ def test_a_quantile_is_exceeded_as_rarely_as_it_says():
     assert conformal.quantile(jnp.asarray(values), 0.5) == 9
     # Too few for the level: the largest.
     assert conformal.quantile(jnp.asarray(values), 0.99) == 18
+    # What is not known is no draw.
+    some = jnp.append(jnp.asarray(values, jnp.float32), jnp.full(5, jnp.nan))
+    assert conformal.quantile(some, 0.5) == 9
+    both = conformal.quantile(jnp.stack([some, jnp.full(24, jnp.nan)], axis=1), 0.95)
+    assert both[0] == 18 and jnp.isnan(both[1])
 
 
 def test_a_p_value_counts_what_is_at_least_as_large():

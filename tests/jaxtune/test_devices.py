@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -70,3 +71,9 @@ def test_a_program_is_compiled_once_wherever_its_arrays_come_from():
 def test_a_mesh_has_as_many_devices_as_there_are(count):
     with pytest.raises(ValueError, match=f"devices: got {count}, expected 1 to"):
         devices.mesh(count)
+
+
+def test_chunks_may_have_leaves_without_elements():
+    found = devices.in_chunks(lambda x: (x, jnp.zeros(0)), (jnp.arange(5.0),), {"cpu": 2, "other": 2})
+    assert found[1].shape == (5, 0)
+    np.testing.assert_array_equal(found[0], np.arange(5.0))

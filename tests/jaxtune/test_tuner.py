@@ -807,6 +807,20 @@ def test_coordinates_that_trade_against_each_other_are_known_together():
     assert 0.0 < both.error < 0.08
 
 
+def test_simulated_sets_that_fall_before_a_window_widen_no_interval():
+    dist, key = toys.uniform(TWO, 0.4), jax.random.key(0)
+    collected = toys.collect(jax.random.fold_in(key, 1), dist)
+    measured = SLIDER.measure({"friction": 0.1, "mass": 0.1}, 3)(jax.random.fold_in(key, 2), toys.policy())
+    fallen = jnp.arange(len(collected.held_out.alive)) < 4
+    alive = collected.held_out.alive & ~fallen[:, None, None]
+    some = collected.replace(held_out=collected.held_out.replace(alive=alive))
+    intervals = [
+        tuners.posterior_update(key, toys.TUNER, each, measured, dist, knobs())[1].interval
+        for each in (collected, some)
+    ]
+    np.testing.assert_allclose(intervals[1], intervals[0], rtol=0.3)
+
+
 def test_posterior_narrows_no_further_than_it_may():
     dist = toys.uniform(THREE, 0.06)
     moved, info = apply(tuners.posterior_update, 1, dist, TWO)
