@@ -54,7 +54,10 @@ def check_measured(measured: Trajectory, simulated: Trajectory, config: TunerCon
     steps = check_set(measured, config)
     expected = np.shape(simulated.alive)[1]
     if steps != expected:
-        raise ValueError(f"measured: got episodes of {steps} steps, expected {expected}, as simulated")
+        raise ValueError(
+            f"measured: got episodes of {steps} steps, expected {expected}, as simulated; what makes sets of episodes "
+            "of many lengths (`from_episodes`, `one_by_one`) takes `steps`"
+        )
     for field in ("obs", "action"):
         got, expected = np.shape(getattr(measured, field))[-1], np.shape(getattr(simulated, field))[-1]
         if got != expected:

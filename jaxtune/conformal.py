@@ -7,8 +7,9 @@ _ROUNDING = 1e-5  # less than the distance of two p-values of as many sets as an
 
 
 def p_value(scores: jax.Array) -> jax.Array:
-    """The conformal p-value of the last score among all [sets + 1]; nan where it is."""
-    p_value = (1 + jnp.sum(scores[:-1] >= scores[-1])) / len(scores)
+    """The conformal p-value of the last score among all [sets + 1]; nan where it is. Other nan are left out."""
+    known = (~jnp.isnan(scores[:-1])).sum()
+    p_value = (1 + jnp.sum(scores[:-1] >= scores[-1])) / (1 + known)
     return jnp.where(jnp.isnan(scores[-1]), jnp.nan, p_value)
 
 

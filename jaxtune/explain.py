@@ -114,9 +114,15 @@ def explain(info) -> str:
     Args:
       info: of one tuning (`jaxtune.tuner.Info`); for a run of several, index its leaves first.
 
+    Raises:
+      ValueError: it is of several tunings.
+
     Returns:
       Lines of text. Positions, steps and intervals are in coordinates: of a multiplier, the logarithm.
     """
+    if np.ndim(info.calls):
+        last = "jax.tree.map(lambda leaf: leaf[-1], info)"
+        raise ValueError(f"explain: got {len(info.calls)} tunings, expected one, such as the last: {last}")
     verdict = Verdict(int(info.verdicts[int(info.calls) - 1]))
     last = int(info.calls) - 1
     lines = [

@@ -238,7 +238,8 @@ def _cut(config: ReplayConfig, replay: Replay, episodes: Trajectory) -> _Pieces:
     steps = episodes.alive.shape[1]
     starts = jnp.arange(0, max(steps - config.window, 1), config.stride)
     within = starts[:, None] + jnp.arange(config.window)
-    flat = lambda leaf: leaf.reshape(-1, *leaf.shape[2:])  # noqa: E731
+    # Not -1: leaves may have no elements, such as a model's activations without muscles.
+    flat = lambda leaf: leaf.reshape(leaf.shape[0] * leaf.shape[1], *leaf.shape[2:])  # noqa: E731
     states = lambda where: jax.tree.map(lambda leaf: flat(leaf[:, where]), episodes.state)  # noqa: E731
     # The state after a fall may be anything, so the step of the end must be alive too.
     alive = episodes.alive[:, within].all(axis=-1) & episodes.alive[:, starts + config.window]

@@ -57,6 +57,9 @@ class TunerConfig:
 
     The defaults are for walking robots on two CPU cores. More `episodes` sharpen both models and take longer.
     For scalars that may vary within one compiled program, see `Knobs`.
+
+    Raises:
+      ValueError: a count is too small, `coverage` is not between 0 and 1, or `min_radius` is not positive.
     """
 
     episodes: int = 600
@@ -84,6 +87,16 @@ class TunerConfig:
     """Sizes of the verification model."""
     replay: ReplayConfig = field(default_factory=ReplayConfig)
     """Sizes of the estimate from measured states, of a tuner that has a `replay`."""
+
+    def __post_init__(self):
+        least = {"episodes": 1, "set_episodes": 1, "held_out_sets": 1, "max_widenings": 0, "refinements": 0}
+        for name, value in least.items():
+            if getattr(self, name) < value:
+                raise ValueError(f"{name}: got {getattr(self, name)}, expected {value} or more")
+        if not 0 < self.coverage < 1:
+            raise ValueError(f"coverage: got {self.coverage}, expected a number between 0 and 1")
+        if not self.min_radius > 0:
+            raise ValueError(f"min_radius: got {self.min_radius}, expected a positive number")
 
     @property
     def longest_window(self) -> int:

@@ -17,7 +17,7 @@ from jaxtune import devices
 from jaxtune.types import Trajectory
 
 _FAR = 10.0  # standard deviations
-_APART, _CHANNELS = 1e3, 0.25  # how many times as far as usual how many channels of a robot go that flies apart
+_APART, _CHANNELS = 1e3, 0.25  # how many times as far as usual a share of the channels of a robot goes that flies apart
 
 _LEAST = 1e-3  # smallest standard deviation by which values are divided, of values whose typical size is one
 _CONSTANT = 1e-5  # of a channel's largest value: a standard deviation that rounding may give
@@ -49,7 +49,10 @@ def without_broken(simulated: Trajectory) -> Trajectory:
     farthest = jnp.where(alive, jnp.abs(values - centre), 0.0).max(axis=1)
     usual = jnp.median(farthest, axis=0)
     times = jnp.where(usual > 0.0, farthest / jnp.where(usual > 0.0, usual, 1.0), 0.0)
-    broken = simulated.not_finite | (jnp.quantile(times, 1.0 - _CHANNELS, axis=1) > _APART)
+    # Or a single channel, but not one in which others have nothing but rounding.
+    apart = (jnp.quantile(times, 1.0 - _CHANNELS, axis=1) > _APART) | (farthest.max(axis=1) > _APART * usual.max())
+    # Where nothing usually moves, nothing can be said of what does.
+    broken = simulated.not_finite | (apart & (usual.max() > 0.0))
     return simulated.replace(alive=simulated.alive & ~broken[:, None], not_finite=broken)
 
 

@@ -30,3 +30,4 @@ def test_a_quantile_is_exceeded_as_rarely_as_it_says():
 def test_a_p_value_counts_what_is_at_least_as_large():
     assert conformal.p_value(jnp.array([3.0, 1.0, 2.0, 2.0])) == 0.75
     assert np.isnan(conformal.p_value(jnp.array([3.0, jnp.nan])))
+    assert conformal.p_value(jnp.array([3.0, jnp.nan, 1.0, jnp.nan, 2.0])) == 2 / 3

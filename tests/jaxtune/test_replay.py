@@ -5,12 +5,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import sled
 import toys
 
 from jaxtune import dist as dists
-from jaxtune import replay, tuner
+from jaxtune import mjx, replay, tuner
 from jaxtune.replay import ReplayConfig
-from jaxtune.tuner import Tuner
+from jaxtune.tuner import Tuner, TunerConfig
 
 EPISODES, SETS = 3, 19
 NAMES = ("friction", "mass")
@@ -210,3 +211,19 @@ def test_states_that_are_missing_or_of_another_robot_are_refused(dist):
     many = dataclasses.replace(one, config=dataclasses.replace(one.config, replay=ReplayConfig(sets=20)))
     with pytest.raises(ValueError, match="sets: got 20, expected 1 to 19 held-out sets"):
         many.tune(jax.random.key(0), state, whole)
+
+
+def test_a_robot_without_muscles_is_replayed_at_the_default_sizes():
+    simulator = mjx.Simulator(sled.Sled(), steps=60, parameters={"mass": sled.TABLE["mass"]})
+    act = lambda policy, obs, key: jax.random.normal(key, (1,))  # noqa: E731
+    machine = Tuner(
+        config=TunerConfig(),
+        train_policy=tuner.keep,
+        simulate=simulator.simulate(act, states=True),
+        replay=simulator.replay(),
+    )
+    key, policy = jax.random.key(0), jnp.zeros(())
+    measured = jax.eval_shape(simulator.measure(act, {"mass": 1.2}, 5, states=True), key, policy)
+    state = machine.init(policy, simulator.dist(0.4), tuner.knobs())
+    after, _ = jax.eval_shape(machine.tune, key, state, measured)
+    assert jax.tree.structure(after) == jax.tree.structure(state)

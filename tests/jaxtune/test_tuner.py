@@ -990,3 +990,22 @@ def test_tuner_does_not_bend_its_parameters_to_physics_that_it_lacks(find):
     last = np.take_along_axis(np.asarray(info.verdicts), np.asarray(info.calls)[:, None] - 1, axis=1)
     assert np.all((last == Verdict.UNEXPLAINED) | (last == Verdict.RADIUS_EXHAUSTED))
     np.testing.assert_array_equal(dists.ravel(state.dist.centre), 0.0)
+
+
+@pytest.mark.parametrize(
+    ("sizes", "message"),
+    [
+        ({"refinements": -1}, "refinements: got -1, expected 0 or more"),
+        ({"held_out_sets": 0}, "held_out_sets: got 0, expected 1 or more"),
+        ({"coverage": 90}, "coverage: got 90, expected a number between 0 and 1"),
+        ({"min_radius": 0.0}, "min_radius: got 0.0, expected a positive number"),
+    ],
+)
+def test_sizes_that_cannot_be_are_refused(sizes, message):
+    with pytest.raises(ValueError, match=message):
+        tuners.TunerConfig(**sizes)
+
+
+def test_several_tunings_are_not_explained_as_one():
+    with pytest.raises(ValueError, match="got 3 tunings, expected one"):
+        explain.explain(SimpleNamespace(calls=np.ones(3, int)))

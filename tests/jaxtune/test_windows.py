@@ -54,7 +54,10 @@ def test_whole_episodes_in_which_the_simulation_broke_are_masked():
     values = rng.normal(size=(9, TIME, 5))
     values[2, 7:] *= 1e6  # flies apart, with finite numbers
     values[3, 7:] *= 100.0  # falls
-    values[4, :, 0] += 1e6  # one sensor that nobody else sees anything with
+    values[4, 7:, 0] *= 1e6  # one sensor does
+    values[7, 7:, 0] *= 100.0
+    values[:, :, 2] *= 1e-9  # rounding, but for one robot
+    values[8, :, 2] *= 1e9
     values[:, :, 1] = np.arange(9)[:, None] == 5  # a flag that one robot alone ever sets
     broke = np.arange(9) == 6
     alive = ~broke[:, None] | (np.arange(TIME) < 5)
@@ -64,8 +67,8 @@ def test_whole_episodes_in_which_the_simulation_broke_are_masked():
     # What follows an end may be anything.
     before = before.replace(obs=before.obs.at[6, 6:].set(jnp.nan))
     after = windows.without_broken(before)
-    np.testing.assert_array_equal(after.not_finite, np.isin(np.arange(9), [2, 6]))
-    np.testing.assert_array_equal(after.alive, ~np.isin(np.arange(9), [2, 6])[:, None] & np.ones(TIME, bool))
+    np.testing.assert_array_equal(after.not_finite, np.isin(np.arange(9), [2, 4, 6]))
+    np.testing.assert_array_equal(after.alive, ~np.isin(np.arange(9), [2, 4, 6])[:, None] & np.ones(TIME, bool))
     np.testing.assert_array_equal(after.obs, before.obs)
 
 
