@@ -29,7 +29,9 @@ def run(guide, monkeypatch, small=SMALL):
     monkeypatch.setattr(tuner, "TunerConfig", lambda **sizes: replace(small, **sizes))
     # Options of the compiler are for the program as a whole, not for what is jitted in it.
     jit, whole = jax.jit, ("tune", "run")
-    monkeypatch.setattr(jax, "jit", lambda f, **options: (toys.long_jit if f.__name__ in whole else jit)(f, **options))
+    monkeypatch.setattr(
+        jax, "jit", lambda f, **options: (toys.long_jit if getattr(f, "__name__", "") in whole else jit)(f, **options)
+    )
     *_, code = re.findall(r"```python\n(.*?)```", (GUIDES / guide).read_text(), re.DOTALL)
     scope = {}
     exec(compile(code, guide, "exec"), scope)
