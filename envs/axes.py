@@ -66,9 +66,10 @@ def describe_axis(
       scale: what one unit of the coordinate stands for.
       joints: indices of the joints in which the effect shows directly, nearest first.
     """
-    least, prior_sd, fields = parameter.bounds[0], 0.0, parameter.fields
-    if parameter.form == "added" and row.on == "joint" and fields:
-        least = max(least, -_MOST_TAKEN * getattr(model, fields[0])[dof[index]] / scale)
+    least, prior_sd = parameter.bounds[0], 0.0
+    if row.name in _NOMINAL_FIELDS:
+        # Dry friction acts on a signal, but what the model has of it can be taken as well.
+        least = max(least, -_MOST_TAKEN * getattr(model, _NOMINAL_FIELDS[row.name])[dof[index]] / scale)
     if row.name in _NOMINAL_RATIOS:
         prior_sd = _NOMINAL_RATIOS[row.name]
     elif row.name in _NOMINAL_FIELDS:

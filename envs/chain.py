@@ -164,7 +164,7 @@ class Chain:
                 memory[row.name] = kept
         return signal, memory
 
-    def start(self, values, state, x, past=None) -> dict:
+    def start(self, values, state, x, past=None, past_target=None) -> dict:
         """Makes the memories in steady state: of a robot that has been in one state, with one target, for a long time.
 
         Use it before the first step. A segment of a log then replays its history to get the real ones (`envs.rig`).
@@ -174,11 +174,14 @@ class Chain:
           state: positions and velocities, [2, joints].
           x: the controller's inputs.
           past: positions [past, joints] rad that led to the state, which bristles remember; None where it never moved.
+          past_target: targets [past, joints] rad that led to the first one, which a slew limit may still be behind;
+            None where they never moved. Both are `envs.effects.memory.PAST_STEP_S` apart.
         """
         torque = self._law(x, x["target"] - state[0], state[1])
         # What reaches each of these stages in steady state, other effects left aside.
-        signals = {"command": x["target"], "sensor": state, "torque": torque, "transmission": torque}
+        signals = {"sensor": state, "torque": torque, "transmission": torque}
         signals["bristle"] = state[:1] if past is None else past
+        signals["command"] = x["target"][None] if past_target is None else past_target
         memory = {"held": torque}
         for stage, signal in signals.items():
             for row in self.entering(stage):

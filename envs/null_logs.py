@@ -24,7 +24,7 @@ from envs import sensing
 from envs.logs import Log, Run
 from envs.logs.controller import Impedance
 from envs.models import suspended
-from envs.readings import noise_of, read_later, rounding_of, stale
+from envs.readings import hermite, noise_of, read_later, rounding_of, stale
 from envs.smoothing import smoothed
 
 _STEP_S = 0.0005  # half the step of `Rig`
@@ -202,11 +202,7 @@ class _Drive:
             back_emf=by_tick([law.back_emf for law in laws]),
         )
         each = zip(runs, times, rows, straight, strict=True)
-        targets = [
-            _targets(run, own, row, linear) if "target" in run.signals else run.sent_torque()[row]
-            for run, own, row, linear in each
-        ]
-        self._wanted = by_tick(targets)
+        self._wanted = by_tick([_sent(*one) for one in each])
 
     def torque(self, look: int, q: np.ndarray, dq: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Commanded torques [runs, joints] at a tick, and what the back electromotive force takes from them."""
@@ -216,7 +212,7 @@ class _Drive:
 
 def as_recorded(robot: Robot, run: Run, motion: Motion) -> Run:
     """Makes a run of a motion, with the signals that the measured one has, read by sensors like its own."""
-    level = np.asarray(sensing.projected_gravity(robot.model.body_quat[1]))
+    level = np.asarray(sensing.resting_gravity(robot.model))
     exact = {
         "q": motion.states[:, 0],
         "dq": motion.states[:, 1],
@@ -226,7 +222,7 @@ def as_recorded(robot: Robot, run: Run, motion: Motion) -> Run:
     }
     # Without targets the torques are what was sent, not what was measured.
     sensed = [name for name in exact if name in run.signals and ("target" in run.signals or name != "tau")]
-    read = {name: _as_read(run, name, motion.times, exact[name], robot.rng) for name in sensed}
+    read = {name: _as_read(run, name, motion, exact[name], robot.rng) for name in sensed}
     return replace(run, signals={**run.signals, **read})
 
 
@@ -235,29 +231,37 @@ def _last_row(run: Run, times: np.ndarray) -> np.ndarray:
     return np.clip(np.searchsorted(run.time, times + 1e-9, side="right") - 1, 0, len(run.time) - 1)
 
 
-def _targets(run: Run, times: np.ndarray, last: np.ndarray, linear: bool) -> np.ndarray:
-    """Returns what the controller is told at other times than the rows', [times, joints] rad."""
-    target = run.signals["target"]
+def _sent(run: Run, times: np.ndarray, last: np.ndarray, linear: bool) -> np.ndarray:
+    """Returns what is sent at other times than the rows', [times, joints]: targets in rad, without these torques."""
+    sent = run.signals["target"] if "target" in run.signals else run.sent_torque()
     if not linear:
-        return target[last]
-    return np.stack([np.interp(times, run.time, column) for column in target.T], axis=1)
+        return sent[last]
+    return np.stack([np.interp(times, run.time, column) for column in sent.T], axis=1)
 
 
-def _as_read(run: Run, signal: str, times: np.ndarray, values: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def _as_read(run: Run, signal: str, motion: Motion, values: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Reads exact values as the run's sensors would: at their times, with their noise, rounding and repetitions.
+
+    A slow controller ticks 20 ms apart, and holds its torque meanwhile: the joint moves in a curve.
 
     Args:
       run: the measured run.
       signal: name of the signal.
-      times: [n] s, of the exact values.
-      values: [n, columns], exact.
+      motion: of the simulated robot.
+      values: [n, columns], exact, at the times of the motion.
       rng: of the noise.
 
     Returns:
       [rows, columns].
     """
     at = run.time[:, None] + read_later(run, signal)
-    read = np.stack([np.interp(own, times, exact) for own, exact in zip(at.T, values.T, strict=True)], axis=1)
+    if signal in ("q", "dq"):
+        pair = motion.states[:, 0], motion.states[:, 1]
+        curves = [hermite(motion.times, *(each[:, joint] for each in pair), own) for joint, own in enumerate(at.T)]
+        read = np.stack([curve[("q", "dq").index(signal)] for curve in curves], axis=1)
+    else:
+        last = np.clip(np.searchsorted(motion.times, at, side="right") - 1, 0, len(motion.times) - 1)
+        read = np.take_along_axis(values, last, axis=0)
     quantum = rounding_of(run, signal)
     # Rounding brings a variance of quantum^2 / 12 of its own, which the noise contains as well.
     extra = np.sqrt(np.maximum(noise_of(run, signal) ** 2 - quantum**2 / 12.0, 0.0))

@@ -106,7 +106,7 @@ class Rig:
         self.chain = Chain(self.dt, tuple(self.effects.values()), self.qpos, self.dof, self._bodies, 0.5 * self.dt)
         self.axes = self._describe_axes()
         # The IMU is taken to sit on the first body, which carries the others.
-        self._gravity = sensing.projected_gravity(jnp.asarray(model.body_quat[1], jnp.float32))
+        self._gravity = sensing.resting_gravity(model)
 
     @property
     def system(self) -> System:
@@ -307,7 +307,7 @@ class Rig:
         # Part of a motor's torque accelerates its own rotor and does not press on the gears (`envs.effects`).
         rotor, acceleration = model.dof_armature[self.dof], jnp.gradient(truth[:, 1], self.dt, axis=0)
         # Encoders sit on the motor. Until its offset from the joint is known, its readings stand for the joint's.
-        memory = chain.start(values, truth[0], jax.tree.map(lambda x: x[0], drive), segment.past)
+        memory = chain.start(values, truth[0], jax.tree.map(lambda x: x[0], drive), segment.past, segment.past_target)
 
         def remember(memory, inputs):
             state, carried, x = inputs

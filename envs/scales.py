@@ -6,6 +6,7 @@ coordinate of one is a large effect for all of them, on a servo as on a biped.
 
 from collections.abc import Sequence
 
+import mujoco
 import numpy as np
 
 from envs.logs import Run
@@ -13,6 +14,7 @@ from envs.regimes import control_torque
 from envs.rig import Rig
 from envs.segments import smoothed
 
+_PINION_M = 0.05
 _DRIVEN = 0.01  # least share of the torque that moves a joint's inertia; a passive joint gets none
 
 
@@ -24,13 +26,14 @@ def measure_scales(rig: Rig, runs: Sequence[Run]) -> dict[str, np.ndarray]:
         torque     rms(tau); of a joint that no torque drives, what its inertia takes, rms(inertia ddq)   Nm
         damping    torque / rms(dq)            Nm s/rad
         quadratic  torque / rms(dq)^2          Nm s^2/rad^2
-        stiffness  torque / 0.02               Nm/rad
+        stiffness  torque / (0.02 angle)       Nm/rad
         inertia    diagonal of the joint-space inertia in the mean pose, kg m^2
         mass       mass of the body            kg
         drag       9.81 mass                   N s/m
         speed      rms(dq)                     rad/s
         slow       0.1 rms(dq)                 rad/s
         motor      largest limit / rms(dq)     Nm s/rad
+        angle      1 rad of a hinge; of a slide 0.05 m, which a pinion of that radius moves it by
 
     Hand the result to `Rig.scaled`.
 
@@ -54,16 +57,19 @@ def measure_scales(rig: Rig, runs: Sequence[Run]) -> dict[str, np.ndarray]:
     mass, inertia = rig.inertias(np.concatenate(pose).mean(axis=0))
     moves = inertia * _rms(rise)
     torque = np.where(_rms(torque) > _DRIVEN * moves, _rms(torque), moves)
+    turns = np.array([rig.mj_model.joint(name).type[0] == mujoco.mjtJoint.mjJNT_HINGE for name in rig.joints])
+    angle = np.where(turns, 1.0, _PINION_M)
     return {
         "torque": torque,
         "damping": torque / _rms(speed),
         "quadratic": torque / _rms(speed) ** 2,
-        "stiffness": torque / 0.02,  # of a spring that winds up by 20 mrad under the rms torque
+        "stiffness": torque / (0.02 * angle),  # of a spring that winds up by 20 mrad under the rms torque
         "inertia": inertia,
         "mass": mass,
         "drag": mass * 9.81,  # a drag that equals the link's weight at 1 m/s
         "speed": _rms(speed),
         "slow": 0.1 * _rms(speed),
+        "angle": angle,
         "motor": np.maximum(np.concatenate(limit).max(axis=0), 1e-6) / _rms(speed),
     }
 

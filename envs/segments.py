@@ -12,7 +12,7 @@ import chex
 import jax
 import numpy as np
 
-from envs.effects.memory import LONGEST_S
+from envs.effects.memory import LONGEST_S, PAST_STEP_S
 from envs.logs import Run
 from envs.readings import aligned, hermite, noise, quantum_of
 from envs.smoothing import smoothed, velocity_lag
@@ -37,7 +37,7 @@ HISTORY_S = LONGEST_S + 0.02
 """Length of the history before a segment, in s: the longest delay and some time for lags to settle."""
 
 _SAME_S = 2e-6  # times that differ by less are the same: time stamps are rounded, those of a wall clock to 0.2 us
-_PAST_S, _PAST_STEP_S = 2.0, 0.01  # before the history: how far back positions are kept, and the time between them
+_PAST_S = 2.0  # how far back before the history positions and targets are kept
 
 
 @chex.dataclass(frozen=True)
@@ -63,6 +63,8 @@ class Segment:
     # [past, joints] rad, smoothed positions every 10 ms in the 2 s that lead to the first of `measured`. They wind up
     # the bristles of dry friction; in slow motion the history alone is too short for that.
     past: jax.Array
+    # [past, joints] rad, the targets at the same times. A limit of their slew may still be far behind them.
+    past_target: jax.Array
     row_step: jax.Array  # [rows] the last step at or before each row; 0 is the segment's start
     row_share: jax.Array  # [rows] share of a step between that step and the row
 
@@ -220,11 +222,10 @@ def _of_run(run: Run, states: np.ndarray, start: np.ndarray, rows: np.ndarray, a
     begin = run.time[start][:, None]
     grid = begin + dt * np.arange(-before, after)
     # A row's values act from its time stamp until the next.
-    last = np.clip(np.searchsorted(run.time, grid + _SAME_S, side="right") - 1, 0, len(run.time) - 1)
-    target, between = _targets(run, grid, last)
+    last = _last_row(run, grid)
+    target, between = _between_rows(run, run.signals.get("target"), grid)
     controller = run.impedance()
     held = {
-        "feed": run.sent_torque(),
         "stiffness": controller.stiffness,
         "damping": controller.damping,
         "limit": controller.limit,
@@ -240,34 +241,42 @@ def _of_run(run: Run, states: np.ndarray, start: np.ndarray, rows: np.ndarray, a
     # delay of whole rows would then seem likelier than any other.
     acceleration = np.gradient(velocity, run.time, axis=0)
     between_rows = [hermite(run.time, *pair, fine)[0] for pair in ((position, velocity), (velocity, acceleration))]
-    past = begin - HISTORY_S + _PAST_STEP_S * np.arange(-round(_PAST_S / _PAST_STEP_S), 1)
+    past = begin - HISTORY_S + PAST_STEP_S * np.arange(-round(_PAST_S / PAST_STEP_S), 1)
     return Segment(
         target=target,
         between=between,
+        feed=_between_rows(run, run.sent_torque(), grid)[0],
         **{name: values.astype(np.float32)[last] for name, values in held.items()},
         sample=np.diff(ticks, axis=1, prepend=-np.inf) > 0,
         measured=np.stack(between_rows, axis=2).astype(np.float32),
         past=hermite(run.time, position, velocity, past)[0].astype(np.float32),
+        past_target=_between_rows(run, run.signals.get("target"), past)[0],
         row_step=step,
         row_share=np.clip(at - step, 0.0, 1.0).astype(np.float32),
     )
 
 
-def _targets(run: Run, grid: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns targets, and how far linear ones are from them where it is unknown which the robot had.
+def _last_row(run: Run, times: np.ndarray) -> np.ndarray:
+    """The last row at or before each time."""
+    return np.clip(np.searchsorted(run.time, times + _SAME_S, side="right") - 1, 0, len(run.time) - 1)
+
+
+def _between_rows(run: Run, sent: np.ndarray | None, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns what was sent to the joints at other times, and how far a linear one is from it where that is unknown.
 
     Args:
-      run: the run; without targets both are zero.
-      grid: [segments, steps] s.
-      last: [segments, steps] the row at or before each time.
+      run: the run.
+      sent: [rows, joints], targets or torques; zeros where None.
+      times: s, of any shape.
 
     Returns:
-      [segments, steps, joints] rad each.
+      [*times.shape, joints] each.
     """
-    target = run.signals.get("target", np.zeros(run.signals["q"].shape))
+    sent = np.zeros(run.signals["q"].shape) if sent is None else sent
+    last = _last_row(run, times)
     following = np.minimum(last + 1, len(run.time) - 1)
-    share = (grid - run.time[last]) / np.maximum(run.time[following] - run.time[last], 1e-9)
-    further = np.clip(share, 0.0, 1.0)[..., None] * (target[following] - target[last])
-    held, none = target[last], np.zeros_like(further)
+    share = (times - run.time[last]) / np.maximum(run.time[following] - run.time[last], 1e-9)
+    further = np.clip(share, 0.0, 1.0)[..., None] * (sent[following] - sent[last])
+    held, none = sent[last], np.zeros_like(further)
     by_rows = {"hold": (held, none), "linear": (held + further, none), "unknown": (held, further)}
     return tuple(values.astype(np.float32) for values in by_rows[run.controller.between_rows])

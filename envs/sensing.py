@@ -1,7 +1,10 @@
 """The policy's observation: one function, whatever engine moves the robot, and the noise on its readings."""
 
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 
 LAYOUT = {
@@ -33,15 +36,23 @@ def rotate_inverse(quat: jax.Array, vector: jax.Array) -> jax.Array:
     return rotate(quat * jnp.array([1.0, -1.0, -1.0, -1.0]), vector)
 
 
-def projected_gravity(quat: jax.Array) -> jax.Array:
+def projected_gravity(quat: jax.Array, down: Sequence[float] = (0.0, 0.0, -1.0)) -> jax.Array:
     """Computes the direction of gravity in the body frame, a unit vector [3]; (0, 0, -1) of an upright body.
 
     It is the part of the orientation that an accelerometer at rest can measure: roll and pitch, without heading.
 
     Args:
       quat: orientation of the body, [4] (w, x, y, z).
+      down: direction of gravity in the world, a unit vector [3].
     """
-    return rotate_inverse(quat, jnp.array([0.0, 0.0, -1.0]))
+    return rotate_inverse(quat, jnp.array(down))
+
+
+def resting_gravity(model: mujoco.MjModel) -> jax.Array:
+    """Computes what an IMU on the first body of a robot on a rig reads, a unit vector [3], by the model's gravity."""
+    size = np.linalg.norm(model.opt.gravity)
+    down = model.opt.gravity / size if size > 0 else np.array([0.0, 0.0, -1.0])
+    return projected_gravity(jnp.asarray(model.body_quat[1], jnp.float32), down)
 
 
 def clock(phase: jax.Array) -> jax.Array:

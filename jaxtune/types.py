@@ -183,14 +183,15 @@ class Verdict(enum.IntEnum):
 
 
 Scale = Literal[
-    "one", "torque", "damping", "stiffness", "inertia", "mass", "drag", "speed", "slow", "motor", "quadratic"
+    "one", "torque", "damping", "stiffness", "inertia", "mass", "drag", "speed", "slow", "angle", "motor", "quadratic"
 ]
 """Quantity that one unit of a discovery coordinate stands for.
 
 Except for `one`, its size depends on the robot and on how it moved in the log; `envs.scales` measures it. Per joint:
 `torque` is the rms torque (Nm), `speed` the rms speed (rad/s), `slow` a tenth of it, `damping` torque / speed,
-`quadratic` torque / speed^2, `stiffness` torque / 0.02 rad, `motor` the largest torque limit / speed, `inertia` the
-diagonal of the joint-space inertia (kg m^2). Per body: `mass` (kg), and `drag`, mass * 9.81 (N s/m).
+`quadratic` torque / speed^2, `angle` 1 rad of a hinge or 0.05 m of a slide, `stiffness` torque / (0.02 angle), `motor`
+the largest torque limit / speed, `inertia` the diagonal of the joint-space inertia (kg m^2). Per body: `mass` (kg), and
+`drag`, mass * 9.81 (N s/m).
 """
 
 

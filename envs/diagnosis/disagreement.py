@@ -24,7 +24,8 @@ class Disagreement:
 
         velocity   dq against the slope of q
         torque     tau against the controller's torque
-        target     target against q, weighted by half because joints lag behind
+        target     target against q while motors are on, both about their means, since joints sag; weighted by half,
+                   since joints lag behind
         range      share of rows outside the joint's range, times 2
         dynamics   the controller's (or the measured) torque against the model's inverse dynamics, away from stops
 
@@ -50,7 +51,11 @@ class Disagreement:
 
     def __call__(self, run: Run) -> float:
         """Sums all parts over all joints, of a run with the same signals as the first one."""
-        return float(sum(part.sum() for part in self.parts(run).values()))
+        return float(self.by_joint(run).sum())
+
+    def by_joint(self, run: Run) -> np.ndarray:
+        """Sums all parts, [joints]."""
+        return sum(self.parts(run).values())
 
     def parts(self, run: Run) -> dict[str, np.ndarray]:
         """Computes the parts by name, [joints] each. Parts whose signals the run lacks are left out.
@@ -93,7 +98,9 @@ class Disagreement:
         if commanded is not None and "tau" in run.signals:
             found["torque"] = run.signals["tau"], commanded
         if "target" in run.signals:
-            found["target"] = run.signals["target"], position
+            on = run.signals.get("enabled", np.ones(len(run.time))) > 0
+            pair = run.signals["target"], position
+            found["target"] = tuple(one[on] - one[on].mean(axis=0) if on.any() else 0.0 * one for one in pair)
         given = commanded if commanded is not None else run.signals.get("tau")
         if self.dynamics and given is not None:
             needed, rows = self.needed(run)

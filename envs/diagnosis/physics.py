@@ -20,8 +20,11 @@ from envs.readings import quantum_of
 _BETTER = 0.25  # in units of one joint's whole signal
 _SHARE = 0.1  # of the disagreement before
 _MOST_REPAIRS = 3
+_HALF = 0.6  # of what the joints of a change of units disagree, and may still disagree after it
+_LEAST_MOTION = (1e-3, 5.0)  # rad or m, and quanta: a joint that moves less says nothing of its sign, order or unit
 _KEPT_ROWS = 1500  # of a long run; more take time and change nothing
-_UNITS = ("degrees", "radians twice", "millimetres", "millinewtonmetres")
+_ANGLES = ("degrees", "radians twice", "millimetres")
+_UNITS = (*_ANGLES, "millinewtonmetres")
 _LEAST_UNITS = 1.0  # by which a change of units must lower `Disagreement.magnitudes` to be tried with another repair
 _DELAYS_S = (0.004, 0.008, 0.012, 0.016, 0.024, 0.032, 0.045)
 _LONGEST_DELAY = 0.25  # of the rows, so that most of them remain
@@ -54,6 +57,8 @@ def physics(run: Run, joints: tuple[str, ...], model: mujoco.MjModel, held: bool
       Findings: repairs in the order in which they were made, then drift of the clock and quantisation.
     """
     run, done = _thinned(run), []
+    if not _moving(run).any():
+        return []
     # With coarse encoders accelerations are mostly rounding errors, so the inverse dynamics are not compared.
     disagreement = Disagreement(run, joints, model, held and not _is_coarse(run))
     turns = np.array([model.joint(name).type[0] == mujoco.mjtJoint.mjJNT_HINGE for name in joints])
@@ -89,8 +94,15 @@ def _summed(repairs: list[_Repair]) -> list[_Repair]:
 
 def _best(chains: list[list[_Repair]], run: Run, disagreement: Disagreement) -> tuple[list[_Repair], Run, float]:
     """Returns the chain of repairs after which a run disagrees least, the repaired run, and its disagreement."""
-    found = [(chain, reduce(lambda run, repair: repair.apply(run), chain, run)) for chain in chains]
-    return min(((chain, one, disagreement(one)) for chain, one in found), key=lambda each: each[2])
+    found, before = [], disagreement.by_joint(run)
+    for chain in chains:
+        repaired = reduce(lambda run, repair: repair.apply(run), chain, run)
+        after = disagreement.by_joint(repaired)
+        # Wrong units spoil all that is compared of a joint. If much remains, sizes have changed for another reason.
+        named = [list(one.joints) or slice(None) for one in chain if one.kind in _ANGLES]
+        explained = all(after[joints].sum() < _HALF * before[joints].sum() for joints in named)
+        found.append((chain, repaired, float(after.sum()) if explained else np.inf))
+    return min(found, key=lambda each: each[2])
 
 
 def _believed(now: float, then: float) -> bool:
@@ -130,7 +142,7 @@ def _repairs(run: Run, disagreement: Disagreement, turns: np.ndarray) -> list[_R
         found += _positions(label, angles, turns) if angles else []
     if "tau" in run.signals:
         found.append(_Repair("millinewtonmetres", "tau", (), 1e-3, _on(("tau",), lambda v: v * 1e-3)))
-    return found + _delays(run, measured) + _offsets(run, disagreement)
+    return found + _delays(run, measured, disagreement) + _offsets(run, disagreement)
 
 
 def _positions(label: str, names: tuple[str, ...], turns: np.ndarray) -> list[_Repair]:
@@ -156,12 +168,13 @@ def _on(names: tuple[str, ...], change: Callable[[np.ndarray], np.ndarray]) -> C
     return lambda run: replace(run, signals={**run.signals, **{name: change(run.signals[name]) for name in names}})
 
 
-def _delays(run: Run, measured: tuple[str, ...]) -> list[_Repair]:
+def _delays(run: Run, measured: tuple[str, ...], disagreement: Disagreement) -> list[_Repair]:
     """Repairs of a delay: all measured signals taken earlier, or velocities alone."""
     period, found = float(np.median(np.diff(run.time))), []
     # Only the inverse dynamics distinguish a delay from the time that a joint takes to follow its target; behind coarse
-    # encoders they are not compared.
-    groups = {"dq": ("dq",)} | ({} if _is_coarse(run) else {"measured": measured})
+    # encoders and without torques they are not compared.
+    told_apart = "dynamics" in disagreement.parts(run) and not _is_coarse(run)
+    groups = {"dq": ("dq",)} | ({"measured": measured} if told_apart else {})
     for label, names in groups.items():
         for delay in _DELAYS_S if "target" in run.signals and set(names) <= set(measured) else ():
             rows = round(delay / period)
@@ -204,17 +217,18 @@ def _offsets(run: Run, disagreement: Disagreement) -> list[_Repair]:
 
 def _drift(run: Run, disagreement: Disagreement) -> list[Finding]:
     """Finds a clock that runs fast or slow: velocities and slopes of positions differ by one factor at all joints."""
-    if "dq" not in run.signals:
+    moving = _moving(run)
+    if "dq" not in run.signals or not moving.any():
         return []
-    slope = disagreement.motion(run)[1]
+    speed, slope = run.signals["dq"][:, moving], disagreement.motion(run)[1][:, moving]
     # With a fast clock time stamps are too far apart, and slopes of positions too small.
-    ratio = (run.signals["dq"] * slope).sum(axis=0) / np.maximum((slope**2).sum(axis=0), 1e-12)
+    ratio = (speed * slope).sum(axis=0) / np.maximum((slope**2).sum(axis=0), 1e-12)
     drift = float(np.median(ratio) - 1.0)
-    apart = [relative_difference(run.signals["dq"], slope * factor).mean() for factor in (1.0, np.median(ratio))]
+    apart = [relative_difference(speed, slope * factor).mean() for factor in (1.0, np.median(ratio))]
     if abs(drift) < _LEAST_DRIFT or np.ptp(ratio) > 0.5 * abs(drift) or apart[1] > 0.6 * apart[0]:
         return []
-    speed = "fast" if drift > 0 else "slow"
-    text = f"the clock drifts: it is {abs(drift):.1%} too {speed}, by velocities against positions"
+    pace = "fast" if drift > 0 else "slow"
+    text = f"the clock drifts: it is {abs(drift):.1%} too {pace}, by velocities against positions"
     return [Finding("clock drift", "t", (), drift, text)]
 
 
@@ -228,7 +242,16 @@ def _coarse(run: Run, joints: tuple[str, ...]) -> list[Finding]:
 
 
 def _is_coarse(run: Run) -> bool:
-    return quantum_of(run.signals["q"]).max() > _COARSE * float(np.median(np.ptp(run.signals["q"], axis=0)))
+    span = np.ptp(run.signals["q"], axis=0)
+    # Joints that hardly move say nothing of the motion.
+    moves = span > 0.1 * span.max()
+    return not moves.any() or quantum_of(run.signals["q"])[moves].max() > _COARSE * float(np.median(span[moves]))
+
+
+def _moving(run: Run) -> np.ndarray:
+    """Tells which joints move far enough to be compared, [joints]."""
+    least, quanta = _LEAST_MOTION
+    return np.ptp(run.signals["q"], axis=0) > np.maximum(least, quanta * quantum_of(run.signals["q"]))
 
 
 _SENTENCES: Mapping[str, str] = {

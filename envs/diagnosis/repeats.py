@@ -21,7 +21,8 @@ _NEAR = 25  # rows before and after a stay, from which noise is estimated
 _LEAST_QUANTA = 3.0  # of motion before and after a stay, for its speed to be known
 _MISSED_QUANTA = 1.75  # of motion that must have been seen during the stay
 _CHANCE = 0.3  # stays that noise may bring about in a run, at most
-_FAR = 0.3  # of the joint's own range of motion
+_FAR = (0.3, 5.0, 2e-3)  # of the joint's own range of motion, quanta, and rad or m
+_FAST_QUANTA = 2.0  # below which a speed may be of rounding alone
 
 
 def repeated(run: Run) -> np.ndarray:
@@ -64,8 +65,12 @@ def _passes(run: Run, first: int, last: int, quanta: np.ndarray) -> bool:
 
 def _driven(run: Run, first: int, last: int) -> bool:
     """Whether recorded speeds, constant in a stay, would have moved a joint far."""
-    speed = np.abs(run.signals["dq"][first]) if "dq" in run.signals else np.zeros(run.signals["q"].shape[1])
-    far = np.maximum(_FAR * np.ptp(run.signals["q"], axis=0), 1e-6)
+    if "dq" not in run.signals:
+        return False
+    position, speed = run.signals["q"], np.abs(run.signals["dq"][first])
+    speed = np.where(speed > _FAST_QUANTA * quantum_of(run.signals["dq"]), speed, 0.0)
+    share, quanta, least = _FAR
+    far = np.maximum(np.maximum(share * np.ptp(position, axis=0), quanta * quantum_of(position)), least)
     return bool((speed * (run.time[last] - run.time[first]) > far).any())
 
 

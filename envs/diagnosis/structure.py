@@ -15,6 +15,7 @@ _SHORT = 3.25  # usual steps: the longest gap over which readings can be interpo
 _FEW = 0.01  # share of the steps that may be short gaps
 _SOON, _IN_STEP = 3, 0.3  # rows after a late one, and usual steps from their place, by which the clock is in step again
 _APART = 1.4  # ratio of two steps, one of which is a hole and the other none
+_PACE = 0.95  # quantile of the steps: one that is as long as these is a pace of the clock
 
 
 def structure(run: Run) -> tuple[list[Finding], Run]:
@@ -68,7 +69,8 @@ def _longest_usual(steps: np.ndarray) -> float:
     """
     longer = np.sort(steps[steps >= np.median(steps)])
     apart = np.flatnonzero(longer[1:] > _APART * longer[:-1])
-    return float(longer[apart[0]] if len(apart) else longer[-1])
+    # Stamps of whole milliseconds at 700 rows a second are 1 or 2 ms apart.
+    return max(float(longer[apart[0]] if len(apart) else longer[-1]), 1.01 * float(np.quantile(steps, _PACE)))
 
 
 def _in_step_again(time: np.ndarray, row: int, period: float) -> bool:

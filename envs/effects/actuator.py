@@ -5,9 +5,10 @@ Several of them look alike in a log (delay and lag; mass, friction and torque sc
 separates it from the others.
 """
 
+import jax
 import jax.numpy as jnp
 
-from envs.effects.memory import as_it_is, delay_line, delayed, lagged
+from envs.effects.memory import PAST_STEP_S, as_it_is, delay_line, delayed, lagged
 from jaxtune.types import Effect, Form, Parameter
 
 _ACTUATOR = {"family": "actuator", "on": "joint"}
@@ -52,12 +53,29 @@ def _command_delay(values, target, now, memory):
     return delayed(memory, target, values["seconds"], now.dt)
 
 
+def _last_target(values, targets, dt):
+    """Starts a delay line of the last of past targets [past, joints]."""
+    return delay_line(values, jnp.atleast_2d(targets)[-1], dt)
+
+
 def _target_slew(values, target, now, memory):
     """d target' / dt = clip((target - target') / dt, -rate, rate); `values` hold 1 / rate."""
-    step = now.dt / jnp.maximum(values["rad_per_s"], 1e-9)
     # The memory is the limited target itself.
-    memory = memory + jnp.clip(target - memory, -step, step)
+    memory = _nearer(values, memory, target, now.dt)
     return memory, memory
+
+
+def _nearer(values, limited, target, dt):
+    step = dt / jnp.maximum(values["rad_per_s"], 1e-9)
+    return limited + jnp.clip(target - limited, -step, step)
+
+
+def _followed(values, targets, dt):
+    """Starts with a limited target that has followed past targets [past, joints] from the first of them."""
+    del dt
+    targets = jnp.atleast_2d(targets)
+    follow = lambda limited, target: (_nearer(values, limited, target, PAST_STEP_S), None)  # noqa: E731
+    return jax.lax.scan(follow, targets[0], targets[1:])[0]
 
 
 def _deadband(values, error, now, memory):
@@ -88,7 +106,7 @@ ROWS = (
         parameters=(_SECONDS,),
         sizes=(0.001, 0.008),
         act=_command_delay,
-        start=delay_line,
+        start=_last_target,
         sentence="Targets act later than they are sent.",
         excited_by="steps and a chirp to 10 Hz at two controller gains",
         **_ACTUATOR,
@@ -99,7 +117,7 @@ ROWS = (
         parameters=(Parameter(name="rad_per_s", form="reciprocal", scale="speed", bounds=(0.0, 3.0), prior=0.5),),
         sizes=(0.05, 0.6),
         act=_target_slew,
-        start=as_it_is,
+        start=_followed,
         sentence="The controller limits how fast its target may move.",
         excited_by="steps of two sizes",
         **_ACTUATOR,
@@ -117,7 +135,7 @@ ROWS = (
     Effect(
         name="deadband",
         enters="error",
-        parameters=(Parameter(name="rad", bounds=(0.0, 0.2), prior=0.02),),
+        parameters=(Parameter(name="rad", scale="angle", bounds=(0.0, 0.2), prior=0.02),),
         sizes=(0.003, 0.02),
         act=_deadband,
         sentence="The controller ignores small errors.",

@@ -36,7 +36,7 @@ ROWS = (
     Effect(
         name="coulomb",
         enters="friction",
-        parameters=(Parameter(name="torque_nm", scale="torque", bounds=(0.0, 5.0), prior=0.3),),
+        parameters=(Parameter(name="torque_nm", scale="torque", bounds=(-0.5, 5.0), prior=0.3),),
         sizes=(0.03, 0.3),
         act=_coulomb,
         forms=(_PRESLIDING, _DIRECTION),

@@ -9,6 +9,9 @@ import jax.numpy as jnp
 LONGEST_S = 0.04
 """Longest delay that a line can hold, in s. Simulations start with at least as much history (`envs.segments`)."""
 
+PAST_STEP_S = 0.01
+"""Time in s between the positions and targets that lead to the history of a segment (`envs.segments`)."""
+
 
 def as_it_is(values, signal: jax.Array, dt: float) -> jax.Array:
     """Starts the memory of a lag or a slew limit whose input has always been this signal: the signal itself.

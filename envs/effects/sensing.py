@@ -72,7 +72,7 @@ ROWS = (
         name="encoder_bias",
         on="joint",
         enters="sensor",
-        parameters=(Parameter(name="rad", bounds=(-0.3, 0.3), prior=0.02),),
+        parameters=(Parameter(name="rad", scale="angle", bounds=(-0.3, 0.3), prior=0.02),),
         sizes=(0.004,),
         act=_encoder_bias,
         undo=_undo_bias,

@@ -89,7 +89,7 @@ ROWS = (
     Effect(
         name="backlash",
         enters="transmission",
-        parameters=(Parameter(name="rad", bounds=(0.0, 0.2), prior=0.02),),
+        parameters=(Parameter(name="rad", scale="angle", bounds=(0.0, 0.2), prior=0.02),),
         sizes=(0.003, 0.02),
         act=_backlash,
         start=_taken_up,

@@ -25,6 +25,7 @@ _HORIZON_ROWS = (4, 12, 36)  # least lengths by default; the first is the least 
 _PARTS = {"train": (0.0, 0.5), "select": (0.5, 0.75), "sealed": (0.75, 1.0)}  # of a run that is cut in time
 _LEAST_ROWS = 8  # of such a part
 _LEAST_SEGMENTS = 3  # of a split: a bootstrap needs a few to draw from
+_ALIKE = 0.05  # of the log's range of positions and speeds, by which repetitions of a segment may begin apart
 _ENOUGH, _ENOUGH_S = (40, 128), 20.0  # segments of a split that are simulated, and their length together in s
 
 
@@ -171,7 +172,7 @@ def cut_log(log: Log, dt: float, signals: Sequence[str], horizons: Sequence[floa
                     "more: record longer runs or more of them, or choose shorter horizons"
                 )
             mine = np.flatnonzero(mine)
-            repeats = _repeats(log, cut.run[mine], cut.row[mine])
+            repeats = _repeats(log, estimates, cut.run[mine], cut.row[mine])
             kept = _spread(repeats, horizon)
             mine = mine[kept]
             data[split][horizon] = Segments(
@@ -185,21 +186,32 @@ def cut_log(log: Log, dt: float, signals: Sequence[str], horizons: Sequence[floa
     return data
 
 
-def _repeats(log: Log, run: np.ndarray, row: np.ndarray) -> np.ndarray:
-    """Groups segments in which several runs of a condition were told the same, [segments]; -1 for all others.
+def _repeats(log: Log, estimates: Sequence[segments.Estimate], run: np.ndarray, row: np.ndarray) -> np.ndarray:
+    """Groups segments in which several runs of a condition were told the same and began alike.
 
     Args:
       log: of the runs.
+      estimates: of the runs.
       run: [segments] index of each segment's run.
       row: [segments, rows] of that run.
+
+    Returns:
+      [segments] the group of each; -1 for those that are alone.
     """
-    told: dict[tuple, list[int]] = {}
+    told: dict[tuple, list[list[int]]] = {}
     conditions = [(one.condition, str(one.controller)) for one in log.runs]
+    far = _ALIKE * np.ptp(np.concatenate([one.states for one in estimates]), axis=0)
+    begins = np.array([estimates[mine].states[rows[0]] for mine, rows in zip(run, row, strict=True)])
     for number, (mine, rows) in enumerate(zip(run, row, strict=True)):
-        one = log.runs[mine]
-        target = one.signals["target"][rows] if "target" in one.signals else one.signals["tau"][rows]
-        told.setdefault((*conditions[mine], rows[0], target.round(6).tobytes()), []).append(number)
-    groups = np.full(len(run), -1)
-    for group, numbers in enumerate(numbers for numbers in told.values() if len(numbers) > 1):
-        groups[numbers] = group
-    return groups
+        signals = log.runs[mine].signals
+        sent = signals["target"][rows] if "target" in signals else signals["tau"][rows]
+        on = signals["enabled"][rows] > 0 if "enabled" in signals else np.ones(len(rows), bool)
+        groups = told.setdefault((*conditions[mine], rows[0], sent.round(6).tobytes(), on.tobytes()), [])
+        alike = (group for group in groups if (np.abs(begins[number] - begins[group[0]]) <= far).all())
+        group = next(alike, None)
+        groups.append([number]) if group is None else group.append(number)
+    found = np.full(len(run), -1)
+    together = (group for groups in told.values() for group in groups if len(group) > 1)
+    for number, members in enumerate(together):
+        found[members] = number
+    return found

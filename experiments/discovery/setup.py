@@ -184,6 +184,7 @@ def build_question(
     library = {name: row for name, row in rig.effects.items() if name in LIBRARY}
     every = hypotheses(rig.axes, rig.places, library)
     unknowns, unknown_bounds = unknown_directions(rig.axes, rig.control_hz, signals)
+    bin_rows = segments.rows_together(1.0 / log.rate_hz, BIN_S)
     measured = cut_log(log, rig.dt, signals, horizons)
     simulated = simulate_null_logs(log, spec, null_logs, seed)
     nulls = [told_alike(cut_log(one, rig.dt, signals, horizons), measured) for one in simulated]
@@ -200,15 +201,22 @@ def build_question(
         axis_trees=np.array([_one_tree(rig.trees[list(axis.joints)]) for axis in rig.axes]),
         data=measured,
         null_logs=nulls,
-        bin_rows=segments.rows_together(1.0 / log.rate_hz, BIN_S),
+        bin_rows=bin_rows,
         regimes=REGIMES,
         components={name: tuple("xyz") if name == "gravity" else rig.joints for name in signals},
+        least_floor=_least_floor(unsealed, signals, bin_rows),
         push={joint: axes["constant_push", joint] for joint in rig.joints},
         forms=forms(rig.axes, rig.effects, every),
         residual=learned_torque(rig.axes, LEARNED),
     )
     names = {split: tuple(run.name for run in runs) for split, runs in splits(log).items()}
     return Question(problem, spec, rig, names, (*log.notes, *notes, *_stale_notes(unsealed)))
+
+
+def _least_floor(runs: Sequence[Run], signals: Sequence[str], bin_rows: int) -> np.ndarray:
+    """What the noise of the readings leaves in the mean of a bin, [cells] in the order of `Problem.cells`."""
+    noise = [np.median([readings.noise_of(run, name) for run in runs], axis=0) for name in sorted(signals)]
+    return np.concatenate(noise) / np.sqrt(bin_rows)
 
 
 def _one_tree(trees: np.ndarray) -> int:

@@ -27,6 +27,7 @@ _STEPS = 5  # of the fits to null logs; a tenth off in the parameters, one step 
 _FITTED = 64  # segments of a null log that its fit sees, at most
 _FEW = 8  # null logs that scales are measured on, at most
 _REPEATED = 8  # repetitions of segments that it takes to tell how far they differ
+_BROKEN = 5.0  # times the median rms of null logs, beyond which a simulation may have come apart
 _LEAST_SHARE = 0.25  # of a component's mean floor: else the first rows of a segment would count without end
 
 Say = Callable[[str], None]
@@ -110,11 +111,11 @@ def measure(problem: Problem, say: Say) -> NoiseFloor:
         # All logs where thresholds come from them too; for a scale a few are enough.
         logs = {split: len(fits) if (split, horizon) == ("train", main) else _FEW for split in problem.data}
         left = {split: _simulated(problem, split, horizon, fits[: logs[split]]) for split in problem.data}
-        sound = {split: _finite(values) for split, values in left.items()}
+        sound = {split: _sound(values, _spread(problem, split, horizon)) for split, values in left.items()}
         left = {split: values[sound[split]] for split, values in left.items()}
         shared = {split: _shared(values) for split, values in left.items()}
         left = {split: values - shared[split] for split, values in left.items()}
-        scale = {split: _rms_floor(values) for split, values in left.items()}
+        scale = {split: np.maximum(_rms_floor(values), problem.least_floor) for split, values in left.items()}
         wider = _of_repeats(problem, horizon, scale)
         scale = {split: wider * values for split, values in scale.items()}
         in_units = left["train"] / scale["train"]
@@ -199,7 +200,8 @@ def _fit_null_logs(problem: Problem, prior: Free) -> tuple[np.ndarray, np.ndarra
         # What broke in the nominal model already says nothing.
         raw = np.where(np.isfinite(raw), raw, 0.0)
         last, known = coordinates, raw
-        unit = np.sqrt((raw**2).mean(axis=(0, 1)))
+        least = np.maximum(problem.least_floor, 1e-9)
+        unit = np.maximum(np.sqrt((raw**2).mean(axis=(0, 1))), least)
         # The first unit holds what the nominal parameters are off, which the second no longer does.
         for _ in range(2 if number == 0 else 1):
             steps = [
@@ -207,25 +209,35 @@ def _fit_null_logs(problem: Problem, prior: Free) -> tuple[np.ndarray, np.ndarra
                 for point, log in zip(coordinates, raw, strict=True)
             ]
             left = np.stack([log + slopes @ step for log, step in zip(raw, steps, strict=True)])
-            unit = np.maximum(np.sqrt((left**2).mean(axis=(0, 1))), 1e-9)
+            unit = np.maximum(np.sqrt((left**2).mean(axis=(0, 1))), least)
             share = independent_share((left / unit).reshape(-1, *unit.shape))
         coordinates = np.clip(coordinates + np.stack(steps), *prior.bounds.T)
     return coordinates, unit
 
 
-def _finite(left: np.ndarray) -> np.ndarray:
+def _sound(left: np.ndarray, spread: np.ndarray) -> np.ndarray:
     """Tells which null logs [logs, segments, bins, components] decide: those that their own models simulate.
+
+    A simulation that comes apart leaves more than the signal's own spread [components], and more than other logs do.
 
     Raises:
       ValueError: fewer than two.
     """
-    found = np.isfinite(left).all(axis=(1, 2, 3))
+    rms = np.sqrt((left**2).mean(axis=(1, 2)))
+    usual = np.nanmedian(np.where(np.isfinite(rms), rms, np.nan), axis=0) if np.isfinite(rms).any() else 0.0
+    found = np.isfinite(rms).all(axis=1) & ~(rms > np.maximum(spread, _BROKEN * usual)).any(axis=1)
     if found.sum() < 2:
         raise ValueError(
-            f"null logs: got {found.sum()} of {len(left)} that the nominal model simulates with finite values, "
-            "expected at least 2; the model may be unstable at the log's rate and gains"
+            f"null logs: got {found.sum()} of {len(left)} that the nominal model simulates, expected at least 2; "
+            "the model may be unstable at the log's rate and gains"
         )
     return found
+
+
+def _spread(problem: Problem, split: str, horizon: float) -> np.ndarray:
+    """Standard deviations of the measured signals, [components]."""
+    signals = problem.data[split][horizon].signals
+    return np.concatenate([signals[name].std(axis=(0, 1)) for name in sorted(problem.components)])
 
 
 def _step(prior: Free, point: np.ndarray, residual: np.ndarray, slopes: np.ndarray, share: float) -> np.ndarray:

@@ -139,6 +139,8 @@ class Problem:
     """[axes]: number of the tree whose joints an axis moves; -1 where it may move several."""
     values: Callable[[np.ndarray], np.ndarray] = lambda vectors: vectors
     """Turns coordinates [n, axes] into what the simulator is given, [n, axes]."""
+    least_floor: np.ndarray = field(default_factory=lambda: np.zeros(()))
+    """[cells]: what noise and rounding leave in the mean of a bin; the noise floor is never below it."""
     push: Mapping[str, int] = field(default_factory=dict)
     """Axis of a constant torque by joint, with which `localise` asks where a torque is missing; empty to skip that."""
     forms: Sequence[Hypothesis] = ()

@@ -318,3 +318,83 @@ def test_a_suspicion_is_reported_once_for_all_runs_that_share_it():
     hole = lambda row: Finding("missing rows", "t", (), 0.02, f"rows are missing behind row {row}")  # noqa: E731
     found = {"run_000": [hole(3), hole(9), hole(12)], "run_001": [], "run_002": [hole(5)]}
     assert shared_findings(found) == [(hole(3), ["run_000 (3 times)", "run_002"])]
+
+
+LEVEL = """<mujoco>
+  <default><joint axis="0 1 0" damping="0.1" armature="0.02"/><geom contype="0" conaffinity="0"/></default>
+  <worldbody>
+    <body>
+      <joint name="shoulder"/>
+      <geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.03" mass="1.2"/>
+      <body pos="0.3 0 0">
+        <joint name="elbow"/>
+        <geom type="capsule" fromto="0 0 0 0.25 0 0" size="0.02" mass="0.6"/>
+      </body>
+    </body>
+  </worldbody>
+</mujoco>"""
+
+
+@pytest.mark.parametrize(("kp", "mean"), [(40.0, -0.05), (20.0, -0.05), (20.0, -0.15)])
+@pytest.mark.parametrize("base", ["free", "fixed"])
+def test_joints_that_sag_to_the_other_side_have_no_flipped_sign(kp, mean, base):
+    # Where inverse dynamics are not compared, targets alone say something of signs.
+    spec = mujoco.MjSpec.from_string(LEVEL)
+    (motion,) = excitation(spec, JOINTS, 4, 3.0, 500.0, 0)[:1]
+    target = 0.15 * (motion.target - motion.target.mean(axis=0)) + mean
+    motion = replace(motion, target=target, enabled=np.ones(len(target)))
+    gains = {"kp": np.array([kp, kp / 3.0]), "kd": np.array([2.0, 0.6]), "torque_limit_nm": np.full(2, 15.0)}
+    run = record(spec, JOINTS, [motion], Controller(kind="pd", rate_hz=1000.0, gains=gains), Truth(None), 0.1, 0).runs[
+        0
+    ]
+    assert (run.signals["q"].mean(axis=0) > target.mean(axis=0) + 0.04).all()
+    if base == "fixed":
+        run = measured(run, lambda values: np.round(values / 0.0015) * 0.0015)
+    assert not [one for one in diagnose(run, JOINTS, suspended(spec), base) if one.misleading]
+
+
+def test_joints_that_friction_rules_are_not_in_degrees():
+    # 2 Nm hold them within 40 mrad, while targets move by 120; the nominal model has a fraction of that.
+    spec = mujoco.MjSpec.from_file(str(ARM))
+    for name in JOINTS:
+        spec.joint(name).frictionloss = 2.0
+    model = suspended(spec)
+    model.opt.timestep = 0.0005
+    data, read = mujoco.MjData(model), []
+    target = 0.06 * np.sin(2 * np.pi * 0.002 * np.arange(1500)[:, None] * [0.4, 0.7])
+    for row in target:
+        read.append([*data.qpos, *data.qvel])
+        for _ in range(4):
+            torque = GAINS["kp"] * (row - data.qpos) - GAINS["kd"] * data.qvel
+            data.qfrc_applied[:] = np.clip(torque, -15.0, 15.0)
+            mujoco.mj_step(model, data)
+    read = np.array(read) + [1e-5, 1e-5, 1e-3, 1e-3] * np.random.default_rng(0).standard_normal((1500, 4))
+    run = undamaged(0)
+    signals = run.signals | {"q": read[:, :2], "dq": read[:, 2:], "target": target, "enabled": np.ones(1500)}
+    rubbed = replace(run, time=0.002 * np.arange(1500), signals=signals)
+    assert np.ptp(rubbed.signals["q"], axis=0).max() < 0.05
+    assert diagnose(rubbed, JOINTS, MODEL) == []
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-4])
+def test_a_robot_at_rest_has_no_signs_units_offsets_or_drift(noise):
+    run = undamaged(0)
+    scatter = np.random.default_rng(0).standard_normal((1500, 4)) * noise
+    still = {"q": 0.2 + scatter[:, :2], "dq": 100.0 * scatter[:, 2:], "target": np.full((1500, 2), 0.25)}
+    assert diagnose(replace(run, signals=run.signals | still), JOINTS, MODEL) == []
+
+
+def test_stamps_in_milliseconds_are_no_clock_jumps():
+    run = undamaged(0)
+    time = np.round(np.arange(1500) / 700.0, 3)
+    assert {1.0, 2.0} == set(np.unique(np.round(1e3 * np.diff(time))))
+    kinds = {one.kind for one in diagnose(replace(run, time=time), JOINTS, MODEL)}
+    assert not kinds & {"clock jump", "missing rows", "short gaps"}
+
+
+def test_rounded_speeds_of_a_robot_at_rest_repeat_no_rows():
+    run = undamaged(0)
+    rest = {"q": np.full((1500, 2), 0.2), "dq": np.full((1500, 2), 0.01)}
+    rest["dq"][750:] = 0.0
+    rest["q"][750:] += 1e-3
+    assert "duplicated rows" not in {kind for kind, _ in said(replace(run, signals=run.signals | rest))}

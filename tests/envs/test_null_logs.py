@@ -61,6 +61,33 @@ def test_held_targets_come_half_a_row_later_than_lines(spec):
     assert shifts[np.argmin(apart)] == pytest.approx(0.025, abs=0.006)
 
 
+def test_between_the_ticks_of_a_slow_controller_joints_move_in_curves(spec):
+    # 20 ticks a second; between them the motor holds its torque.
+    run = measured(200.0, dq=np.zeros((400, 2)), known={name: {"noise_sd": np.zeros(2)} for name in ("q", "dq")})
+    run = replace(run, controller=replace(run.controller, rate_hz=20.0, gains={**GAINS, "kp": np.array([4.0, 2.0])}))
+    model = suspended(spec)
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION
+    robot = Robot(model, False, np.random.default_rng(0))
+    motion = play([(robot, run)], ARM_JOINTS)[0]
+    read = as_recorded(robot, run, motion).signals
+    # From tick to tick with the same torques.
+    data = mujoco.MjData(model)
+    tick = 12
+    data.qpos[:], data.qvel[:] = motion.states[tick]
+    data.qfrc_applied[:] = motion.torques[tick]
+    rows = np.flatnonzero((run.time > motion.times[tick]) & (run.time < motion.times[tick + 1]))
+    assert len(rows) >= 8
+    states = []
+    while motion.times[tick] + data.time < motion.times[tick + 1]:
+        states.append([motion.times[tick] + data.time, *data.qpos, *data.qvel])
+        mujoco.mj_step(model, data)
+    states = np.array(states)
+    for name, first in (("q", 1), ("dq", 3)):
+        exact = [np.interp(run.time[rows], states[:, 0], states[:, first + joint]) for joint in range(2)]
+        span = np.ptp(exact[0])
+        np.testing.assert_allclose(read[name][rows].T, exact, atol=0.02 * span)
+
+
 def test_unknown_targets_between_rows_are_drawn_for_every_null_log(spec):
     known = {"q": {"noise_sd": np.zeros(2)}}
     found = {}

@@ -202,6 +202,14 @@ def test_bristles_of_a_segment_are_where_its_motion_has_wound_them(arm):
     assert error(cut.past) < 0.2 * error(np.zeros_like(cut.past))
 
 
+def test_the_imu_reads_the_models_gravity():
+    spec = mujoco.MjSpec.from_string(rigs.ARM)
+    spec.option.gravity = [9.81, 0.0, 0.0]
+    hung = rigs.Player(Rig(spec, rigs.ARM_JOINTS, rigs.CONTROL_HZ))
+    read = hung.play(rigs.segment(hung.rig, START, START))
+    np.testing.assert_allclose(read["gravity"], [[1.0, 0.0, 0.0]] * rigs.STEPS, atol=1e-6)
+
+
 def test_the_imu_reads_gravity_as_it_is_mounted(arm):
     segment = rigs.segment(arm.rig, START, START)
     np.testing.assert_allclose(arm.play(segment)["gravity"], [[0.0, 0.0, -1.0]] * rigs.STEPS, atol=1e-6)
@@ -321,6 +329,16 @@ def test_a_tenth_of_a_field_stays_when_an_effect_takes_from_it(arm):
     # The arm's armature is 0.01 kg m^2; a coordinate stands for 0.11 and 0.03 of them.
     np.testing.assert_allclose(least["armature", "shoulder"], -0.009 / 0.11, rtol=1e-6)
     np.testing.assert_allclose(least["armature", "elbow"], -0.009 / 0.03, rtol=1e-6)
+    # It has no dry friction, of which nothing can be taken.
+    assert least["coulomb", "elbow"] == 0.0
+
+
+def test_dry_friction_of_the_model_can_be_taken_as_well():
+    spec = mujoco.MjSpec.from_string(rigs.ARM)
+    spec.joint("elbow").frictionloss = 0.05
+    rig = Rig(spec, rigs.ARM_JOINTS, rigs.CONTROL_HZ)
+    least = {(axis.effect, axis.place): axis.least for axis in rig.axes}
+    assert least["coulomb", "elbow"] == pytest.approx(-0.045)
 
 
 def test_a_vector_has_its_axes_by_effect_parameter_and_place(arm):

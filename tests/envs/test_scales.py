@@ -42,3 +42,28 @@ def test_a_torque_of_one_is_what_moves_the_joint(kp):
         # The weight of 0.6 kg, 0.125 m from the elbow, would be 0.74 Nm if it hung level.
         assert 0.05 < found["torque"][1] < 2.0
     np.testing.assert_allclose(found["damping"] * found["speed"], found["torque"], rtol=1e-5)
+
+
+def test_a_slide_has_no_angles():
+    xml = ARM.replace('name="elbow"', 'name="elbow" type="slide"')
+    time = np.arange(400) / 200.0
+    moved = 0.1 * np.sin(2 * np.pi * time)[:, None] * [1.0, 0.5]
+    run = Run(
+        name="run_000",
+        condition="a",
+        split=None,
+        controller=Controller(
+            kind="pd",
+            rate_hz=500.0,
+            gains={"kp": np.full(2, 40.0), "kd": np.full(2, 2.0), "torque_limit_nm": np.full(2, 15.0)},
+        ),
+        time=time,
+        signals={"q": moved, "target": 1.2 * moved},
+    )
+    rig = Rig(mujoco.MjSpec.from_string(xml), ARM_JOINTS, 500.0)
+    found = measure_scales(rig, [run])
+    np.testing.assert_allclose(found["angle"], [1.0, 0.05])
+    np.testing.assert_allclose(found["stiffness"], found["torque"] / [0.02, 0.001], rtol=1e-6)
+    for name in ("deadband", "backlash", "encoder_bias"):
+        axes = {axis.place: axis.scale for axis in rig.scaled(found).axes if axis.effect == name}
+        assert axes == pytest.approx({"shoulder": 1.0, "elbow": 0.05})

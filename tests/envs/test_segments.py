@@ -344,6 +344,26 @@ def test_targets_between_rows_are_held_or_lines_or_unknown(moving):
     np.testing.assert_allclose(line[0, :150, 0] - line[0, 0, 0], first[:150], atol=1e-3)
 
 
+def test_targets_of_two_seconds_lead_to_a_segment():
+    time = times(4.0)
+    number = np.arange(len(time), dtype=float)[:, None] * [1.0, -1.0]
+    cut = segments.cut([run(time, target=number)], 0.15, DT)
+    past, first = np.asarray(cut.segments.past_target), np.asarray(cut.segments.target)[:, 0]
+    assert past.shape[1:] == (201, 2)
+    np.testing.assert_array_equal(past[:, -1], first)
+    # Every second row, from the run's first one on.
+    expected = np.maximum(first[:, None, 0] - 2.0 * np.arange(200, -1, -1), 0.0)
+    np.testing.assert_array_equal(past[..., 0], expected)
+
+
+def test_torques_between_rows_are_lines_where_the_log_says_so(moving):
+    number = np.arange(len(moving.time), dtype=float)[:, None] * [1.0, -1.0]
+    fed = run(moving.time, q=moving.signals["q"], target=None, tau=number)
+    fed = replace(fed, controller=replace(fed.controller, between_rows="linear"))
+    feed = np.asarray(segments.cut([fed], 0.15, DT).segments.feed)
+    np.testing.assert_allclose(feed[0, :150, 0] - feed[0, 0, 0], np.arange(150) / 5.0, atol=1e-3)
+
+
 def test_a_controller_looks_at_its_rate(moving):
     cut = segments.cut([moving], 0.15, DT)
     # 200 Hz at a millisecond: every fifth step, the start among them; the first step of all has nothing to hold.

@@ -219,3 +219,20 @@ def test_segments_in_which_runs_were_told_the_same_are_repeats(played):
     assert (again.repeats >= 0).all()
     assert (found["select"][0.24].repeats < 0).all()
     assert (found["sealed"][0.24].repeats < 0).all()
+
+
+def test_segments_that_begin_elsewhere_or_without_motors_are_no_repeats(played):
+    (one,) = played.runs
+    on = np.ones(len(one.time))
+    one = replace(one, signals={**one.signals, "enabled": on})
+    off = replace(one, signals={**one.signals, "enabled": np.where(one.time < 9.0, on, 0.0)})
+    elsewhere = replace(one, signals={**one.signals, "q": one.signals["q"] + [0.3, 0.0]})
+    named = lambda run, number, split: replace(run, name=f"{split}_{number}", condition=split, split=split)  # noqa: E731
+    runs = [named(one, 0, "train"), named(off, 1, "train"), named(one, 0, "select"), named(elsewhere, 1, "select")]
+    found = cut_log(replace(played, runs=(*runs, named(one, 0, "sealed"))), 0.001, ("q",), (0.24,))
+    train = found["train"][0.24]
+    for group in np.unique(train.repeats[train.repeats >= 0]):
+        assert (train.repeats == group).sum() == 2
+    # Motors are on in the first half alone.
+    assert 0.3 < (train.repeats >= 0).mean() < 0.7
+    assert (found["select"][0.24].repeats < 0).all()

@@ -245,6 +245,13 @@ def test_a_slow_controller_follows_its_target_at_its_speed():
     np.testing.assert_allclose(got[:, 1], -0.001 * steps, atol=1e-6)
 
 
+def test_a_slow_controller_is_behind_what_it_was_told_seconds_ago():
+    # Told to move by 1 rad 0.3 s ago, at 2 rad/s it has come 0.6 rad.
+    past = np.concatenate([np.zeros(171), np.ones(30)])[:, None] * [1.0, -1.0]
+    got = EVERY["target_slew"].start(values_of(EVERY["target_slew"], rad_per_s=[2.0, 5.0]), jnp.asarray(past), DT)
+    np.testing.assert_allclose(got, [0.6, -1.0], atol=1e-5)
+
+
 def test_a_deadband_swallows_half_its_width_on_each_side():
     errors = [[0.005, -0.005], [0.03, -0.03], [0.01, 0.0]]
     expected = [[0.0, 0.0], [0.02, -0.02], [0.0, 0.0]]

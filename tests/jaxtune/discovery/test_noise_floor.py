@@ -60,6 +60,33 @@ def test_a_null_log_that_breaks_decides_nothing():
         measure(spoilt(problem, range(1, count)), lambda text: None)
 
 
+def test_a_null_log_that_comes_apart_widens_nothing():
+    problem = toy.problem({})
+    at = problem.main_horizon
+    whole = measure(problem, lambda text: None)[at]
+    every = [dict(log) for log in problem.null_logs]
+    segments = every[1]["train"][at]
+    every[1]["train"] = {
+        **every[1]["train"],
+        at: replace(
+            segments,
+            signals={"q": 1e3 + segments.signals["q"]}
+            | {name: values for name, values in segments.signals.items() if name != "q"},
+        ),
+    }
+    found = measure(replace(problem, null_logs=every), lambda text: None)[at]
+    assert len(found.null_residuals) == len(whole.null_residuals) - 1
+    np.testing.assert_allclose(found.scale["train"].mean(axis=0), whole.scale["train"].mean(axis=0), rtol=0.2)
+
+
+def test_a_component_that_never_changes_has_the_floor_of_its_noise(monkeypatch):
+    monkeypatch.setattr(toy, "NOISE", 0.0)
+    monkeypatch.setattr(toy, "DRAWS", np.zeros((6, 2)))
+    problem = replace(toy.problem({}), least_floor=np.array([1e-3, 2e-3]))
+    floor = measure(problem, lambda text: None)[problem.main_horizon]
+    np.testing.assert_allclose(floor.scale["train"], [[1e-3, 2e-3]] * len(floor.scale["train"]))
+
+
 def floor_of_repeats(masses, told_alike=True):
     """Mean floor [components] where a motion of train was repeated by sliders whose masses are off by so much."""
     problem = toy.problem({})
