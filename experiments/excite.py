@@ -61,6 +61,9 @@ def main(args: Args) -> None:
     _check(args)
     robot, joints, controller, convention = _described(args) if args.like is None else _alike(args.like, args.robot)
     spec = models.spec(robot)
+    stiffness = controller.gains.get("kp")
+    if stiffness is not None and not stiffness.any():
+        raise ValueError("kp: got 0 for every joint, expected a joint that follows its target")
     runs = tuple(
         Run(
             name=one.name,
@@ -68,7 +71,7 @@ def main(args: Args) -> None:
             split=one.split,
             controller=scaled(controller, one.gain),
             time=one.time,
-            signals={"target": one.target, "enabled": one.enabled},
+            signals={"target": _followed(one.target, stiffness), "enabled": one.enabled},
         )
         for one in excitation(spec, joints, args.runs, args.seconds, args.rate_hz, args.seed, args.motion)
     )
@@ -86,6 +89,11 @@ def main(args: Args) -> None:
         f"wrote {len(runs)} runs of {args.seconds:g} s for {', '.join(joints)} to {args.out}. Play each run's targets "
         "on the robot, and add the measured columns to its file or a copy of it: q.*, and dq.* if there is a sensor."
     )
+
+
+def _followed(target: np.ndarray, stiffness: np.ndarray | None) -> np.ndarray:
+    """Holds the targets [rows, joints] of passive joints, which cannot follow any."""
+    return target if stiffness is None else np.where(stiffness > 0, target, target[0])
 
 
 def _described(args: Args) -> tuple[str, tuple[str, ...], Controller, Convention]:

@@ -1,5 +1,7 @@
 """Finds contacts that a suspended or clamped robot must have had, by the model's geometry at the measured positions."""
 
+from collections.abc import Sequence
+
 import mujoco
 import numpy as np
 
@@ -19,26 +21,41 @@ def contacts(run: Run, joints: tuple[str, ...], model: mujoco.MjModel) -> list[F
       joints: names of the joints, in the log's order.
       model: of the robot with contacts and a fixed base.
     """
-    data = mujoco.MjData(model)
-    address = [int(model.joint(name).qposadr[0]) for name in joints]
-    rows = np.unique(np.linspace(0, len(run.time) - 1, _ROWS).astype(int))
-    touched: dict[tuple[str, str], int] = {}
-    for row in rows:
-        data.qpos[address] = run.signals["q"][row]
-        mujoco.mj_fwdPosition(model, data)
-        deep = data.contact.geom[data.contact.dist < -_DEEP_M]
-        pairs = {tuple(sorted(model.body(body).name for body in model.geom_bodyid[pair])) for pair in deep}
-        for pair in pairs:
-            touched[pair] = touched.get(pair, 0) + 1
+    shares = touching(model, joints, run.signals["q"])
     return [
         Finding(
             "contact",
             "q",
             (),
-            count / len(rows),
-            f"by the model's geometry {one} touches {other} in {count / len(rows):.0%} of the rows; record a robot "
+            share,
+            f"by the model's geometry {one} touches {other} in {share:.0%} of the rows; record a robot "
             "that touches nothing, or correct the geometry: contacts are not simulated",
         )
-        for (one, other), count in touched.items()
-        if _SHARES[0] < count / len(rows) < _SHARES[1]
+        for (one, other), share in shares.items()
+        if _SHARES[0] < share < _SHARES[1]
     ]
+
+
+def touching(model: mujoco.MjModel, joints: Sequence[str], positions: np.ndarray) -> dict[tuple[str, str], float]:
+    """Finds pairs of bodies that go into each other by more than 2 mm.
+
+    Args:
+      model: of the robot with contacts and a fixed base.
+      joints: names of the joints, in the columns' order.
+      positions: [rows, joints] rad or m; 50 rows of them are looked at.
+
+    Returns:
+      Share of these rows by the bodies' names.
+    """
+    data = mujoco.MjData(model)
+    address = [int(model.joint(name).qposadr[0]) for name in joints]
+    rows = np.unique(np.linspace(0, len(positions) - 1, _ROWS).astype(int))
+    touched: dict[tuple[str, str], int] = {}
+    for row in rows:
+        data.qpos[address] = positions[row]
+        mujoco.mj_fwdPosition(model, data)
+        deep = data.contact.geom[data.contact.dist < -_DEEP_M]
+        pairs = {tuple(sorted(model.body(body).name for body in model.geom_bodyid[pair])) for pair in deep}
+        for pair in pairs:
+            touched[pair] = touched.get(pair, 0) + 1
+    return {pair: count / len(rows) for pair, count in touched.items()}

@@ -40,8 +40,8 @@ def read(folder: Path, measured: bool = True, model: Path | None = None) -> Log:
     Args:
       folder: with `meta.yaml` and the runs.
       measured: True for a measured log, which needs positions. False for targets that a robot is still to play.
-      model: path of an MJCF in the place of the log's own `robot`. A log's own model, and all that it refers to, must
-        be in its folder; this one may be anywhere.
+      model: path of an MJCF, which may be anywhere, or name of a built-in robot, in the place of the log's own `robot`.
+        A log's own model, and all that it refers to, must be in its folder.
 
     Returns:
       The log in the model's names, units and signs.

@@ -76,7 +76,8 @@ class Meta:
       folder: of the log.
       robots: joints that may be logged, by the name of the built-in robot; None for a log of observations and actions,
         whose robot may have any name, any joints and an unknown controller.
-      model: path of an MJCF that the user names in the place of the log's `robot`; it may be anywhere.
+      model: path of an MJCF that the user names in the place of the log's `robot`, which may be anywhere, or the name
+        of a built-in robot.
 
     Raises:
       ValueError: names the file and the key, what was found and what was expected.
@@ -94,7 +95,8 @@ class Meta:
         meta = self._mapping("", meta, _META if robots is not None else _META | {"base": False, "controller": False})
         self.robot, movable = self._text("robot", meta["robot"]), None
         if model is not None:
-            self.robot, movable = self._read_model(model)
+            built_in = str(model) in (robots or {})
+            self.robot, movable = self._robot(folder, str(model), robots) if built_in else self._read_model(model)
         elif robots is not None:
             self.robot, movable = self._robot(folder, self.robot, robots)
         self.base = self._one_of("base", meta.get("base", "free"), ("fixed", "free"))

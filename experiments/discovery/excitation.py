@@ -9,16 +9,23 @@ The other motions have one of these each. `deciding` chooses the one in which tw
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
 
+from envs.diagnosis.contacts import touching
 from envs.logs import Controller
 from envs.models import suspended
 
 _CHIRP_HZ = (0.5, 10.0)
 _LEAST_ROWS = 10  # of a piece
+_TRIES, _SMALLER = 40, 0.95  # motions that are drawn until none touches, and by how much each is smaller
+
+
+class Touching(ValueError):
+    """Bodies of a robot touch in every motion that was drawn."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,18 +111,21 @@ def deciding(
       seed: of postures, paces and steps; `excite` writes the same targets with the same numbers.
 
     Returns:
-      The motion; None where no score is a number.
+      The motion; None where no score is a number, or bodies touch in all motions.
 
     Raises:
       ValueError: fewer runs than can be split.
     """
     candidates = [name for name in MOTIONS if name != "medley"]
-    motions = {name: excitation(spec, joints, runs, seconds, rate_hz, seed, name) for name in candidates}
+    motions = {}
+    for name in candidates:
+        with suppress(Touching):
+            motions[name] = excitation(spec, joints, runs, seconds, rate_hz, seed, name)
     scores = {name: float(score(motion)) for name, motion in motions.items()}
     # A simulation that diverges under a suspect decides nothing.
     scores = {name: value if np.isfinite(value) else -np.inf for name, value in scores.items()}
-    best = max(scores, key=scores.__getitem__)
-    if scores[best] == -np.inf:
+    best = max(scores, key=scores.__getitem__, default=None)
+    if best is None or scores[best] == -np.inf:
         return None
     return Decision(name=best, motion=motions[best], scores=scores)
 
@@ -130,6 +140,9 @@ def excitation(
     motion: str = "medley",
 ) -> list[TargetRun]:
     """Makes the target runs of a log in which effects are distinguishable.
+
+    A posture in which bodies would touch is drawn again, and again with smaller motions. What a robot on a free base
+    touches is not known.
 
     Args:
       spec: the robot; postures are drawn within its joint ranges.
@@ -146,6 +159,7 @@ def excitation(
     Raises:
       ValueError: fewer runs than can be split, fewer rows than the motion needs, the motion is unknown, or a slide
         joint has no range.
+      Touching: bodies touch wherever the robot moves.
     """
     if motion not in MOTIONS:
         raise ValueError(f"motion: got '{motion}', expected one of {', '.join(MOTIONS)}")
@@ -159,12 +173,21 @@ def excitation(
         )
     rng = np.random.default_rng(seed)
     low, high, home = _ranges(suspended(spec), joints)
+    blocked = _Blocked(spec, joints)
     splits = ("train", "select", "train", "sealed")
     motions = []
     for number in range(runs):
-        posture = home + 0.25 * (high - low) * rng.uniform(-1, 1, len(joints))
-        room = np.minimum(np.minimum(high - posture, posture - low), 0.6)
-        target, enabled = _targets(chosen, posture, room, seconds, rate_hz, rng)
+        for tried in range(_TRIES):
+            posture = home + 0.25 * (high - low) * rng.uniform(-1, 1, len(joints))
+            room = np.minimum(np.minimum(high - posture, posture - low), 0.6 * _SMALLER**tried)
+            target, enabled = _targets(chosen, posture, room, seconds, rate_hz, rng)
+            if not (pairs := blocked.at(target)):
+                break
+        else:
+            raise Touching(
+                f"robot: {' and '.join(pairs[0])} touch in every motion that was drawn, by the model's geometry: "
+                "narrow the joints' ranges, correct the geometry, or mount the robot away from it"
+            )
         split = splits[number % len(splits)]
         # The gain alternates within every split. Of four runs one is for select, and it has the lower gain.
         earlier = sum(one.split == split for one in motions)
@@ -181,6 +204,23 @@ def excitation(
             )
         )
     return motions
+
+
+class _Blocked:
+    """Tells which bodies targets would drive into each other, beside those that overlap as the model is drawn."""
+
+    def __init__(self, spec: mujoco.MjSpec, joints: Sequence[str]):
+        # Where a rig holds a free base is not known, so neither is what the robot would touch.
+        free = any(joint.type == mujoco.mjtJoint.mjJNT_FREE for joint in spec.joints)
+        self._model, self._joints = None if free else spec.copy().compile(), joints
+        self._drawn = set() if free else set(touching(self._model, joints, self._model.qpos0[None, self._columns()]))
+
+    def at(self, targets: np.ndarray) -> list[tuple[str, str]]:
+        """Lists pairs of bodies that touch in some of the targets [rows, joints]."""
+        return [] if self._model is None else sorted(set(touching(self._model, self._joints, targets)) - self._drawn)
+
+    def _columns(self) -> list[int]:
+        return [int(self._model.joint(name).qposadr[0]) for name in self._joints]
 
 
 def unlimited_slides(model: mujoco.MjModel, joints: Sequence[str]) -> list[str]:

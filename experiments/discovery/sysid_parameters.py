@@ -80,7 +80,13 @@ def robot_of(spec: mujoco.MjSpec, log: Log) -> Robot:
     Args:
       spec: the nominal model.
       log: of the robot.
+
+    Raises:
+      ValueError: a run has no targets, or no joint follows any.
     """
+    for run in log.runs:
+        if "target" not in run.signals:
+            raise ValueError(f"{run.name}: got torques alone, expected the targets of a controller")
     runs = [run for split, own in splits(log).items() if split != "sealed" for run in own]
     laws = [run.impedance() for run in runs]
     shape = [run.signals["q"].shape for run in runs]
@@ -90,12 +96,16 @@ def robot_of(spec: mujoco.MjSpec, log: Log) -> Robot:
     )
     error = np.concatenate([np.abs(run.signals["target"] - run.signals["q"]) for run in runs])
     on = (stiffness > 0).any(axis=1)
+    if not on.any():
+        raise ValueError("controller: got kp 0 for every joint, expected a joint that follows its target")
     visible = {
         "gain": (stiffness > 0).any(axis=0),
         "brake": (damping > 0).any(axis=0),
         "limit": (on[:, None] & (stiffness * error > 0.5 * limit)).any(axis=0),
     }
-    return Robot(playable(spec, log), log.joints, np.median(stiffness[on], axis=0), visible)
+    typical = np.median(stiffness[on], axis=0)
+    # A passive joint has no stiffness of its own, by which its parameters could be measured.
+    return Robot(playable(spec, log), log.joints, np.where(typical > 0, typical, typical.max()), visible)
 
 
 def declare(robot: Robot, subset: str):

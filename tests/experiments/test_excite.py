@@ -218,3 +218,80 @@ def test_half_the_gain_of_a_servo_is_half_of_its_gain():
     gains = {"gain": np.array([4.0]), "kt": np.array([0.5]), "resistance_ohm": np.array([2.0])}
     found = scaled(Controller(kind="servo", rate_hz=500.0, gains=gains), 0.5).gains
     assert (found["gain"], found["kt"], found["resistance_ohm"]) == (2.0, 0.5, 2.0)
+
+
+TABLE = """<mujoco>
+  <compiler angle="radian"/>
+  <worldbody>
+    <geom type="plane" size="2 2 0.1"/>
+    <body name="upper" pos="0 0 0.3">
+      <joint name="shoulder" axis="0 1 0" range="-1.4 1.4" limited="true"/>
+      <geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.03"/>
+      <body name="lower" pos="0.3 0 0">
+        <joint name="elbow" axis="0 1 0" range="-1.4 1.4" limited="true"/>
+        <geom type="capsule" fromto="0 0 0 {} 0 0" size="0.02"/>
+      </body>
+    </body>
+  </worldbody>
+</mujoco>"""
+
+
+@pytest.mark.parametrize("motion", ["medley", "large_steps", "holds"])
+def test_targets_do_not_go_through_a_table(motion):
+    spec = mujoco.MjSpec.from_string(TABLE.format(0.25))
+    model, runs = spec.compile(), excitation(spec, JOINTS, 6, 2.0, 200.0, seed=0, motion=motion)
+    data = mujoco.MjData(model)
+    for run in runs:
+        for row in run.target[::7]:
+            data.qpos[:] = row
+            mujoco.mj_fwdPosition(model, data)
+            assert data.contact.dist.min(initial=0.0) > -0.02
+    # It is the table that keeps the arm up.
+    (without,) = [one for one in spec.geoms if one.type == mujoco.mjtGeom.mjGEOM_PLANE]
+    without.contype = without.conaffinity = 0
+    free = excitation(spec, JOINTS, 6, 2.0, 200.0, seed=0, motion=motion)
+    assert max(run.target[:, 0].max() for run in free) > max(run.target[:, 0].max() for run in runs)
+
+
+def test_a_robot_that_touches_wherever_it_moves_is_named(tmp_path):
+    # A forearm of 3 m above a table at 0.3 m, which it crosses at 0.1 rad.
+    low = TABLE.format(3.0).replace('pos="0 0 0.3"', 'pos="0 0 0.05"').replace("-1.4 1.4", "0.2 1.4")
+    (tmp_path / "low.xml").write_text(low)
+    with pytest.raises(ValueError, match="lower and world touch in every motion that was drawn"):
+        excite.main(excite.Args(out=tmp_path / "log", robot=str(tmp_path / "low.xml"), seconds=2.0))
+    assert not (tmp_path / "log").exists()
+    assert deciding(models.spec(str(tmp_path / "low.xml")), JOINTS, lambda motion: 1.0, seconds=2.0) is None
+
+
+def like(tmp_path, kp, **options):
+    """Targets for the robot of a log whose controller has these gains."""
+    excite.main(excite.Args(out=tmp_path / "targets", robot=str(ARM), seconds=2.0))
+    log = read(tmp_path / "targets", measured=False)
+    gains = {"kp": np.array(kp), "kd": np.array([2.0, 0.5]), "torque_limit_nm": np.array([9.0, 9.0])}
+    controller = Controller(kind="pd", rate_hz=500.0, gains=gains)
+    runs = [
+        replace(run, controller=controller, signals={"q": run.signals["target"], **run.signals}) for run in log.runs
+    ]
+    write(replace(log, runs=tuple(runs)), tmp_path / "measured")
+    excite.main(excite.Args(out=tmp_path / "next", like=tmp_path / "measured", seconds=2.0, **options))
+    return read(tmp_path / "next", measured=False)
+
+
+def test_passive_joints_are_told_nothing(tmp_path):
+    for run in like(tmp_path, [30.0, 0.0]).runs:
+        assert np.ptp(run.signals["target"][:, 0]) > 0.1
+        assert np.ptp(run.signals["target"][:, 1]) == 0.0
+
+
+def test_a_robot_without_any_gain_follows_no_targets(tmp_path):
+    with pytest.raises(ValueError, match="kp: got 0 for every joint"):
+        like(tmp_path, [0.0, 0.0])
+
+
+def test_a_built_in_robot_may_stand_for_the_one_of_a_log(tmp_path):
+    excite.main(excite.Args(out=tmp_path / "targets", seconds=2.0))
+    log = read(tmp_path / "targets", measured=False)
+    runs = [replace(run, signals={"q": run.signals["target"], **run.signals}) for run in log.runs]
+    write(replace(log, runs=tuple(runs)), tmp_path / "measured")
+    excite.main(excite.Args(out=tmp_path / "next", like=tmp_path / "measured", robot="biteno", seconds=2.0))
+    assert read(tmp_path / "next", measured=False).robot == "biteno"

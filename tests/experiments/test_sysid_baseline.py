@@ -12,6 +12,7 @@ from envs import models
 from envs.logs import Controller, Log, Run, write
 from experiments import sysid_baseline
 from experiments.discovery import playback, sysid_fit, sysid_parameters
+from tests.rigs import ARM, ARM_JOINTS
 
 needs_sysid = pytest.mark.skipif(not hasattr(sysid, "optimize"), reason="needs the extra sysid")
 
@@ -140,3 +141,33 @@ def test_without_the_package_the_command_says_what_to_install(monkeypatch, tmp_p
     monkeypatch.delattr(sysid, "optimize", raising=False)
     with pytest.raises(ValueError, match=r"jaxtune\[sysid\]"):
         sysid_baseline.main(sysid_baseline.Args(logs=(tmp_path,)))
+
+
+def test_logs_that_it_cannot_play_are_named():
+    log = pendulum()
+    signals = {name: values for name, values in log.runs[0].signals.items() if name != "target"}
+    sent = replace(log, runs=(replace(log.runs[0], signals=signals | {"tau": signals["dq"]}), *log.runs[1:]))
+    with pytest.raises(ValueError, match="run_000: got torques alone, expected the targets of a controller"):
+        sysid_parameters.robot_of(models.spec("pendulum"), sent)
+    still = Controller(kind="pd", rate_hz=1000.0, gains={**PD, "kp": np.array([0.0])})
+    with pytest.raises(ValueError, match="kp 0 for every joint"):
+        off = replace(log, runs=tuple(replace(run, controller=still) for run in log.runs))
+        sysid_parameters.robot_of(models.spec("pendulum"), off)
+
+
+def test_parameters_of_a_passive_joint_have_a_unit():
+    spec = mujoco.MjSpec.from_string(ARM)
+    gains = {"kp": np.array([3.0, 0.0]), "kd": np.array([0.1, 0.0]), "torque_limit_nm": np.array([1.0, 1.0])}
+    one = pendulum(0.5)
+    runs = tuple(
+        replace(
+            run,
+            controller=Controller(kind="pd", rate_hz=1000.0, gains=gains),
+            signals={name: v if name == "enabled" else np.repeat(v, 2, axis=1) for name, v in run.signals.items()},
+        )
+        for run in one.runs
+    )
+    robot = sysid_parameters.robot_of(spec, replace(one, robot="arm.xml", joints=ARM_JOINTS, runs=runs))
+    np.testing.assert_allclose(robot.stiffness, 3.0)
+    for kind in ("armature", "damping", "friction"):
+        assert sysid_parameters._unit(robot, robot.spec.compile(), 1, kind) > 0
