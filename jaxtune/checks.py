@@ -1,6 +1,6 @@
 """Checks of the episodes that a user's functions return: by shape, so they run before anything is compiled."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import jax
 import numpy as np
@@ -78,21 +78,25 @@ def _check_motion(simulated: Trajectory) -> None:
         )
 
 
-def check_states(measured: Trajectory, simulated: Trajectory, config: TunerConfig) -> None:
+def check_states(measured: Trajectory, simulated: Trajectory, config: TunerConfig, needs: Sequence[str] = ()) -> None:
     """Checks that a set can be simulated again from its states (`jaxtune.replay`).
 
     Args:
       measured: the measured set, [episodes, time], or its shapes.
       simulated: what `simulate` returns, or its shapes.
       config: sizes of the tuning.
+      needs: names that a measured state must have.
 
     Raises:
-      ValueError: one of them has no states, a measured state has a name or a shape that simulated ones have not, or
-        episodes are no longer than a piece, or there are fewer held-out sets than are to be fitted.
+      ValueError: one of them has no states, a measured state lacks a name, or has one or a shape that simulated ones
+        have not, episodes are no longer than a piece, or there are fewer held-out sets than are to be fitted.
     """
     for source, episodes in (("measured", measured), ("simulate", simulated)):
-        if not isinstance(episodes.state, Mapping):
+        if not isinstance(episodes.state, Mapping) or not episodes.state:
             raise ValueError(f"{source}, state: got none, expected arrays by name, since the tuner has a replay")
+    missing = sorted(set(needs) - set(measured.state))
+    if missing:
+        raise ValueError(f"measured, state: got {', '.join(measured.state)}, expected '{missing[0]}' as well")
     unknown = sorted(set(measured.state) - set(simulated.state))
     if unknown:
         raise ValueError(f"measured, state: got '{unknown[0]}', expected some of {', '.join(simulated.state)}")
@@ -133,6 +137,8 @@ def _check_shapes(source: str, trajectory: Trajectory, episodes: int, why: str) 
                 f"{source}, {field}: got a {type(value).__name__}{names}, expected one array "
                 f"[episodes, time, {field}]: put what is to be compared side by side"
             )
+        if value.dtype == np.dtype(bool):
+            raise ValueError(f"{source}, {field}: got bool, expected numbers, such as 0 and 1 of float32")
     shape = np.shape(trajectory.alive)
     if len(shape) != 2 or shape[0] != episodes:
         raise ValueError(f"{source}, alive: got shape {shape}, expected {episodes} episodes ({why}) by time")

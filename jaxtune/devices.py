@@ -104,10 +104,14 @@ def in_chunks(function: Callable[..., Any], inputs: tuple, sizes: Mapping[str, i
         fill = jnp.arange(chunks * size) % count
         inputs = jax.tree.map(lambda x: x[fill].reshape(chunks, size, *x.shape[1:]), inputs)
         stacked = jax.lax.map(lambda item: several(*shared, *item), inputs)
-        # Not -1: leaves may have no elements, such as a model's activations without muscles.
-        return jax.tree.map(lambda x: x.reshape(chunks * size, *x.shape[2:])[:count], stacked)
+        return jax.tree.map(lambda x: merged(x)[:count], stacked)
 
     return spread(in_turn, inputs, shared=shared)
+
+
+def merged(leaf: jax.Array) -> jax.Array:
+    """Merges the first two axes of an array, which may have no elements (a model's activations without muscles)."""
+    return leaf.reshape(leaf.shape[0] * leaf.shape[1], *leaf.shape[2:])
 
 
 def share(batch: Any, *, axis: int = 0) -> Any:

@@ -7,7 +7,7 @@ so that sizes mean the same for every parameter and after every widening.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -16,26 +16,28 @@ from jaxtyping import Array, Float, Shaped
 from jaxtune.types import Coords, ParamDist
 
 
-def make(centre: Coords, radius: float, lower: Coords, upper: Coords) -> ParamDist:
-    """Makes a distribution that starts with the same radius for every parameter, and checks it.
+def make(centre: Coords, radius: float | Coords, lower: Coords, upper: Coords) -> ParamDist:
+    """Makes the distribution that a search starts with, and checks it.
 
     Use it once, on the host, to describe where a search begins: the nominal model as `centre`, a `radius` that is small
     (the paper starts at 0.2) and bounds that no physical robot exceeds.
 
     Args:
       centre: scalars by name, in coordinates: 0.0 for a multiplier of one.
-      radius: half width of the distribution, in coordinates. A radius of 0.2 spans multipliers of 0.82 to 1.22. Where
-        it exceeds the width of a parameter's bounds, that width is its radius.
+      radius: half width of the distribution, in coordinates, the same for every parameter or by name. A radius of 0.2
+        spans multipliers of 0.82 to 1.22. Where it exceeds the width of a parameter's bounds, that width is its radius.
       lower: smallest coordinate by name.
       upper: largest coordinate by name.
 
     Raises:
-      ValueError: names differ, the radius is not a positive number, bounds leave no room, or a centre lies outside
+      ValueError: names differ, a radius is not a positive number, bounds leave no room, or a centre lies outside
         them.
     """
-    if isinstance(radius, str) or not 0 < radius < math.inf:
-        raise ValueError(f"radius: got {radius!r}, expected a positive number")
-    for field, named in {"lower": lower, "upper": upper}.items():
+    radii = radius if isinstance(radius, Mapping) else dict.fromkeys(centre, radius)
+    for value in radii.values():
+        if isinstance(value, str) or not 0 < value < math.inf:
+            raise ValueError(f"radius: got {value!r}, expected a positive number")
+    for field, named in {"radius": radii, "lower": lower, "upper": upper}.items():
         if set(named) != set(centre):
             raise ValueError(f"{field}: got {sorted(named)}, expected {sorted(centre)}")
     for name, value in centre.items():
@@ -51,7 +53,7 @@ def make(centre: Coords, radius: float, lower: Coords, upper: Coords) -> ParamDi
         return {name: jnp.asarray(value, jnp.float32) for name, value in named.items()}
 
     # As `widen` does: a radius as wide as the bounds fills them from any centre.
-    radii = {name: min(radius, upper[name] - lower[name]) for name in centre}
+    radii = {name: min(radii[name], upper[name] - lower[name]) for name in centre}
     return ParamDist(centre=strong(centre), radius=strong(radii), lower=strong(lower), upper=strong(upper))
 
 

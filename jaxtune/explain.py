@@ -118,13 +118,16 @@ def explain(info) -> str:
       ValueError: it is of several tunings.
 
     Returns:
-      Lines of text. Positions, steps and intervals are in coordinates: of a multiplier, the logarithm.
+      Lines of text; one where nothing was tested, as by `baselines.Untuned`. Positions, steps and intervals are in
+      coordinates: of a multiplier, the logarithm.
     """
     if np.ndim(info.calls):
         last = "jax.tree.map(lambda leaf: leaf[-1], info)"
         raise ValueError(f"explain: got {len(info.calls)} tunings, expected one, such as the last: {last}")
-    verdict = Verdict(int(info.verdicts[int(info.calls) - 1]))
+    if not int(info.calls):
+        return "Nothing was tested: the distribution stays as it is."
     last = int(info.calls) - 1
+    verdict = Verdict(int(info.verdicts[last]))
     lines = [
         f"{verdict.name.lower()} after {int(info.calls)} gate call(s): {MEANING[verdict]}",
         f"  novelty {float(info.gate.novelty[last]):.3f}, threshold {float(info.gate.threshold[last]):.3f}",

@@ -55,6 +55,8 @@ class Replay:
     """`(state, actions, coords: scalars by name) -> features` of the state after these control steps."""
     read: Callable[[Any], Float[Array, " features"]]
     """`state -> features` of a measured state, such as its positions and velocities."""
+    needs: tuple[str, ...] = ()
+    """Names that a measured state must have; others may be left out."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -238,16 +240,14 @@ def _cut(config: ReplayConfig, replay: Replay, episodes: Trajectory) -> _Pieces:
     steps = episodes.alive.shape[1]
     starts = jnp.arange(0, max(steps - config.window, 1), config.stride)
     within = starts[:, None] + jnp.arange(config.window)
-    # Not -1: leaves may have no elements, such as a model's activations without muscles.
-    flat = lambda leaf: leaf.reshape(leaf.shape[0] * leaf.shape[1], *leaf.shape[2:])  # noqa: E731
-    states = lambda where: jax.tree.map(lambda leaf: flat(leaf[:, where]), episodes.state)  # noqa: E731
+    states = lambda where: jax.tree.map(lambda leaf: devices.merged(leaf[:, where]), episodes.state)  # noqa: E731
     # The state after a fall may be anything, so the step of the end must be alive too.
     alive = episodes.alive[:, within].all(axis=-1) & episodes.alive[:, starts + config.window]
     return _Pieces(
         start=states(starts),
-        action=flat(episodes.action[:, within]),
+        action=devices.merged(episodes.action[:, within]),
         end=jax.vmap(replay.read)(states(starts + config.window)),
-        valid=flat(alive),
+        valid=devices.merged(alive),
     )
 
 

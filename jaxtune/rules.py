@@ -29,7 +29,7 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from jaxtune import conformal, devices, dvm, regression, spm, surface
+from jaxtune import conformal, devices, dvm, regression, spm, surface, windows
 from jaxtune import dist as dists
 from jaxtune.dvm import DVMConfig
 from jaxtune.regression import RegressionConfig
@@ -43,7 +43,7 @@ _IDENTIFIABLE = 0.9
 # Least distance of median and 0.9-quantile of each statistic, where all simulated sets are alike.
 _LEAST_SPREAD = {"cover": 0.02, "lost": 0.1, "misfit": 0.05, "beyond": 0.1}
 _EACH, _MOST = 0.1, 5  # share of all misses that one reading's box may have, and readings that are allowed for
-_SAME = 1e-6  # of an observation's size: it does not change
+_SAME = 1e-6  # of an observation's size and usual spread: it does not change
 LEAST_ERROR = 1e-4
 """Radii; without noise a regression may be exact."""
 
@@ -244,9 +244,9 @@ def calibrated_gate(
     sets are treated alike. The test is calibrated per set, because windows and episodes of one robot depend on each
     other. A set of which no window is known has `lost` alone.
 
-    The set is not comparable if it has no valid window, if its observations never change, if its episodes are copies of
-    each other though simulated ones differ, or if fewer held-out sets have a window than the level needs
-    (level / (1 - level), which is 19 at 0.95).
+    The set is not comparable if it has no valid window of both models, if its observations never change, if its
+    episodes are copies of each other though simulated ones differ, or if fewer held-out sets have a window than the
+    level needs (level / (1 - level), which is 19 at 0.95).
 
     Args:
       key: random key, for training the verification model.
@@ -271,12 +271,13 @@ def calibrated_gate(
     every = jnp.where(fixed, cover, jnp.nanmax(jnp.stack([*excess.values()]), axis=0))
     calibration, value = every[:-1], jnp.where(sane[-1], every[-1], jnp.nan)
     usable, needed = valid.any(axis=-1), knobs.level / (1.0 - knobs.level)
+    read = fixed | ~jnp.isnan(statistics["misfit"][-1])
     enough = fixed | (usable[:-1].sum() >= jnp.floor(needed + 0.5))
     return GateInfo(
         novelty=value,
         threshold=jnp.where(fixed, knobs.threshold, conformal.quantile(calibration, knobs.level)),
         p_value=conformal.p_value(every),
-        comparable=usable[-1] & enough & _moves(measured) & ~_copied(measured, collected),
+        comparable=usable[-1] & read & enough & _moves(measured, collected) & ~_copied(measured, collected),
         uncovered=jnp.sum(valid[-1] & ~covered[-1]) / jnp.maximum(valid[-1].sum(), 1),
         elbo=elbo,
         **{name: values[-1] for name, values in excess.items()},
@@ -294,11 +295,35 @@ def _share_up(episodes: Trajectory) -> jax.Array:
 
 
 def of_all_sets(function: Callable, shared: tuple, collected: Collected, measured: Trajectory):
-    """What a function `(*shared, set)` returns for every held-out set and, last, for the measured one."""
+    """What a function `(*shared, set)` returns for every held-out set and, last, for the measured one.
+
+    Under `vmap` over measured sets, held-out sets are scored once for all.
+    """
     held_out, measured = (episodes.replace(state=None) for episodes in (collected.held_out, measured))
-    # Put together first, so that the function is compiled once.
-    every = jax.tree.map(lambda sets, one: jnp.concatenate([sets, one[None]]), held_out, measured)
-    return devices.in_chunks(function, (every,), SETS, shared=shared)
+    of = lambda shared, sets: devices.in_chunks(function, (sets,), SETS, shared=shared)  # noqa: E731
+
+    def every(shared, held_out, measured):
+        # Put together first, so that the function is compiled once.
+        return of(shared, jax.tree.map(lambda sets, one: jnp.concatenate([sets, one[None]]), held_out, measured))
+
+    @jax.custom_batching.custom_vmap
+    def scored(shared, held_out, measured):
+        return every(shared, held_out, measured)
+
+    @scored.def_vmap
+    def of_many(size, batched, shared, held_out, measured):
+        if any(jax.tree.leaves(batched[:2])):
+            # Lanes of a sweep have sets of their own.
+            axes = jax.tree.map(lambda own: 0 if own else None, tuple(batched))
+            found = jax.vmap(every, in_axes=axes, axis_size=size)(shared, held_out, measured)
+        else:
+            wide = lambda leaf, own: leaf if own else jnp.broadcast_to(leaf, (size, *leaf.shape))  # noqa: E731
+            once, each = of(shared, held_out), of(shared, jax.tree.map(wide, measured, batched[2]))
+            row = lambda sets, one: jnp.concatenate([sets, one[None]])  # noqa: E731
+            found = jax.tree.map(lambda sets, ones: jax.vmap(row, (None, 0))(sets, ones), once, each)
+        return found, jax.tree.map(lambda _: True, found)
+
+    return scored(shared, held_out, measured)
 
 
 def fit(config: TunerConfig, collected: Collected) -> tuple[regression.Regression, surface.Surface]:
@@ -347,11 +372,11 @@ def _excess(name: str, values: jax.Array) -> jax.Array:
     return (values - median) / jnp.maximum(high - median, _LEAST_SPREAD[name])
 
 
-def _moves(episodes: Trajectory) -> jax.Array:
-    """Tells whether any observation changes within the living steps of an episode."""
-    first = episodes.obs[:, :1]
-    changes = jnp.abs(episodes.obs - first) > _SAME * (1.0 + jnp.abs(first))
-    return (changes & episodes.alive[..., None]).any()
+def _moves(measured: Trajectory, collected: Collected) -> jax.Array:
+    """Tells whether any observation changes within the living steps of a measured episode, in whatever units."""
+    first, usual = measured.obs[:, :1], windows.fit_scaler(collected.trajectory).std[: measured.obs.shape[-1]]
+    changes = jnp.abs(measured.obs - first) > _SAME * (usual + jnp.abs(first))
+    return (changes & measured.alive[..., None]).any()
 
 
 def _copied(measured: Trajectory, collected: Collected) -> jax.Array:
@@ -407,6 +432,8 @@ def posterior_update(
     quantile of `interval` is by as much higher as the refinements (five at most) may miss:
     `1 - (1 - coverage) (1 - refinements / 10)`.
 
+    Held-out sets without a window are left out of all quantiles, since the measured one has some.
+
     A coordinate that is not identifiable keeps centre and radius. Where the interval of one that is reaches past the
     box, and not merely past a bound, all keep their radii, and centres move.
 
@@ -424,7 +451,7 @@ def posterior_update(
     held_out, estimate = estimates[:-1], estimates[-1]
     # The errors on robots with known coordinates stand for the error on the measured one.
     truth = dists.normalise(dist, collected.held_out_coords)
-    # A set without a window is answered blindly; the measured one has some.
+    # A set without a window is answered blindly.
     known = ~jnp.isnan(reading.misfit[:-1, None])
     off = jnp.where(known, held_out - truth, 0.0)
     error = jnp.where(known, jnp.abs(off), jnp.nan)

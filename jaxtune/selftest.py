@@ -135,8 +135,10 @@ def run(
       done: called after every gate and tuning with their number so far and in all.
 
     Raises:
-      ValueError: fewer than two robots, or no gate or tuning.
+      ValueError: fewer than two robots, no gate or tuning, or a tuner whose `simulate` JAX cannot trace.
     """
+    if not isinstance(tuner, Tuner):
+        raise ValueError(f"tuner: got {type(tuner).__name__}, expected a Tuner, whose simulate JAX can trace")
     if robots < 2 or gates < 1 or tunings < 1:
         raise ValueError(f"robots, gates, tunings: got {robots}, {gates} and {tunings}, expected at least 2, 1 and 1")
     outside = _outside(state.dist)

@@ -236,7 +236,12 @@ class Tuner:
         """Does one tuning: measures a set, tunes the distribution with it, and trains the policy in the result.
 
         Use it where the target is in JAX, so that `measure` can be traced.
+
+        Raises:
+          ValueError: the tuner has no `measure`.
         """
+        if self.measure is None:
+            raise ValueError("measure: got none, expected a function; or measure a set yourself, and call `tune`")
         key_measure, key_tune, key_train = jax.random.split(key, 3)
         state, info = self.tune(key_tune, state, self.measure(key_measure, state.policy))
         state, metrics = self.train(key_train, state)
@@ -279,7 +284,7 @@ class Tuner:
         shapes = jax.eval_shape(self.collect, key, state.policy, state.dist)
         check_measured(measured, shapes.trajectory, self.config)
         if self.replay is not None:
-            check_states(measured, shapes.held_out, self.config)
+            check_states(measured, shapes.held_out, self.config, self.replay.needs)
 
         def body(carry):
             # Every round simulates new robots and trains its models anew, because the distribution has changed.

@@ -137,7 +137,7 @@ def replay(robot: Robot, table: Mapping[str, Entry]) -> Replay:
         move = lambda state, action: (robot.move(params, state, action)[0], None)  # noqa: E731
         return read(robot.kept(jax.lax.scan(move, robot.resumed(params, kept), actions)[0]))
 
-    return Replay(play=play, read=read)
+    return Replay(play=play, read=read, needs=("qpos", "qvel"))
 
 
 def _checked(action: Any, size: int) -> jax.Array:

@@ -8,6 +8,7 @@ import toys
 
 from jaxtune import baselines
 from jaxtune import spm as models
+from jaxtune.explain import explain
 from jaxtune.tuner import Tuner, calibrated_gate, knobs, posterior_update
 from jaxtune.types import Verdict
 
@@ -94,3 +95,9 @@ def test_histories_of_all_methods_have_one_shape(tuner, spm):
     first = jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), shapes[0])
     for other in shapes[1:]:
         assert jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), other) == first
+
+
+def test_what_tests_nothing_is_explained_in_a_sentence(tuner):
+    untuned = baselines.Untuned(tuner=tuner)
+    _, info = untuned.tune(jax.random.key(0), start(untuned))
+    assert explain(info) == "Nothing was tested: the distribution stays as it is."

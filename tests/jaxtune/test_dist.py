@@ -112,6 +112,16 @@ def test_make_needs_a_positive_radius():
             dists.make(scalars(a=0), radius, scalars(a=-1), scalars(a=1))
 
 
+def test_make_takes_radii_by_name():
+    made = dists.make(scalars(a=0, b=0), {"a": 0.2, "b": 5.0}, scalars(a=-1, b=-1), scalars(a=1, b=1))
+    # No wider than the bounds.
+    assert {name: float(value) for name, value in made.radius.items()} == pytest.approx({"a": 0.2, "b": 2.0})
+    with pytest.raises(ValueError, match=r"radius: got \['a'\], expected \['a', 'b'\]"):
+        dists.make(scalars(a=0, b=0), {"a": 0.2}, scalars(a=-1, b=-1), scalars(a=1, b=1))
+    with pytest.raises(ValueError, match=r"radius: got -0.1, expected a positive number"):
+        dists.make(scalars(a=0), {"a": -0.1}, scalars(a=-1), scalars(a=1))
+
+
 @pytest.mark.parametrize("field", ["lower", "upper"])
 def test_make_needs_the_same_names_everywhere(field):
     bounds = {"lower": scalars(a=-1), "upper": scalars(a=1)} | {field: scalars(wrong=1)}

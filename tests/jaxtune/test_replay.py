@@ -199,9 +199,13 @@ def test_states_that_are_missing_or_of_another_robot_are_refused(dist):
         (whole.replace(state=None), "measured, state: got none"),
         (whole.replace(state={"cart": whole.state["slider"]}), "measured, state: got 'cart', expected some of slider"),
         (whole.replace(state={"slider": whole.state["slider"][..., :1]}), "measured, state, slider: got shape"),
+        (whole.replace(state={}), "measured, state: got none"),
     ):
         with pytest.raises(ValueError, match=message):
             one.tune(jax.random.key(0), state, changed)
+    needing = dataclasses.replace(one, replay=dataclasses.replace(one.replay, needs=("slider", "spring")))
+    with pytest.raises(ValueError, match="measured, state: got slider, expected 'spring' as well"):
+        needing.tune(jax.random.key(0), state, whole)
     without = dataclasses.replace(one, simulate=lambda *args: EXACT.simulate(*args).replace(state=None))
     with pytest.raises(ValueError, match="simulate, state: got none"):
         without.tune(jax.random.key(0), state, whole)

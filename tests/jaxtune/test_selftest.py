@@ -7,6 +7,7 @@ import pytest
 import toys
 
 from jaxtune import selftest
+from jaxtune.host import HostTuner
 from jaxtune.selftest import INSIDE, Rate
 from jaxtune.tuner import Tuner, keep, knobs
 from jaxtune.types import Verdict
@@ -134,3 +135,10 @@ def test_a_test_of_nothing_is_refused(robots, gates, tunings):
     got = f"robots, gates, tunings: got {robots}, {gates} and {tunings}, expected at least 2, 1 and 1"
     with pytest.raises(ValueError, match=got):
         selftest.run(jax.random.key(0), *machine(), robots=robots, gates=gates, tunings=tunings)
+
+
+def test_a_simulator_that_cannot_be_traced_is_refused():
+    tuner, state = machine()
+    host = HostTuner(config=CONFIG, simulate=tuner.simulate)
+    with pytest.raises(ValueError, match="tuner: got HostTuner, expected a Tuner, whose simulate JAX can trace"):
+        selftest.run(jax.random.key(0), host, state, robots=2)

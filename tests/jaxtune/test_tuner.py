@@ -1009,3 +1009,66 @@ def test_sizes_that_cannot_be_are_refused(sizes, message):
 def test_several_tunings_are_not_explained_as_one():
     with pytest.raises(ValueError, match="got 3 tunings, expected one"):
         explain.explain(SimpleNamespace(calls=np.ones(3, int)))
+
+
+def test_a_tuner_that_cannot_measure_says_what_to_do():
+    one = Tuner(config=toys.TINY, train_policy=tuners.keep, simulate=SLIDER.simulate)
+    state = one.init(toys.policy(), toys.uniform(TWO, 0.2), knobs())
+    with pytest.raises(ValueError, match=r"measure: got none, .* or measure a set yourself, and call `tune`"):
+        one.run(jax.random.key(0), state, 2)
+
+
+def test_many_measured_sets_are_scored_beside_the_held_out_ones_once():
+    collected = toys.collect(jax.random.key(0), toys.uniform(TWO, 0.2), toys.TINY)
+    sets = jax.tree.map(
+        lambda leaf: leaf[:, :2] if leaf.ndim > 1 else leaf, stacked({"mass": jnp.linspace(-0.2, 0.2, 3)}, 3)
+    )
+    counted = []
+
+    def one(scale, episodes):
+        jax.debug.callback(lambda _: counted.append(1), episodes.obs[0, 0, 0])
+        return scale * episodes.obs.mean(), episodes.alive.sum()
+
+    several = jax.jit(jax.vmap(lambda measured: rules.of_all_sets(one, (2.0,), collected, measured)))
+    found = jax.block_until_ready(several(sets))
+    jax.effects_barrier()
+    assert len(counted) == toys.TINY.held_out_sets + 3
+    for number in range(3):
+        alone = rules.of_all_sets(one, (2.0,), collected, jax.tree.map(lambda leaf, n=number: leaf[n], sets))
+        jax.tree.map(lambda many, single, n=number: close(many[n], single, rtol=1e-6), found, alone)
+    # Lanes of a sweep have held-out sets of their own.
+    both = jax.tree.map(lambda leaf: jnp.stack([leaf, 3 * leaf if leaf.dtype == jnp.float32 else leaf]), collected)
+    pair = jax.tree.map(lambda leaf: leaf[:2], sets)
+    lanes, _ = jax.vmap(lambda own, measured: rules.of_all_sets(one, (2.0,), own, measured))(both, pair)
+    close(lanes[1, :-1], 3 * lanes[0, :-1], rtol=1e-5)
+
+
+@pytest.mark.parametrize("unit", [1e-8, 1e8])
+def test_a_robot_moves_in_whatever_units(unit):
+    measured = lambda episodes: episodes.replace(obs=unit * episodes.obs)  # noqa: E731
+    collected = toys.collect(jax.random.key(0), toys.uniform(TWO, 0.2), toys.TINY)
+    collected = collected.replace(trajectory=measured(collected.trajectory), held_out=measured(collected.held_out))
+    one = SLIDER.measure(TWO, 2)(jax.random.key(1), toys.policy())
+    assert tiny_gate(toys.TINY, collected, measured(one), knobs()).comparable
+    still = one.replace(obs=jnp.broadcast_to(one.obs[:, :1], one.obs.shape))
+    assert not tiny_gate(toys.TINY, collected, measured(still), knobs()).comparable
+
+
+def test_a_set_that_the_regression_cannot_read_is_not_comparable():
+    # Its windows are longer than what the robot lived.
+    config = dataclasses.replace(toys.TINY, regression=dataclasses.replace(toys.TINY.regression, window=58))
+    collected = toys.collect(jax.random.key(0), toys.uniform(TWO, 0.2), config)
+    one = SLIDER.measure(TWO, 2)(jax.random.key(1), toys.policy())
+    short = one.replace(alive=one.alive.at[:, 54:].set(False))
+    assert tiny_gate(config, collected, one, knobs()).comparable
+    assert not tiny_gate(config, collected, short, knobs()).comparable
+    assert tiny_gate(config, collected, short, knobs(threshold=0.7)).comparable
+
+
+@pytest.mark.parametrize("field", ["obs", "action"])
+def test_numbers_that_are_bool_are_named(field):
+    one = Tuner(config=toys.TINY, train_policy=tuners.keep, simulate=SLIDER.simulate)
+    state = one.init(toys.policy(), toys.uniform(TWO, 0.2), knobs())
+    measured = SLIDER.measure(TWO, 2)(jax.random.key(1), toys.policy())
+    with pytest.raises(ValueError, match=f"measured, {field}: got bool, expected numbers"):
+        one.tune(jax.random.key(0), state, measured.replace(**{field: getattr(measured, field) > 0}))
