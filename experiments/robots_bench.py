@@ -195,10 +195,11 @@ def main(args: Args) -> None:
     sizes = replace(sizes, scratch_updates=min(sizes.scratch_updates, _UPDATES))
     checkpoint.set_up_compiler(sizes.xla_flags)
     checkpoint.open_run(args.out, {"radius": args.radius, "tunings": args.tunings, "preset": args.preset})
-    results = {name: results_of(args, sizes, name) for name in args.robots}
-    summaries = {name: summary(each) for name, each in results.items()}
-    write_json(args.out / "summary.json", {"args": args, "robots": summaries, "versions": checkpoint.versions()})
-    plots.recovery(args.out / "errors.png", results)
+    with checkpoint.lock(args.out / "summary.json"):
+        results = {name: results_of(args, sizes, name) for name in args.robots}
+        summaries = {name: summary(each) for name, each in results.items()}
+        write_json(args.out / "summary.json", {"args": args, "robots": summaries, "versions": checkpoint.versions()})
+        plots.recovery(args.out / "errors.png", results)
     show(summaries)
 
 

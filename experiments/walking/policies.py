@@ -6,6 +6,7 @@ A policy on disk is a folder: PPO's state as an orbax checkpoint, and a `config.
 
 import shutil
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import jax
@@ -95,7 +96,9 @@ def walk(
     return policy, curve
 
 
-def trained(key: jax.Array, learner: Learner, updates: int, out: Path) -> tuple[Policy, list[dict[str, float]]]:
+def trained(
+    key: jax.Array, learner: Learner, updates: int, out: Path, check: Callable[[], None] = lambda: None
+) -> tuple[Policy, list[dict[str, float]]]:
     """Trains a policy with `walk`, showing progress, and saves it with its curve; goes on where it was interrupted.
 
     Args:
@@ -103,6 +106,7 @@ def trained(key: jax.Array, learner: Learner, updates: int, out: Path) -> tuple[
       learner: robot and sizes.
       updates: PPO updates.
       out: folder of the policy.
+      check: looks at what the folder holds, before it is written to and while no other process may.
 
     Returns:
       As `walk`.
@@ -114,6 +118,7 @@ def trained(key: jax.Array, learner: Learner, updates: int, out: Path) -> tuple[
     checkpoint.check_writable(out)
     kept = out / "training"
     with checkpoint.lock(kept), bars() as progress:
+        hosts.from_first(check)
         policy, curve = walk(key, learner, updates, progress, kept)
         skipped = sum(line["skipped"] for line in curve) / len(curve)
         if skipped > 0:
