@@ -54,8 +54,10 @@ def main(args: Args) -> None:
     updates = sizes.scratch_updates if args.updates is None else args.updates
     if updates < 1:
         raise ValueError(f"updates: got {updates}, expected 1 or more")
+    hosts.from_first(lambda: _check_folder(args))
     learner = Learner(sizes, entries, correction=args.model and corrected.read(args.model), kind=robot)
     memory.check(learner)
+    # Again, since another process may have been at work there.
     _, curve = trained(jax.random.PRNGKey(args.seed), learner, updates, args.out, lambda: _check_folder(args))
     write_json(args.out / "curve.json", {"args": args, "curve": curve})
     plots.training(args.out / "curve.png", curve, robot.control_s, robot.shown)
