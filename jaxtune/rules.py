@@ -448,23 +448,13 @@ def posterior_update(
     reading = _reading(config, collected, measured)
     model, (low, high) = reading.model, dists.normalised_box(dist)
     estimates = jnp.clip(reading.answers, low, high)
-    held_out, estimate = estimates[:-1], estimates[-1]
-    # The errors on robots with known coordinates stand for the error on the measured one.
-    truth = dists.normalise(dist, collected.held_out_coords)
-    # A set without a window is answered blindly.
-    known = ~jnp.isnan(reading.misfit[:-1, None])
-    off = jnp.where(known, held_out - truth, 0.0)
-    error = jnp.where(known, jnp.abs(off), jnp.nan)
-    # What scales the errors must not come from the sets that calibrate them.
-    scale = jnp.maximum(model.error, LEAST_ERROR)
-    missed = 1.0 - config.coverage
-    interval, wide = (
-        scale * conformal.quantile((error / scale).max(axis=-1), 1.0 - share * missed)
-        for share in (1.0 - _EACH * min(config.refinements, _MOST), _EACH)
-    )
-    ignorant = conformal.quantile(jnp.where(known, jnp.abs((low + high) / 2 - truth), jnp.nan), config.coverage)
-    identifiable = conformal.quantile(error, config.coverage) < _IDENTIFIABLE * ignorant
-    step = jnp.where(identifiable, estimate, 0.0)
+    # The errors on robots with known coordinates stand for the error on the measured one. A set without a window is
+    # answered blindly.
+    truth, known = dists.normalise(dist, collected.held_out_coords), ~jnp.isnan(reading.misfit[:-1, None])
+    off = jnp.where(known, estimates[:-1] - truth, 0.0)
+    ignorant = jnp.where(known, jnp.abs((low + high) / 2 - truth), jnp.nan)
+    interval, wide, identifiable = _calibrate(config, model, jnp.where(known, jnp.abs(off), jnp.nan), ignorant)
+    step = jnp.where(identifiable, estimates[-1], 0.0)
     # Held-out truths all lie in the box, so their errors say nothing of truths beyond it. One that is outside in one
     # coordinate may bend the estimates of all, and narrowing could exclude it for good.
     # No truth lies beyond a physical bound.
@@ -483,6 +473,28 @@ def posterior_update(
         p_misfit=conformal.p_value(excess["misfit"]),
         errors=off.T @ off / jnp.maximum(known.sum(), 1),
     )
+
+
+def _calibrate(
+    config: TunerConfig, model: regression.Regression, error: jax.Array, ignorant: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Calibrates the interval, the radius to narrow to and what is identifiable, [coords] each.
+
+    Args:
+      config: for `coverage` and `refinements`.
+      model: the regression, whose error scales those of all coordinates.
+      error: [sets, coords] of held-out sets' estimates, in radii; nan for a set that is left out.
+      ignorant: [sets, coords] the same of the middle of the box.
+    """
+    # What scales the errors must not come from the sets that calibrate them.
+    scale = jnp.maximum(model.error, LEAST_ERROR)
+    missed = 1.0 - config.coverage
+    interval, wide = (
+        scale * conformal.quantile((error / scale).max(axis=-1), 1.0 - share * missed)
+        for share in (1.0 - _EACH * min(config.refinements, _MOST), _EACH)
+    )
+    sure, unsure = (conformal.quantile(values, config.coverage) for values in (error, ignorant))
+    return interval, wide, sure < _IDENTIFIABLE * unsure
 
 
 def no_gate_log(config: TunerConfig) -> dict:

@@ -204,9 +204,8 @@ def test_a_joint_that_is_pressed_against_its_stop_is_no_defect(joint, share):
     stopped, stop = mujoco.MjSpec.from_file(str(ARM)), float(np.quantile(position, 1.0 - share))
     stopped.joint(JOINTS[joint]).limited = True
     stopped.joint(JOINTS[joint]).range = [position.min() - 0.5, stop]
-    run = record(stopped, JOINTS, motion, Controller(kind="pd", rate_hz=1000.0, gains=GAINS), Truth(None), 0.1, 0).runs[
-        0
-    ]
+    controller = Controller(kind="pd", rate_hz=1000.0, gains=GAINS)
+    (run,) = record(stopped, JOINTS, motion, controller, Truth(None), 0.1, 0).runs
     stopped.joint(JOINTS[joint]).range = [position.min() - 0.5, stop - 0.005]
     model = suspended(stopped)
     assert diagnose(run, JOINTS, model) == []
@@ -344,9 +343,8 @@ def test_joints_that_sag_to_the_other_side_have_no_flipped_sign(kp, mean, base):
     target = 0.15 * (motion.target - motion.target.mean(axis=0)) + mean
     motion = replace(motion, target=target, enabled=np.ones(len(target)))
     gains = {"kp": np.array([kp, kp / 3.0]), "kd": np.array([2.0, 0.6]), "torque_limit_nm": np.full(2, 15.0)}
-    run = record(spec, JOINTS, [motion], Controller(kind="pd", rate_hz=1000.0, gains=gains), Truth(None), 0.1, 0).runs[
-        0
-    ]
+    controller = Controller(kind="pd", rate_hz=1000.0, gains=gains)
+    (run,) = record(spec, JOINTS, [motion], controller, Truth(None), 0.1, 0).runs
     assert (run.signals["q"].mean(axis=0) > target.mean(axis=0) + 0.04).all()
     if base == "fixed":
         run = measured(run, lambda values: np.round(values / 0.0015) * 0.0015)
