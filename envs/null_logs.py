@@ -68,8 +68,9 @@ class Robot:
         return Robot(_drawn(spec, rng), bool(rng.integers(0, 2)), rng)
 
     def goes_straight(self, run: Run) -> bool:
-        """Whether targets move to the next row in a straight line; else they are held."""
-        return {"hold": False, "linear": True, "unknown": self.linear}[run.controller.between_rows]
+        """Whether targets, or torques that were sent, move to the next row in a straight line; else they are held."""
+        unknown = self.linear and "target" in run.signals
+        return {"hold": False, "linear": True, "unknown": unknown}[run.controller.between_rows]
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ import numpy as np
 from envs import models
 from envs.logs import Controller, Convention, Log, Run, read_any, write
 from experiments.common.cli import console, run
-from experiments.discovery.excitation import MOTIONS, excitation, scaled
+from experiments.discovery.excitation import MOTIONS, controller_of, excitation, scaled
 
 _MOST = {"seconds": 3600.0, "rate_hz": 1e5, "kp": 1e6, "torque_limit_nm": 1e5, "control_hz": 1e5}
 """Largest values of options: what a robot can be, and what fits into memory."""
@@ -29,7 +29,7 @@ class Args:
     robot: str | None = None
     """Robot: biteno (the default), pendulum, or the path of an MJCF file."""
     like: Path | None = None
-    """Folder of a log of the robot. Its joints and first run's controller are taken, in the place of kp, kd,
+    """Folder of a log of the robot. Its joints and controller are taken, in the place of kp, kd,
     torque_limit_nm and control_hz, and its model unless robot is given. Targets are written in its units and signs."""
     runs: int = 6
     """Number of runs; 4 or more, so that they can be split into train, select and sealed."""
@@ -59,11 +59,11 @@ def main(args: Args) -> None:
       ValueError: an option is wrong, or the model cannot be read.
     """
     _check(args)
-    robot, joints, controller, convention = _described(args) if args.like is None else _alike(args.like, args.robot)
-    spec = models.spec(robot)
-    stiffness = controller.gains.get("kp")
-    if stiffness is not None and not stiffness.any():
+    described = _described(args) if args.like is None else _alike(args.like, args.robot)
+    robot, joints, controller, held, convention = described
+    if held is not None and held.all():
         raise ValueError("kp: got 0 for every joint, expected a joint that follows its target")
+    spec = models.spec(robot)
     runs = tuple(
         Run(
             name=one.name,
@@ -71,9 +71,9 @@ def main(args: Args) -> None:
             split=one.split,
             controller=scaled(controller, one.gain),
             time=one.time,
-            signals={"target": _followed(one.target, stiffness), "enabled": one.enabled},
+            signals={"target": one.target, "enabled": one.enabled},
         )
-        for one in excitation(spec, joints, args.runs, args.seconds, args.rate_hz, args.seed, args.motion)
+        for one in excitation(spec, joints, args.runs, args.seconds, args.rate_hz, args.seed, args.motion, held)
     )
     log = Log(
         robot=robot,
@@ -91,12 +91,7 @@ def main(args: Args) -> None:
     )
 
 
-def _followed(target: np.ndarray, stiffness: np.ndarray | None) -> np.ndarray:
-    """Holds the targets [rows, joints] of passive joints, which cannot follow any."""
-    return target if stiffness is None else np.where(stiffness > 0, target, target[0])
-
-
-def _described(args: Args) -> tuple[str, tuple[str, ...], Controller, Convention]:
+def _described(args: Args) -> tuple[str, tuple[str, ...], Controller, None, Convention]:
     """Robot, joints and controller as the options say, in the model's units and signs."""
     # A free joint is the base, which is held, and a ball joint has no scalar target.
     kinds = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
@@ -106,13 +101,13 @@ def _described(args: Args) -> tuple[str, tuple[str, ...], Controller, Convention
         raise ValueError(f"robot: got '{robot}' with joints {joints}, expected hinges or slides that have names")
     gains = {"kp": args.kp, "kd": args.kd, "torque_limit_nm": args.torque_limit_nm}
     every = {name: np.full(len(joints), value) for name, value in gains.items()}
-    return robot, joints, Controller(kind="pd", rate_hz=args.control_hz, gains=every), Convention()
+    return robot, joints, Controller(kind="pd", rate_hz=args.control_hz, gains=every), None, Convention()
 
 
-def _alike(folder: Path, robot: str | None) -> tuple[str, tuple[str, ...], Controller, Convention]:
-    """Robot, joints, controller, and units and signs of a log, which may be read with another model."""
+def _alike(folder: Path, robot: str | None) -> tuple[str, tuple[str, ...], Controller, np.ndarray | None, Convention]:
+    """Robot, joints, controller, passive joints, units and signs of a log, which may be read with another model."""
     log = read_any(folder, robot and Path(robot))
-    return log.robot, log.joints, log.runs[0].controller, log.convention
+    return log.robot, log.joints, *controller_of(log), log.convention
 
 
 def _check(args: Args) -> None:

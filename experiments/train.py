@@ -7,7 +7,7 @@ import jax
 
 from envs import corrected
 from experiments.common import checkpoint, hosts, plots
-from experiments.common.checkpoint import as_json, read_json, write_json
+from experiments.common.checkpoint import as_json, read_json
 from experiments.common.cli import console, run
 from experiments.common.config import preset
 from experiments.walking import memory
@@ -58,8 +58,8 @@ def main(args: Args) -> None:
     learner = Learner(sizes, entries, correction=args.model and corrected.read(args.model), kind=robot)
     memory.check(learner)
     # Again, since another process may have been at work there.
-    _, curve = trained(jax.random.PRNGKey(args.seed), learner, updates, args.out, lambda: _check_folder(args))
-    write_json(args.out / "curve.json", {"args": args, "curve": curve})
+    key, check = jax.random.PRNGKey(args.seed), lambda: _check_folder(args)
+    _, curve = trained(key, learner, updates, args.out, check, {"args": args})
     plots.training(args.out / "curve.png", curve, robot.control_s, robot.shown)
     first, last = curve[0], curve[-1]
     # The first chunk includes compilation, so the speed is that of the others.

@@ -34,9 +34,10 @@ def make(centre: Coords, radius: float | Coords, lower: Coords, upper: Coords) -
         them.
     """
     radii = radius if isinstance(radius, Mapping) else dict.fromkeys(centre, radius)
-    for value in radii.values():
+    for name, value in radii.items():
         if isinstance(value, str) or not 0 < value < math.inf:
-            raise ValueError(f"radius: got {value!r}, expected a positive number")
+            field = f"radius['{name}']" if isinstance(radius, Mapping) else "radius"
+            raise ValueError(f"{field}: got {value!r}, expected a positive number")
     for field, named in {"radius": radii, "lower": lower, "upper": upper}.items():
         if set(named) != set(centre):
             raise ValueError(f"{field}: got {sorted(named)}, expected {sorted(centre)}")

@@ -93,9 +93,8 @@ class HostTuner:
             key_collect, key_verify, key_update = jax.random.split(jax.random.fold_in(key, carry["rounds"]), 3)
             collected = self._tuner.collect(key_collect, state.policy, carry["dist"])
             check_measured(measured, collected.trajectory, self.config)
-            if self.verify is calibrated_gate or self.update is posterior_update:
-                # Once for gate and update.
-                collected = collected.replace(reading=self._examine(collected, measured))
+            # Once for gate and update.
+            collected = collected.replace(reading=self._examine(collected, measured))
             carry = counted(carry, collected)
             if carry["verdict"] == Verdict.WIDEN:
                 gate = self._verify(key_verify, collected, measured, state.knobs)

@@ -270,14 +270,14 @@ def calibrated_gate(
     fixed = ~jnp.isnan(knobs.threshold)
     every = jnp.where(fixed, cover, jnp.nanmax(jnp.stack([*excess.values()]), axis=0))
     calibration, value = every[:-1], jnp.where(sane[-1], every[-1], jnp.nan)
-    usable, needed = valid.any(axis=-1), knobs.level / (1.0 - knobs.level)
-    read = fixed | ~jnp.isnan(statistics["misfit"][-1])
+    lived = jnp.append(_lives(collected.held_out, config), _lives(measured, config))
+    usable, needed = valid.any(axis=-1) & (fixed | lived), knobs.level / (1.0 - knobs.level)
     enough = fixed | (usable[:-1].sum() >= jnp.floor(needed + 0.5))
     return GateInfo(
         novelty=value,
         threshold=jnp.where(fixed, knobs.threshold, conformal.quantile(calibration, knobs.level)),
         p_value=conformal.p_value(every),
-        comparable=usable[-1] & read & enough & _moves(measured, collected) & ~_copied(measured, collected),
+        comparable=usable[-1] & enough & _moves(measured, model.scaler) & ~_copied(measured, collected),
         uncovered=jnp.sum(valid[-1] & ~covered[-1]) / jnp.maximum(valid[-1].sum(), 1),
         elbo=elbo,
         **{name: values[-1] for name, values in excess.items()},
@@ -297,7 +297,8 @@ def _share_up(episodes: Trajectory) -> jax.Array:
 def of_all_sets(function: Callable, shared: tuple, collected: Collected, measured: Trajectory):
     """What a function `(*shared, set)` returns for every held-out set and, last, for the measured one.
 
-    Under `vmap` over measured sets, held-out sets are scored once for all.
+    Under `vmap` over measured sets alone, held-out sets are scored once for all. The function closes over constants
+    only (`devices.spread`), and cannot be differentiated backwards.
     """
     held_out, measured = (episodes.replace(state=None) for episodes in (collected.held_out, measured))
     of = lambda shared, sets: devices.in_chunks(function, (sets,), SETS, shared=shared)  # noqa: E731
@@ -372,9 +373,14 @@ def _excess(name: str, values: jax.Array) -> jax.Array:
     return (values - median) / jnp.maximum(high - median, _LEAST_SPREAD[name])
 
 
-def _moves(measured: Trajectory, collected: Collected) -> jax.Array:
+def _lives(episodes: Trajectory, config: TunerConfig) -> jax.Array:
+    """Tells which sets [..., episodes, time] hold a window that the regression can read, [...]."""
+    return windows.valid_starts(episodes.alive, config.regression.window).any(axis=(-2, -1))
+
+
+def _moves(measured: Trajectory, scaler: windows.Scaler) -> jax.Array:
     """Tells whether any observation changes within the living steps of a measured episode, in whatever units."""
-    first, usual = measured.obs[:, :1], windows.fit_scaler(collected.trajectory).std[: measured.obs.shape[-1]]
+    first, usual = measured.obs[:, :1], scaler.std[: measured.obs.shape[-1]]
     changes = jnp.abs(measured.obs - first) > _SAME * (usual + jnp.abs(first))
     return (changes & measured.alive[..., None]).any()
 
@@ -432,7 +438,8 @@ def posterior_update(
     quantile of `interval` is by as much higher as the refinements (five at most) may miss:
     `1 - (1 - coverage) (1 - refinements / 10)`.
 
-    Held-out sets without a window are left out of all quantiles, since the measured one has some.
+    Held-out sets without a window are left out of all quantiles. A measured set without one, or with a living step that
+    is not finite, leaves the distribution as it is.
 
     A coordinate that is not identifiable keeps centre and radius. Where the interval of one that is reaches past the
     box, and not merely past a bound, all keep their radii, and centres move.
@@ -454,6 +461,8 @@ def posterior_update(
     off = jnp.where(known, estimates[:-1] - truth, 0.0)
     ignorant = jnp.where(known, jnp.abs((low + high) / 2 - truth), jnp.nan)
     interval, wide, identifiable = _calibrate(config, model, jnp.where(known, jnp.abs(off), jnp.nan), ignorant)
+    # A measured set without a window, or with a number that is not finite, says nothing.
+    identifiable &= ~jnp.isnan(reading.misfit[-1])
     step = jnp.where(identifiable, estimates[-1], 0.0)
     # Held-out truths all lie in the box, so their errors say nothing of truths beyond it. One that is outside in one
     # coordinate may bend the estimates of all, and narrowing could exclude it for good.

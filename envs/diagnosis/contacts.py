@@ -36,20 +36,23 @@ def contacts(run: Run, joints: tuple[str, ...], model: mujoco.MjModel) -> list[F
     ]
 
 
-def touching(model: mujoco.MjModel, joints: Sequence[str], positions: np.ndarray) -> dict[tuple[str, str], float]:
+def touching(
+    model: mujoco.MjModel, joints: Sequence[str], positions: np.ndarray, most: int = _ROWS
+) -> dict[tuple[str, str], float]:
     """Finds pairs of bodies that go into each other by more than 2 mm.
 
     Args:
       model: of the robot with contacts and a fixed base.
       joints: names of the joints, in the columns' order.
-      positions: [rows, joints] rad or m; 50 rows of them are looked at.
+      positions: [rows, joints] rad or m.
+      most: number of rows that are looked at, at even distances.
 
     Returns:
       Share of these rows by the bodies' names.
     """
     data = mujoco.MjData(model)
     address = [int(model.joint(name).qposadr[0]) for name in joints]
-    rows = np.unique(np.linspace(0, len(positions) - 1, _ROWS).astype(int))
+    rows = np.unique(np.linspace(0, len(positions) - 1, most).astype(int))
     touched: dict[tuple[str, str], int] = {}
     for row in rows:
         data.qpos[address] = positions[row]

@@ -20,8 +20,8 @@ from envs.readings import quantum_of
 _BETTER = 0.25  # in units of one joint's whole signal
 _SHARE = 0.1  # of the disagreement before
 _MOST_REPAIRS = 3
-_HALF = 0.6  # of what the joints of a change of units disagree, and may still disagree after it
-_LEAST_MOTION = (1e-3, 5.0)  # rad or m, and quanta: a joint that moves less says nothing of its sign, order or unit
+_LEFT = 0.6  # of what the joints of a change of units disagree, and may still disagree after it
+_LEAST_MOTION = (1e-3, 5.0)  # rad or m, and quanta: where all joints move less, nothing shows signs, order or units
 _KEPT_ROWS = 1500  # of a long run; more take time and change nothing
 _ANGLES = ("degrees", "radians twice", "millimetres")
 _UNITS = (*_ANGLES, "millinewtonmetres")
@@ -30,6 +30,7 @@ _DELAYS_S = (0.004, 0.008, 0.012, 0.016, 0.024, 0.032, 0.045)
 _LONGEST_DELAY = 0.25  # of the rows, so that most of them remain
 _LEAST_OFFSET_RAD = 0.025
 _LEAST_DRIFT = 0.015
+_MOVES = 0.02  # of the largest motion, in rad or m, below which a joint counts as still
 _COARSE = 0.004  # largest step of an encoder, as a share of the joint's range of motion
 
 
@@ -42,6 +43,8 @@ class _Repair:
     joints: tuple[int, ...]
     size: float
     apply: Callable[[Run], Run]
+    places: tuple[int, ...] = ()
+    """Joints that a change of units changes, also where it is of all hinges and names none."""
 
 
 def physics(run: Run, joints: tuple[str, ...], model: mujoco.MjModel, held: bool) -> list[Finding]:
@@ -58,7 +61,7 @@ def physics(run: Run, joints: tuple[str, ...], model: mujoco.MjModel, held: bool
     """
     run, done = _thinned(run), []
     if not _moving(run).any():
-        return []
+        return _coarse(run, joints) if (np.ptp(run.signals["q"], axis=0) > _LEAST_MOTION[0]).any() else []
     # With coarse encoders accelerations are mostly rounding errors, so the inverse dynamics are not compared.
     disagreement = Disagreement(run, joints, model, held and not _is_coarse(run))
     turns = np.array([model.joint(name).type[0] == mujoco.mjtJoint.mjJNT_HINGE for name in joints])
@@ -99,8 +102,8 @@ def _best(chains: list[list[_Repair]], run: Run, disagreement: Disagreement) -> 
         repaired = reduce(lambda run, repair: repair.apply(run), chain, run)
         after = disagreement.by_joint(repaired)
         # Wrong units spoil all that is compared of a joint. If much remains, sizes have changed for another reason.
-        named = [list(one.joints) or slice(None) for one in chain if one.kind in _ANGLES]
-        explained = all(after[joints].sum() < _HALF * before[joints].sum() for joints in named)
+        named = [list(one.places) for one in chain if one.kind in _ANGLES]
+        explained = all(after[joints].sum() < _LEFT * before[joints].sum() for joints in named)
         found.append((chain, repaired, float(after.sum()) if explained else np.inf))
     return min(found, key=lambda each: each[2])
 
@@ -159,7 +162,9 @@ def _positions(label: str, names: tuple[str, ...], turns: np.ndarray) -> list[_R
             factors = np.where(np.isin(np.arange(len(turns)), joints), factor, 1.0)
             # `units` in meta.yaml is about all hinges, so these are not named.
             named = () if len(joints) == turns.sum() and kind != "millimetres" else joints
-            found.append(_Repair(kind, label, named, factor, _on(names, lambda v, factors=factors: v * factors)))
+            found.append(
+                _Repair(kind, label, named, factor, _on(names, lambda v, factors=factors: v * factors), joints)
+            )
     return found
 
 
@@ -244,7 +249,7 @@ def _coarse(run: Run, joints: tuple[str, ...]) -> list[Finding]:
 def _is_coarse(run: Run) -> bool:
     span = np.ptp(run.signals["q"], axis=0)
     # Joints that hardly move say nothing of the motion.
-    moves = span > 0.1 * span.max()
+    moves = span > _MOVES * span.max()
     return not moves.any() or quantum_of(run.signals["q"])[moves].max() > _COARSE * float(np.median(span[moves]))
 
 

@@ -41,8 +41,15 @@ def repeated(run: Run) -> np.ndarray:
     expected = len(same) * chance
     # Beyond chance by itself, or as one of many more than noise brings about.
     noisy = (chance < 1) & ((expected < _CHANCE) | ((chance < 1).sum() > 3.0 * expected + 1.0))
+    share, steps, least = _FAR
+    far = np.maximum(np.maximum(share * np.ptp(run.signals["q"], axis=0), steps * quanta[:joints]), least)
+    speeds = np.zeros((len(values), joints))
+    if "dq" in run.signals:
+        rounding = quanta[joints : 2 * joints]  # `MEASURED` begins with positions and velocities
+        speeds = np.where((fast := np.abs(run.signals["dq"])) > _FAST_QUANTA * rounding, fast, 0.0)
     for (first, last), beyond in zip(stays, noisy, strict=True):
-        if not (beyond or _passes(run, first, last, quanta[:joints]) or _driven(run, first, last)):
+        driven = (speeds[first] * (run.time[last] - run.time[first]) > far).any()
+        if not (beyond or driven or _passes(run, first, last, quanta[:joints])):
             same[first:last] = False
     return same
 
@@ -61,17 +68,6 @@ def _passes(run: Run, first: int, last: int, quanta: np.ndarray) -> bool:
     # Rounding alone makes a slow joint stay.
     missed = pace * (last - first) / width
     return bool((sudden & (pace > _LEAST_QUANTA * quanta) & (missed > _MISSED_QUANTA * quanta)).any())
-
-
-def _driven(run: Run, first: int, last: int) -> bool:
-    """Whether recorded speeds, constant in a stay, would have moved a joint far."""
-    if "dq" not in run.signals:
-        return False
-    position, speed = run.signals["q"], np.abs(run.signals["dq"][first])
-    speed = np.where(speed > _FAST_QUANTA * quantum_of(run.signals["dq"]), speed, 0.0)
-    share, quanta, least = _FAR
-    far = np.maximum(np.maximum(share * np.ptp(position, axis=0), quanta * quantum_of(position)), least)
-    return bool((speed * (run.time[last] - run.time[first]) > far).any())
 
 
 def _chance(values: np.ndarray, first: int, last: int, quanta: np.ndarray, parts: np.ndarray) -> float:

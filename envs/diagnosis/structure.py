@@ -15,7 +15,7 @@ _SHORT = 3.25  # usual steps: the longest gap over which readings can be interpo
 _FEW = 0.01  # share of the steps that may be short gaps
 _SOON, _IN_STEP = 3, 0.3  # rows after a late one, and usual steps from their place, by which the clock is in step again
 _APART = 1.4  # ratio of two steps, one of which is a hole and the other none
-_PACE = 0.95  # quantile of the steps: one that is as long as these is a pace of the clock
+_PACE, _LOOKED_AT = 0.95, 100  # quantile of the steps: those up to it may be a pace of the clock; how many are tested
 
 
 def structure(run: Run) -> tuple[list[Finding], Run]:
@@ -42,6 +42,10 @@ def structure(run: Run) -> tuple[list[Finding], Run]:
         )
         found.append(Finding("duplicated rows", "t", (), float(twice.sum()), text))
     holes = np.flatnonzero(steps > max(_LEAST_HOLE * period, _longest_usual(steps)))
+    # Stamps of whole milliseconds at 700 rows a second are 1 or 2 ms apart, but the robot moves as far.
+    pace = holes[steps[holes] <= 1.01 * np.quantile(steps, _PACE)]
+    if len(pace) and np.mean([_moves_on(run, row) for row in pace[:: -(-len(pace) // _LOOKED_AT)]]) < 0.5:
+        holes = np.setdiff1d(holes, pace)
     # A row that was read late, with the time at which it was read, is no defect.
     short = [row for row in holes if steps[row] <= _SHORT * period]
     gaps = [row for row in short if not _in_step_again(run.time, row, period)]
@@ -69,8 +73,7 @@ def _longest_usual(steps: np.ndarray) -> float:
     """
     longer = np.sort(steps[steps >= np.median(steps)])
     apart = np.flatnonzero(longer[1:] > _APART * longer[:-1])
-    # Stamps of whole milliseconds at 700 rows a second are 1 or 2 ms apart.
-    return max(float(longer[apart[0]] if len(apart) else longer[-1]), 1.01 * float(np.quantile(steps, _PACE)))
+    return float(longer[apart[0]] if len(apart) else longer[-1])
 
 
 def _in_step_again(time: np.ndarray, row: int, period: float) -> bool:

@@ -37,7 +37,7 @@ PRESLIDING = Effect(
     family="joint_friction",
     on="joint",
     enters="bristle",
-    parameters=(Parameter(name="travel_rad", scale="angle", bounds=(0.0, 0.05), prior=0.005),),
+    parameters=(Parameter(name="travel_rad", bounds=(0.0, 0.05), prior=0.005),),
     sizes=(0.0005, 0.005),
     act=_presliding,
     start=_wound,

@@ -1,6 +1,7 @@
 """Cuts logs into the segments that discovery works on, by split (train, select, sealed) and horizon."""
 
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import replace
 
 import jax
@@ -26,6 +27,7 @@ _PARTS = {"train": (0.0, 0.5), "select": (0.5, 0.75), "sealed": (0.75, 1.0)}  # 
 _LEAST_ROWS = 8  # of such a part
 _LEAST_SEGMENTS = 3  # of a split: a bootstrap needs a few to draw from
 _ALIKE = 0.05  # of the log's range of positions and speeds, by which repetitions of a segment may begin apart
+_NEAR = [[2e-3], [0.05]]  # rad or m, and per s, which noise may take a joint that stands still
 _ENOUGH, _ENOUGH_S = (40, 128), 20.0  # segments of a split that are simulated, and their length together in s
 
 
@@ -125,7 +127,7 @@ def _spread(repeats: np.ndarray, horizon: float) -> np.ndarray:
     Repeats stay together, because alone they do not show how far runs differ.
 
     Args:
-      repeats: [segments] of `_repeats`.
+      repeats: [segments] of `_told_the_same`.
       horizon: their length in s.
 
     Returns:
@@ -172,46 +174,60 @@ def cut_log(log: Log, dt: float, signals: Sequence[str], horizons: Sequence[floa
                     "more: record longer runs or more of them, or choose shorter horizons"
                 )
             mine = np.flatnonzero(mine)
-            repeats = _repeats(log, estimates, cut.run[mine], cut.row[mine])
-            kept = _spread(repeats, horizon)
-            mine = mine[kept]
+            told = _told_the_same(log, cut.run[mine], cut.row[mine])
+            kept = _spread(told, horizon)
+            mine, told = mine[kept], told[kept]
             data[split][horizon] = Segments(
                 inputs=jax.tree.map(lambda leaf, mine=mine: leaf[mine], cut.segments),
                 signals={name: cut.signals[name][mine] for name in signals},
                 steps=cut.segments.target.shape[1] - round(segments.HISTORY_S / dt),
                 run=cut.run[mine],
                 regimes=label[mine],
-                repeats=repeats[kept],
+                repeats=_began_alike(told, log, estimates, cut.run[mine], cut.row[mine]),
             )
     return data
 
 
-def _repeats(log: Log, estimates: Sequence[segments.Estimate], run: np.ndarray, row: np.ndarray) -> np.ndarray:
-    """Groups segments in which several runs of a condition were told the same and began alike.
+def _told_the_same(log: Log, run: np.ndarray, row: np.ndarray) -> np.ndarray:
+    """Groups segments in which several runs of a condition were told the same, which null logs share.
 
     Args:
       log: of the runs.
-      estimates: of the runs.
       run: [segments] index of each segment's run.
       row: [segments, rows] of that run.
 
     Returns:
       [segments] the group of each; -1 for those that are alone.
     """
-    told: dict[tuple, list[list[int]]] = {}
     conditions = [(one.condition, str(one.controller)) for one in log.runs]
-    far = _ALIKE * np.ptp(np.concatenate([one.states for one in estimates]), axis=0)
-    begins = np.array([estimates[mine].states[rows[0]] for mine, rows in zip(run, row, strict=True)])
-    for number, (mine, rows) in enumerate(zip(run, row, strict=True)):
+    keys = []
+    for mine, rows in zip(run, row, strict=True):
         signals = log.runs[mine].signals
         sent = signals["target"][rows] if "target" in signals else signals["tau"][rows]
         on = signals["enabled"][rows] > 0 if "enabled" in signals else np.ones(len(rows), bool)
-        groups = told.setdefault((*conditions[mine], rows[0], sent.round(6).tobytes(), on.tobytes()), [])
-        alike = (group for group in groups if (np.abs(begins[number] - begins[group[0]]) <= far).all())
-        group = next(alike, None)
-        groups.append([number]) if group is None else group.append(number)
-    found = np.full(len(run), -1)
-    together = (group for groups in told.values() for group in groups if len(group) > 1)
-    for number, members in enumerate(together):
-        found[members] = number
-    return found
+        keys.append((*conditions[mine], rows[0], sent.round(6).tobytes(), on.tobytes()))
+    return _grouped(keys)
+
+
+def _began_alike(
+    told: np.ndarray, log: Log, estimates: Sequence[segments.Estimate], run: np.ndarray, row: np.ndarray
+) -> np.ndarray:
+    """Splits groups of segments by the states in which they begin, [segments]; other arguments as `_told_the_same`."""
+    unsealed = [one.states for one, of in zip(estimates, log.runs, strict=True) if of.split != "sealed"]
+    far = np.maximum(_ALIKE * np.ptp(np.concatenate(unsealed or [one.states for one in estimates]), axis=0), _NEAR)
+    keys: list[tuple[int, int]] = []
+    # By group, where its parts begin.
+    begins: dict[int, list[np.ndarray]] = {}
+    for number, (group, mine, rows) in enumerate(zip(told, run, row, strict=True)):
+        state, known = estimates[mine].states[rows[0]], begins.setdefault(int(group), [])
+        part = next((index for index, other in enumerate(known) if (np.abs(state - other) <= far).all()), len(known))
+        known += [state] if part == len(known) else []
+        keys.append((int(group), part if group >= 0 else -1 - number))
+    return _grouped(keys)
+
+
+def _grouped(keys: Sequence[Hashable]) -> np.ndarray:
+    """Numbers equal keys; -1 for those that are there once."""
+    times = Counter(keys)
+    numbers = {key: number for number, key in enumerate(key for key in times if times[key] > 1)}
+    return np.array([numbers.get(key, -1) for key in keys], int)

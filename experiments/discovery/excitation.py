@@ -16,11 +16,12 @@ import mujoco
 import numpy as np
 
 from envs.diagnosis.contacts import touching
-from envs.logs import Controller
+from envs.logs import Controller, Log
 from envs.models import suspended
 
 _CHIRP_HZ = (0.5, 10.0)
 _LEAST_ROWS = 10  # of a piece
+_LOOK_S = 0.02  # between targets that are tested for contacts
 _TRIES, _SMALLER = 40, 0.95  # motions that are drawn until none touches, and by how much each is smaller
 
 
@@ -98,6 +99,7 @@ def deciding(
     seconds: float = 3.0,
     rate_hz: float = 500.0,
     seed: int = 0,
+    held: np.ndarray | None = None,
 ) -> Decision | None:
     """Chooses the motion with the largest score, of all but the medley.
 
@@ -109,6 +111,7 @@ def deciding(
       seconds: length of a run in s.
       rate_hz: rows per second.
       seed: of postures, paces and steps; `excite` writes the same targets with the same numbers.
+      held: [joints] as in `excitation`.
 
     Returns:
       The motion; None where no score is a number, or bodies touch in all motions.
@@ -120,7 +123,7 @@ def deciding(
     motions = {}
     for name in candidates:
         with suppress(Touching):
-            motions[name] = excitation(spec, joints, runs, seconds, rate_hz, seed, name)
+            motions[name] = excitation(spec, joints, runs, seconds, rate_hz, seed, name, held)
     scores = {name: float(score(motion)) for name, motion in motions.items()}
     # A simulation that diverges under a suspect decides nothing.
     scores = {name: value if np.isfinite(value) else -np.inf for name, value in scores.items()}
@@ -138,6 +141,7 @@ def excitation(
     rate_hz: float,
     seed: int = 0,
     motion: str = "medley",
+    held: np.ndarray | None = None,
 ) -> list[TargetRun]:
     """Makes the target runs of a log in which effects are distinguishable.
 
@@ -152,6 +156,7 @@ def excitation(
       rate_hz: rows per second.
       seed: of postures, paces and steps.
       motion: a name of `MOTIONS`.
+      held: [joints] true for those whose targets stay where they begin, as passive ones cannot follow any.
 
     Returns:
       Runs, split into train, select and sealed so that every split has both of the motion's gains.
@@ -181,7 +186,8 @@ def excitation(
             posture = home + 0.25 * (high - low) * rng.uniform(-1, 1, len(joints))
             room = np.minimum(np.minimum(high - posture, posture - low), 0.6 * _SMALLER**tried)
             target, enabled = _targets(chosen, posture, room, seconds, rate_hz, rng)
-            if not (pairs := blocked.at(target)):
+            target = target if held is None else np.where(held, target[0], target)
+            if not (pairs := blocked.at(target, round(seconds / _LOOK_S))):
                 break
         else:
             raise Touching(
@@ -215,12 +221,30 @@ class _Blocked:
         self._model, self._joints = None if free else spec.copy().compile(), joints
         self._drawn = set() if free else set(touching(self._model, joints, self._model.qpos0[None, self._columns()]))
 
-    def at(self, targets: np.ndarray) -> list[tuple[str, str]]:
-        """Lists pairs of bodies that touch in some of the targets [rows, joints]."""
-        return [] if self._model is None else sorted(set(touching(self._model, self._joints, targets)) - self._drawn)
+    def at(self, targets: np.ndarray, most: int) -> list[tuple[str, str]]:
+        """Lists pairs of bodies that touch in some of the targets [rows, joints], of which `most` are looked at."""
+        if self._model is None:
+            return []
+        return sorted(set(touching(self._model, self._joints, targets, most)) - self._drawn)
 
     def _columns(self) -> list[int]:
         return [int(self._model.joint(name).qposadr[0]) for name in self._joints]
+
+
+def controller_of(log: Log) -> tuple[Controller, np.ndarray | None]:
+    """Returns the controller that a log's robot is driven with, and which joints are passive.
+
+    Args:
+      log: of the robot.
+
+    Returns:
+      The controller of the first run in which a joint follows its target, else of the first; and [joints], true where its kp is zero, or
+      None where it has none.
+    """
+    driven = (run.controller for run in log.runs if np.any(run.controller.gains.get("kp", 1.0)))
+    controller = next(driven, log.runs[0].controller)
+    kp = controller.gains.get("kp")
+    return controller, None if kp is None else kp == 0
 
 
 def unlimited_slides(model: mujoco.MjModel, joints: Sequence[str]) -> list[str]:

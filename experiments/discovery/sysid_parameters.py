@@ -97,13 +97,13 @@ def robot_of(spec: mujoco.MjSpec, log: Log) -> Robot:
     error = np.concatenate([np.abs(run.signals["target"] - run.signals["q"]) for run in runs])
     on = (stiffness > 0).any(axis=1)
     if not on.any():
-        raise ValueError("controller: got kp 0 for every joint, expected a joint that follows its target")
+        raise ValueError("controller: got no row with motors on and a gain above 0, expected a joint that is driven")
     visible = {
         "gain": (stiffness > 0).any(axis=0),
         "brake": (damping > 0).any(axis=0),
         "limit": (on[:, None] & (stiffness * error > 0.5 * limit)).any(axis=0),
     }
-    typical = np.median(stiffness[on], axis=0)
+    typical = np.array([np.median(own[own > 0]) if own.any() else 0.0 for own in stiffness.T])
     # A passive joint has no stiffness of its own, by which its parameters could be measured.
     return Robot(playable(spec, log), log.joints, np.where(typical > 0, typical, typical.max()), visible)
 

@@ -11,10 +11,12 @@ from pathlib import Path
 import jax
 
 from experiments.walking.learner import Learner
+from jaxtune.rules import SETS
 
 _TRAINING = 14.0  # of a PPO update's rollout: its batches, their gradients, the physics of a step
 _TUNING = 2.0  # of a tuning's episodes: windows, and batches of them
 _SCORED = 20.0  # of sets that are scored side by side: their windows, and what networks make of them
+_KEPT = 2.0  # of all sets that are measured: their episodes
 _MODELS = 100e6  # B, of both models while they are trained
 _USABLE = 0.9  # share of a device's memory
 _LIMIT = Path("/sys/fs/cgroup/memory.max")  # of a container, in bytes; `max` where there is none
@@ -25,7 +27,7 @@ def needed(learner: Learner, sets: int = 0) -> dict[str, float]:
 
     Args:
       learner: robot and sizes.
-      sets: measured sets that are scored side by side, as a self-test does.
+      sets: measured sets that are scored at once, as by a self-test.
 
     Returns:
       Bytes by name: `training` over all devices, and `tuning` and `scoring` on each, as every device learns from all
@@ -38,7 +40,8 @@ def needed(learner: Learner, sets: int = 0) -> dict[str, float]:
         kept = jax.eval_shape(lambda key: learner.robot.kept(learner.robot.reset({}, key)), jax.random.PRNGKey(0))
         step += 4.0 * sum(leaf.size for leaf in jax.tree.leaves(kept))
     episodes = step * sizes.episode_steps * (tuner.episodes + tuner.held_out_sets * tuner.set_episodes)
-    scores = _SCORED * step * sizes.episode_steps * sets * tuner.set_episodes
+    beside = min(sets, SETS["cpu" if jax.default_backend() == "cpu" else "other"])
+    scores = (_KEPT * sets + _SCORED * beside) * step * sizes.episode_steps * tuner.set_episodes
     return {"training": _TRAINING * rollout, "tuning": _TUNING * episodes + _MODELS, "scoring": scores}
 
 
@@ -48,7 +51,7 @@ def check(learner: Learner, lanes: int = 1, sets: int = 0) -> None:
     Args:
       learner: robot and sizes.
       lanes: runs side by side, spread over devices.
-      sets: measured sets that are scored side by side.
+      sets: measured sets that are scored at once.
 
     Raises:
       ValueError: it does not; says how much is needed for what, and how much there is.

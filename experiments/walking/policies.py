@@ -6,8 +6,10 @@ A policy on disk is a folder: PPO's state as an orbax checkpoint, and a `config.
 
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import MappingProxyType
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -97,7 +99,12 @@ def walk(
 
 
 def trained(
-    key: jax.Array, learner: Learner, updates: int, out: Path, check: Callable[[], None] = lambda: None
+    key: jax.Array,
+    learner: Learner,
+    updates: int,
+    out: Path,
+    check: Callable[[], None] = lambda: None,
+    told: Mapping[str, Any] = MappingProxyType({}),
 ) -> tuple[Policy, list[dict[str, float]]]:
     """Trains a policy with `walk`, showing progress, and saves it with its curve; goes on where it was interrupted.
 
@@ -107,6 +114,7 @@ def trained(
       updates: PPO updates.
       out: folder of the policy.
       check: looks at what the folder holds, before it is written to and while no other process may.
+      told: what is saved beside the curve, such as options.
 
     Returns:
       As `walk`.
@@ -125,7 +133,7 @@ def trained(
             console.print(f"{skipped:.2%} of the gradient steps were not taken, since a number was not finite")
         checkpoint.check_finite("policy", policy.learner)
         checkpoint.save(out, policy.learner, policy_config(learner))
-        write_json(out / "curve.json", {"curve": curve})
+        write_json(out / "curve.json", {**told, "curve": curve})
         hosts.from_first(lambda: shutil.rmtree(kept, ignore_errors=True))
     return policy, curve
 

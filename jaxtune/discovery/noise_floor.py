@@ -218,14 +218,16 @@ def _fit_null_logs(problem: Problem, prior: Free) -> tuple[np.ndarray, np.ndarra
 def _sound(left: np.ndarray, spread: np.ndarray) -> np.ndarray:
     """Tells which null logs [logs, segments, bins, components] decide: those that their own models simulate.
 
-    A simulation that comes apart leaves more than the signal's own spread [components], and more than other logs do.
+    A simulation that comes apart leaves more than the largest joint moves in the signal [components], and more than
+    other logs do.
 
     Raises:
       ValueError: fewer than two.
     """
     rms = np.sqrt((left**2).mean(axis=(1, 2)))
-    usual = np.nanmedian(np.where(np.isfinite(rms), rms, np.nan), axis=0) if np.isfinite(rms).any() else 0.0
-    found = np.isfinite(rms).all(axis=1) & ~(rms > np.maximum(spread, _BROKEN * usual)).any(axis=1)
+    found = np.isfinite(rms).all(axis=1)
+    if found.any():
+        found &= ~(rms > np.maximum(spread, _BROKEN * np.median(rms[found], axis=0))).any(axis=1)
     if found.sum() < 2:
         raise ValueError(
             f"null logs: got {found.sum()} of {len(left)} that the nominal model simulates, expected at least 2; "
@@ -235,9 +237,10 @@ def _sound(left: np.ndarray, spread: np.ndarray) -> np.ndarray:
 
 
 def _spread(problem: Problem, split: str, horizon: float) -> np.ndarray:
-    """Standard deviations of the measured signals, [components]."""
+    """The largest standard deviation of the components of every measured signal, [components]."""
     signals = problem.data[split][horizon].signals
-    return np.concatenate([signals[name].std(axis=(0, 1)) for name in sorted(problem.components)])
+    most = [signals[name].std(axis=(0, 1)) for name in sorted(problem.components)]
+    return np.concatenate([np.full(len(each), each.max()) for each in most])
 
 
 def _step(prior: Free, point: np.ndarray, residual: np.ndarray, slopes: np.ndarray, share: float) -> np.ndarray:

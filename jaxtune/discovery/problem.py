@@ -94,8 +94,8 @@ class Segments:
     regimes: np.ndarray
     """[segments, rows, joints]: index of the regime that each joint is in."""
     repeats: np.ndarray | None = None
-    """[segments]: the same number for segments in which several runs were told the same, -1 for all others; None where
-    that is not known."""
+    """[segments]: the same number for segments in which several runs were told the same and began alike, -1 for all
+    others; None where that is not known."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -254,7 +254,7 @@ def test_targets_do_not_go_through_a_table(motion):
 
 
 def test_a_robot_that_touches_wherever_it_moves_is_named(tmp_path):
-    # A forearm of 3 m above a table at 0.3 m, which it crosses at 0.1 rad.
+    # A forearm of 3 m that points down, 50 mm above a table.
     low = TABLE.format(3.0).replace('pos="0 0 0.3"', 'pos="0 0 0.05"').replace("-1.4 1.4", "0.2 1.4")
     (tmp_path / "low.xml").write_text(low)
     with pytest.raises(ValueError, match="lower and world touch in every motion that was drawn"):

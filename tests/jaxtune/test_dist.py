@@ -118,7 +118,7 @@ def test_make_takes_radii_by_name():
     assert {name: float(value) for name, value in made.radius.items()} == pytest.approx({"a": 0.2, "b": 2.0})
     with pytest.raises(ValueError, match=r"radius: got \['a'\], expected \['a', 'b'\]"):
         dists.make(scalars(a=0, b=0), {"a": 0.2}, scalars(a=-1, b=-1), scalars(a=1, b=1))
-    with pytest.raises(ValueError, match=r"radius: got -0.1, expected a positive number"):
+    with pytest.raises(ValueError, match=r"radius\['a'\]: got -0.1, expected a positive number"):
         dists.make(scalars(a=0), {"a": -0.1}, scalars(a=-1), scalars(a=1))
 
 

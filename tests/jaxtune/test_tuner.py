@@ -14,7 +14,7 @@ from jaxtune import baselines, dvm, explain, rules, spm
 from jaxtune import dist as dists
 from jaxtune import tuner as tuners
 from jaxtune.misfits import PHASES
-from jaxtune.tuner import GateInfo, Tuner, UpdateInfo, knobs
+from jaxtune.tuner import GateInfo, Tuner, UpdateInfo, knobs, posterior_update
 from jaxtune.types import Trajectory, Verdict
 
 TWO = {"friction": 0.0, "mass": 0.0}
@@ -1041,9 +1041,17 @@ def test_many_measured_sets_are_scored_beside_the_held_out_ones_once():
     pair = jax.tree.map(lambda leaf: leaf[:2], sets)
     lanes, _ = jax.vmap(lambda own, measured: rules.of_all_sets(one, (2.0,), own, measured))(both, pair)
     close(lanes[1, :-1], 3 * lanes[0, :-1], rtol=1e-5)
+    close(lanes[:, -1], found[0][:2, -1], rtol=1e-6)
+    of_model = lambda scale: rules.of_all_sets(one, (scale,), collected, jax.tree.map(lambda leaf: leaf[0], sets))  # noqa: E731
+    models, _ = jax.vmap(of_model)(jnp.array([2.0, 4.0]))
+    close(models[1], 2 * models[0], rtol=1e-6)
+    inner = lambda own: jax.vmap(lambda measured: rules.of_all_sets(one, (2.0,), own, measured))(pair)  # noqa: E731
+    nested, _ = jax.vmap(inner)(both)
+    close(nested[1, :, :-1], 3 * nested[0, :, :-1], rtol=1e-5)
+    close(nested[1, :, -1], nested[0, :, -1], rtol=1e-6)
 
 
-@pytest.mark.parametrize("unit", [1e-8, 1e8])
+@pytest.mark.parametrize("unit", [1e-8, 1.0])
 def test_a_robot_moves_in_whatever_units(unit):
     measured = lambda episodes: episodes.replace(obs=unit * episodes.obs)  # noqa: E731
     collected = toys.collect(jax.random.key(0), toys.uniform(TWO, 0.2), toys.TINY)
@@ -1063,6 +1071,20 @@ def test_a_set_that_the_regression_cannot_read_is_not_comparable():
     assert tiny_gate(config, collected, one, knobs()).comparable
     assert not tiny_gate(config, collected, short, knobs()).comparable
     assert tiny_gate(config, collected, short, knobs(threshold=0.7)).comparable
+    # Nor does it move anything, where a threshold that is set by hand lets it pass.
+    dist = toys.uniform(TWO, 0.2)
+    broken = one.replace(obs=one.obs.at[0, 5, 0].set(jnp.nan))
+    for says_nothing in (short, broken):
+        moved, update = jax.jit(posterior_update, static_argnums=1)(
+            jax.random.key(0), config, collected, says_nothing, dist, knobs()
+        )
+        assert not update.identifiable.any()
+        jax.tree.map(np.testing.assert_array_equal, moved, dist)
+    # Simulated sets must be long enough for both models as well.
+    few = collected.replace(
+        held_out=collected.held_out.replace(alive=collected.held_out.alive.at[2:, :, 54:].set(False))
+    )
+    assert not tiny_gate(config, few, one, knobs()).comparable
 
 
 @pytest.mark.parametrize("field", ["obs", "action"])
