@@ -238,8 +238,8 @@ def controller_of(log: Log) -> tuple[Controller, np.ndarray | None]:
       log: of the robot.
 
     Returns:
-      The controller of the first run in which a joint follows its target, else of the first; and [joints], true where its kp is zero, or
-      None where it has none.
+      The controller of the first run in which a joint follows its target, else of the first run; and [joints], true
+      where its kp is zero, or None where it has none.
     """
     driven = (run.controller for run in log.runs if np.any(run.controller.gains.get("kp", 1.0)))
     controller = next(driven, log.runs[0].controller)

@@ -285,6 +285,12 @@ def test_short_gaps_are_said_and_do_not_mislead():
     assert "missing rows" in {kind for kind, _ in said(rows(run, many))}
 
 
+def test_many_lost_rows_are_no_pace_of_the_clock():
+    run = undamaged(0)
+    for keep in (np.arange(1500) % 10 != 5, np.arange(1500) % 60 > 6):
+        assert "missing rows" in {kind for kind, _ in said(rows(run, np.flatnonzero(keep)))}
+
+
 def test_a_short_piece_at_a_high_rate_is_tried_for_short_delays_alone():
     """100 rows at 4 kHz last for 25 ms, less than the longest delay that is tried."""
     run = undamaged(0)
@@ -396,3 +402,10 @@ def test_rounded_speeds_of_a_robot_at_rest_repeat_no_rows():
     rest["dq"][750:] = 0.0
     rest["q"][750:] += 1e-3
     assert "duplicated rows" not in {kind for kind, _ in said(replace(run, signals=run.signals | rest))}
+
+
+def test_motion_of_a_few_steps_of_the_encoder_is_quantised():
+    run = undamaged(0)
+    turn = 0.02 * np.sin(2 * np.pi * 0.5 * run.time)[:, None] * [1.0, -1.0]
+    coarse = replace(run, signals={**run.signals, "q": np.round(turn / 0.01) * 0.01, "target": turn})
+    assert "quantised" in {one.kind for one in diagnose(coarse, JOINTS, MODEL)}

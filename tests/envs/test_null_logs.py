@@ -167,3 +167,14 @@ def test_runs_with_targets_and_runs_with_torques_are_driven_each_by_its_own(spec
             # The controller's ticks are drawn for all runs together, and so is the noise.
             np.testing.assert_allclose(mine.signals["q"], alone.runs[0].signals["q"], atol=0.02)
         np.testing.assert_array_equal(both.runs[runs.index(sent)].signals["tau"], sent.signals["tau"])
+
+
+def test_torques_of_which_nothing_is_said_are_held_in_all_null_logs(spec):
+    exact = {"q": {"noise_sd": np.zeros(2)}}
+    told = measured(20.0, "unknown", exact)
+    run = replace(told, signals={"q": told.signals["q"], "tau": 0.5 * told.signals["target"]})
+    robots = [Robot(suspended(spec), linear, np.random.default_rng(0)) for linear in (False, True)]
+    for robot in robots:
+        robot.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION
+    held, too = (as_recorded(one, run, play([(one, run)], ARM_JOINTS)[0]).signals["q"] for one in robots)
+    np.testing.assert_array_equal(held, too)

@@ -236,3 +236,35 @@ def test_segments_that_begin_elsewhere_or_without_motors_are_no_repeats(played):
     # Motors are on in the first half alone.
     assert 0.3 < (train.repeats >= 0).mean() < 0.7
     assert (found["select"][0.24].repeats < 0).all()
+
+
+def test_null_logs_keep_the_segments_of_the_measured_log(played):
+    # The two began elsewhere on the robot and alike in simulation; of so many segments some are left out.
+    (one,) = played.runs
+    named = lambda run, number, split: replace(run, name=f"{split}_{number}", condition=split, split=split)  # noqa: E731
+    rest = [named(one, 0, "select"), named(one, 0, "sealed")]
+    elsewhere = replace(one, signals={**one.signals, "q": one.signals["q"] + [0.3, 0.0]})
+    cut = [
+        cut_log(replace(played, runs=(named(one, 0, "train"), named(two, 1, "train"), *rest)), 0.001, ("q",), (0.08,))
+        for two in (elsewhere, one)
+    ]
+    measured, null = (each["train"][0.08] for each in cut)
+    assert len(measured.run) < 2 * (12.0 - segments.HISTORY_S) / 0.08 - 10
+    np.testing.assert_array_equal(null.run, measured.run)
+    np.testing.assert_array_equal(null.inputs.target, measured.inputs.target)
+    assert (measured.repeats < 0).all()
+    assert (null.repeats >= 0).all()
+
+
+def test_a_joint_that_stands_still_does_not_keep_runs_from_being_repeats(played):
+    (one,) = played.runs
+    rng = np.random.default_rng(0)
+    runs = []
+    for split, count in (("train", 2), ("select", 1), ("sealed", 1)):
+        for number in range(count):
+            still = 0.2 + 1e-4 * rng.standard_normal(len(one.time))
+            position = np.stack([one.signals["q"][:, 0], still], axis=1)
+            run = replace(one, signals={"q": position, "target": one.signals["target"]})
+            runs.append(replace(run, name=f"{split}_{number}", condition=split, split=split))
+    found = cut_log(replace(played, runs=tuple(runs)), 0.001, ("q",), (0.24,))
+    assert (found["train"][0.24].repeats >= 0).all()

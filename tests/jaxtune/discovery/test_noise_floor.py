@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import slider as toy
 
-from jaxtune.discovery.noise_floor import measure
+from jaxtune.discovery.noise_floor import _sound, measure
 
 
 def floor_of(draws, monkeypatch):
@@ -77,6 +77,15 @@ def test_a_null_log_that_comes_apart_widens_nothing():
     found = measure(replace(problem, null_logs=every), lambda text: None)[at]
     assert len(found.null_residuals) == len(whole.null_residuals) - 1
     np.testing.assert_allclose(found.scale["train"].mean(axis=0), whole.scale["train"].mean(axis=0), rtol=0.2)
+
+
+def test_a_null_log_in_which_a_joint_slips_counts():
+    # On the robot it stuck, and in the other null logs.
+    left = np.full((8, 4, 5, 2), 1e-3)
+    left[3, :, :, 1] = 0.02
+    assert _sound(left, np.array([0.1, 0.1])).all()
+    left[3, :, :, 1] = 0.2
+    np.testing.assert_array_equal(np.flatnonzero(~_sound(left, np.array([0.1, 0.1]))), [3])
 
 
 def test_a_component_that_never_changes_has_the_floor_of_its_noise(monkeypatch):
