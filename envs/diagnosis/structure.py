@@ -15,7 +15,7 @@ _SHORT = 3.25  # usual steps: the longest gap over which readings can be interpo
 _FEW = 0.01  # share of the steps that may be short gaps
 _SOON, _IN_STEP = 3, 0.3  # rows after a late one, and usual steps from their place, by which the clock is in step again
 _APART = 1.4  # ratio of two steps, one of which is a hole and the other none
-_PACE, _LOOKED_AT = 0.95, 100  # quantile of the steps: those up to it may be a pace of the clock; how many are tested
+_PACE, _AS_FAR = 0.95, 1.4  # quantile of the steps up to which they may be a pace of the clock; least ratio of motion
 
 
 def structure(run: Run) -> tuple[list[Finding], Run]:
@@ -44,7 +44,8 @@ def structure(run: Run) -> tuple[list[Finding], Run]:
     holes = np.flatnonzero(steps > max(_LEAST_HOLE * period, _longest_usual(steps)))
     # Stamps of whole milliseconds at 700 rows a second are 1 or 2 ms apart, but the robot moves as far.
     pace = holes[steps[holes] <= 1.01 * np.quantile(steps, _PACE)]
-    if len(pace) and np.mean([_moves_on(run, row) for row in pace[:: -(-len(pace) // _LOOKED_AT)]]) < 0.5:
+    moved = np.abs(np.diff(run.signals["q"], axis=0)) / np.maximum(np.ptp(run.signals["q"], axis=0), 1e-9)
+    if len(pace) and moved[pace].mean() < _AS_FAR * np.delete(moved, holes, axis=0).mean():
         holes = np.setdiff1d(holes, pace)
     # A row that was read late, with the time at which it was read, is no defect.
     short = [row for row in holes if steps[row] <= _SHORT * period]

@@ -16,7 +16,7 @@ from jaxtune.rules import SETS
 _TRAINING = 14.0  # of a PPO update's rollout: its batches, their gradients, the physics of a step
 _TUNING = 2.0  # of a tuning's episodes: windows, and batches of them
 _SCORED = 20.0  # of sets that are scored side by side: their windows, and what networks make of them
-_KEPT = 2.0  # of all sets that are measured: their episodes
+_KEPT = 2.6  # of all measured sets, whose episodes are kept
 _MODELS = 100e6  # B, of both models while they are trained
 _USABLE = 0.9  # share of a device's memory
 _LIMIT = Path("/sys/fs/cgroup/memory.max")  # of a container, in bytes; `max` where there is none
@@ -42,7 +42,8 @@ def needed(learner: Learner, sets: int = 0) -> dict[str, float]:
     episodes = step * sizes.episode_steps * (tuner.episodes + tuner.held_out_sets * tuner.set_episodes)
     beside = min(sets, SETS["cpu" if jax.default_backend() == "cpu" else "other"])
     scores = (_KEPT * sets + _SCORED * beside) * step * sizes.episode_steps * tuner.set_episodes
-    return {"training": _TRAINING * rollout, "tuning": _TUNING * episodes + _MODELS, "scoring": scores}
+    tuning = _TUNING * episodes + _MODELS
+    return {"training": _TRAINING * rollout, "tuning": tuning, "scoring": tuning + scores if sets else 0.0}
 
 
 def check(learner: Learner, lanes: int = 1, sets: int = 0) -> None:

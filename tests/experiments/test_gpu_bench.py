@@ -115,8 +115,9 @@ def test_a_run_that_does_not_fit_into_memory_is_refused(monkeypatch):
     memory.check(learner)
     with pytest.raises(ValueError, match=r"lanes: tuning takes .* 64 runs side by side"):
         memory.check(learner, lanes=64)
-    # XLA's analysis of 360 sets of five episodes of BITeno: 1.6 GiB.
-    assert 1.2 < memory.needed(learner, sets=360)["scoring"] / 2**30 < 2.0
-    monkeypatch.setattr(memory, "available", lambda: 2.0**30)
-    with pytest.raises(ValueError, match=r"preset: scoring takes about 1\.\d* GiB"):
+    # XLA's analysis of so many sets of five episodes of BITeno, in GiB.
+    for sets, analysed in ((40, 0.217), (360, 0.393)):
+        assert memory.needed(learner, sets=sets)["scoring"] / 2**30 == pytest.approx(analysed, rel=0.15)
+    monkeypatch.setattr(memory, "available", lambda: 0.3 * 2**30)
+    with pytest.raises(ValueError, match=r"preset: scoring takes about 0\.3\d* GiB"):
         memory.check(learner, sets=360)
