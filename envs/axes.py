@@ -67,13 +67,12 @@ def describe_axis(
       joints: indices of the joints in which the effect shows directly, nearest first.
     """
     least, prior_sd = parameter.bounds[0], 0.0
-    if row.name in _NOMINAL_FIELDS:
-        # Dry friction acts on a signal, but what the model has of it can be taken as well.
-        least = max(least, -_MOST_TAKEN * getattr(model, _NOMINAL_FIELDS[row.name])[dof[index]] / scale)
     if row.name in _NOMINAL_RATIOS:
         prior_sd = _NOMINAL_RATIOS[row.name]
     elif row.name in _NOMINAL_FIELDS:
-        prior_sd = _PRIOR_SHARE * float(getattr(model, _NOMINAL_FIELDS[row.name])[dof[index]] / scale)
+        nominal = float(getattr(model, _NOMINAL_FIELDS[row.name])[dof[index]] / scale)
+        # Dry friction acts on a signal, but what the model has of it can be taken as well.
+        least, prior_sd = max(least, -_MOST_TAKEN * nominal), _PRIOR_SHARE * nominal
     return Axis(
         effect=row.name,
         parameter=parameter.name,

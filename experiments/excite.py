@@ -13,7 +13,7 @@ import numpy as np
 from envs import models
 from envs.logs import Controller, Convention, Log, Run, read_any, write
 from experiments.common.cli import console, run
-from experiments.discovery.excitation import MOTIONS, controller_of, excitation, scaled
+from experiments.discovery.excitation import MOTIONS, controller_of, excitation, passive, scaled
 
 _MOST = {"seconds": 3600.0, "rate_hz": 1e5, "kp": 1e6, "torque_limit_nm": 1e5, "control_hz": 1e5}
 """Largest values of options: what a robot can be, and what fits into memory."""
@@ -59,9 +59,9 @@ def main(args: Args) -> None:
       ValueError: an option is wrong, or the model cannot be read.
     """
     _check(args)
-    described = _described(args) if args.like is None else _alike(args.like, args.robot)
-    robot, joints, controller, held, convention = described
-    if held is not None and held.all():
+    robot, joints, controller, convention = _described(args) if args.like is None else _alike(args.like, args.robot)
+    held = passive(controller)
+    if held.all():
         raise ValueError("kp: got 0 for every joint, expected a joint that follows its target")
     spec = models.spec(robot)
     runs = tuple(
@@ -91,7 +91,7 @@ def main(args: Args) -> None:
     )
 
 
-def _described(args: Args) -> tuple[str, tuple[str, ...], Controller, None, Convention]:
+def _described(args: Args) -> tuple[str, tuple[str, ...], Controller, Convention]:
     """Robot, joints and controller as the options say, in the model's units and signs."""
     # A free joint is the base, which is held, and a ball joint has no scalar target.
     kinds = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
@@ -101,13 +101,13 @@ def _described(args: Args) -> tuple[str, tuple[str, ...], Controller, None, Conv
         raise ValueError(f"robot: got '{robot}' with joints {joints}, expected hinges or slides that have names")
     gains = {"kp": args.kp, "kd": args.kd, "torque_limit_nm": args.torque_limit_nm}
     every = {name: np.full(len(joints), value) for name, value in gains.items()}
-    return robot, joints, Controller(kind="pd", rate_hz=args.control_hz, gains=every), None, Convention()
+    return robot, joints, Controller(kind="pd", rate_hz=args.control_hz, gains=every), Convention()
 
 
-def _alike(folder: Path, robot: str | None) -> tuple[str, tuple[str, ...], Controller, np.ndarray | None, Convention]:
-    """Robot, joints, controller, passive joints, units and signs of a log, which may be read with another model."""
+def _alike(folder: Path, robot: str | None) -> tuple[str, tuple[str, ...], Controller, Convention]:
+    """Robot, joints, controller, units and signs of a log, which may be read with another model."""
     log = read_any(folder, robot and Path(robot))
-    return log.robot, log.joints, *controller_of(log), log.convention
+    return log.robot, log.joints, controller_of(log), log.convention
 
 
 def _check(args: Args) -> None:

@@ -42,11 +42,7 @@ def structure(run: Run) -> tuple[list[Finding], Run]:
         )
         found.append(Finding("duplicated rows", "t", (), float(twice.sum()), text))
     holes = np.flatnonzero(steps > max(_LEAST_HOLE * period, _longest_usual(steps)))
-    # Stamps of whole milliseconds at 700 rows a second are 1 or 2 ms apart, but the robot moves as far.
-    pace = holes[steps[holes] <= 1.01 * np.quantile(steps, _PACE)]
-    moved = np.abs(np.diff(run.signals["q"], axis=0)) / np.maximum(np.ptp(run.signals["q"], axis=0), 1e-9)
-    if len(pace) and moved[pace].mean() < _AS_FAR * np.delete(moved, holes, axis=0).mean():
-        holes = np.setdiff1d(holes, pace)
+    holes = np.setdiff1d(holes, _pace(run, steps, holes))
     # A row that was read late, with the time at which it was read, is no defect.
     short = [row for row in holes if steps[row] <= _SHORT * period]
     gaps = [row for row in short if not _in_step_again(run.time, row, period)]
@@ -65,6 +61,17 @@ def structure(run: Run) -> tuple[list[Finding], Run]:
         text = f"{what} after row {row + 1}: {steps[row]:.4g} s to the next row, where {period:.4g} s are usual"
         found.append(Finding(kind, "t", (), float(steps[row]), text))
     return found, _longest(run, np.union1d(holes, np.flatnonzero(twice)))
+
+
+def _pace(run: Run, steps: np.ndarray, holes: np.ndarray) -> np.ndarray:
+    """Finds long steps that are a pace of the clock: frequent ones, over which the robot moves no further than usual.
+
+    Stamps of whole milliseconds at 700 rows a second are 1 or 2 ms apart.
+    """
+    frequent = holes[steps[holes] <= 1.01 * np.quantile(steps, _PACE)]
+    moved = np.abs(np.diff(run.signals["q"], axis=0)) / np.maximum(np.ptp(run.signals["q"], axis=0), 1e-9)
+    usual = np.delete(moved, holes, axis=0).mean()
+    return frequent if len(frequent) and moved[frequent].mean() < _AS_FAR * usual else frequent[:0]
 
 
 def _longest_usual(steps: np.ndarray) -> float:

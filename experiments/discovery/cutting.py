@@ -214,16 +214,19 @@ def _began_alike(
 ) -> np.ndarray:
     """Splits groups of segments by the states in which they begin, [segments]; other arguments as `_told_the_same`."""
     unsealed = [one.states for one, of in zip(estimates, log.runs, strict=True) if of.split != "sealed"]
-    far = np.maximum(_ALIKE * np.ptp(np.concatenate(unsealed or [one.states for one in estimates]), axis=0), _NEAR)
-    keys: list[tuple[int, int]] = []
-    # By group, where its parts begin.
+    far = np.maximum(_ALIKE * np.ptp(np.concatenate(unsealed), axis=0), _NEAR)
+    found, together, keys = np.full(len(told), -1), np.flatnonzero(told >= 0), []
+    # Where the parts of each group begin.
     begins: dict[int, list[np.ndarray]] = {}
-    for number, (group, mine, rows) in enumerate(zip(told, run, row, strict=True)):
-        state, known = estimates[mine].states[rows[0]], begins.setdefault(int(group), [])
-        part = next((index for index, other in enumerate(known) if (np.abs(state - other) <= far).all()), len(known))
-        known += [state] if part == len(known) else []
-        keys.append((int(group), part if group >= 0 else -1 - number))
-    return _grouped(keys)
+    for number in together:
+        state, known = estimates[run[number]].states[row[number][0]], begins.setdefault(told[number], [])
+        part = next((index for index, other in enumerate(known) if (np.abs(state - other) <= far).all()), None)
+        if part is None:
+            part = len(known)
+            known.append(state)
+        keys.append((told[number], part))
+    found[together] = _grouped(keys)
+    return found
 
 
 def _grouped(keys: Sequence[Hashable]) -> np.ndarray:

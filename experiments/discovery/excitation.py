@@ -99,7 +99,7 @@ def deciding(
     seconds: float = 3.0,
     rate_hz: float = 500.0,
     seed: int = 0,
-    held: np.ndarray | None = None,
+    held: np.ndarray | bool = False,
 ) -> Decision | None:
     """Chooses the motion with the largest score, of all but the medley.
 
@@ -141,7 +141,7 @@ def excitation(
     rate_hz: float,
     seed: int = 0,
     motion: str = "medley",
-    held: np.ndarray | None = None,
+    held: np.ndarray | bool = False,
 ) -> list[TargetRun]:
     """Makes the target runs of a log in which effects are distinguishable.
 
@@ -186,7 +186,7 @@ def excitation(
             posture = home + 0.25 * (high - low) * rng.uniform(-1, 1, len(joints))
             room = np.minimum(np.minimum(high - posture, posture - low), 0.6 * _SMALLER**tried)
             target, enabled = _targets(chosen, posture, room, seconds, rate_hz, rng)
-            target = target if held is None else np.where(held, target[0], target)
+            target = np.where(held, target[0], target)
             if not (pairs := blocked.at(target, round(seconds / _LOOK_S))):
                 break
         else:
@@ -231,20 +231,14 @@ class _Blocked:
         return [int(self._model.joint(name).qposadr[0]) for name in self._joints]
 
 
-def controller_of(log: Log) -> tuple[Controller, np.ndarray | None]:
-    """Returns the controller that a log's robot is driven with, and which joints are passive.
+def controller_of(log: Log) -> Controller:
+    """Returns the controller of the first run in which a joint follows its target, else of the first run."""
+    return next((run.controller for run in log.runs if not passive(run.controller).all()), log.runs[0].controller)
 
-    Args:
-      log: of the robot.
 
-    Returns:
-      The controller of the first run in which a joint follows its target, else of the first run; and [joints], true
-      where its kp is zero, or None where it has none.
-    """
-    driven = (run.controller for run in log.runs if np.any(run.controller.gains.get("kp", 1.0)))
-    controller = next(driven, log.runs[0].controller)
-    kp = controller.gains.get("kp")
-    return controller, None if kp is None else kp == 0
+def passive(controller: Controller) -> np.ndarray:
+    """Tells which joints cannot follow a target since their kp is zero, [joints]; one False for a servo."""
+    return controller.gains.get("kp", np.ones(1)) == 0
 
 
 def unlimited_slides(model: mujoco.MjModel, joints: Sequence[str]) -> list[str]:

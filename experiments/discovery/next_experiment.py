@@ -9,7 +9,7 @@ import numpy as np
 from envs import segments
 from envs.logs import Log, Run
 from envs.models import BUILT_IN
-from experiments.discovery.excitation import TargetRun, controller_of, deciding, scaled, unlimited_slides
+from experiments.discovery.excitation import TargetRun, controller_of, deciding, passive, scaled, unlimited_slides
 from experiments.discovery.setup import Question
 from experiments.discovery.whole_runs import simulate_runs
 from jaxtune.discovery.result import Result
@@ -39,8 +39,8 @@ def deciding_experiment(question: Question, log: Log, folder: Path, result: Resu
         # Of the joint in which they differ most.
         return float(np.sqrt(np.mean([(a - b) ** 2 for a, b in simulated], axis=(0, 1)).max()))
 
-    held = controller_of(log)[1]
-    if held is not None and held.all():
+    held = passive(controller_of(log))
+    if held.all():
         return None
     sizes = {"runs": _RUNS, "seconds": _SECONDS, "rate_hz": _RATE_HZ, "seed": 0}
     found = deciding(question.spec, log.joints, score, **sizes, held=held)
@@ -72,7 +72,7 @@ def _as_run(log: Log, motion: TargetRun) -> Run:
         name=motion.name,
         condition=motion.condition,
         split=motion.split,
-        controller=scaled(controller_of(log)[0], motion.gain),
+        controller=scaled(controller_of(log), motion.gain),
         time=np.arange(len(target)) / _RATE_HZ,
         signals={
             "q": np.broadcast_to(motion.target[0], target.shape),

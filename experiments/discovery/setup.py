@@ -204,7 +204,7 @@ def build_question(
         bin_rows=bin_rows,
         regimes=REGIMES,
         components={name: tuple("xyz") if name == "gravity" else rig.joints for name in signals},
-        least_floor=_least_floor(unsealed, signals, bin_rows),
+        least_floor=_least_floor(unsealed[0], signals, bin_rows),
         push={joint: axes["constant_push", joint] for joint in rig.joints},
         forms=forms(rig.axes, rig.effects, every),
         residual=learned_torque(rig.axes, LEARNED),
@@ -213,10 +213,10 @@ def build_question(
     return Question(problem, spec, rig, names, (*log.notes, *notes, *_stale_notes(unsealed)))
 
 
-def _least_floor(runs: Sequence[Run], signals: Sequence[str], bin_rows: int) -> np.ndarray:
+def _least_floor(run: Run, signals: Sequence[str], bin_rows: int) -> np.ndarray:
     """What the noise of the readings leaves in the mean of a bin, [cells] in the order of `Problem.cells`."""
-    noise = [np.median([readings.noise_of(run, name) for run in runs], axis=0) for name in sorted(signals)]
-    return np.concatenate(noise) / np.sqrt(bin_rows)
+    # One estimate for all runs (`readings.with_noise`).
+    return np.concatenate([readings.noise_of(run, name) for name in sorted(signals)]) / np.sqrt(bin_rows)
 
 
 def _one_tree(trees: np.ndarray) -> int:
