@@ -22,26 +22,24 @@ MIN_FRICTION_NM = 1e-6
 MJX solves for friction only in joints that had some when the model was put on the device, and brakes a joint whose
 bound is exactly zero."""
 
+_LIGHTEST = 0.01  # least share of a joint's inertia that its link has; the rest is the rotor's
+_HOLD_RAD_S = 200.0  # pace of the controller that holds rotors to their measured motion: 5 ms, some steps
+
 
 @chex.dataclass(frozen=True)
 class Now:
-    """State of the robot at one step, as far as an effect may depend on it beside its values, signal and memory.
-
-    While the history of a segment is replayed, the motor's motion is measured, not simulated (`measured`). It already
-    contains how controller and rotor reacted to an offset between motor and joint, so `stiffness`, `damping` and
-    `rotor` are zero then.
-    """
+    """State of the robot at one step, as far as an effect may depend on it beside its values, signal and memory."""
 
     dt: float  # step of the simulation in s
     position: jax.Array  # [joints] rad
     speed: jax.Array  # [joints] rad/s
     load: jax.Array  # [joints] Nm on the gears: the larger of motor torque and of gravity and Coriolis torque
     limit: jax.Array  # [joints] Nm, largest torque of the controller
-    stiffness: jax.Array  # [joints] Nm/rad, of the controller
-    damping: jax.Array  # [joints] Nm s/rad, of controller and back electromotive force
-    measured: bool  # whether the motor's motion was measured, and so is not simulated
+    stiffness: jax.Array  # [joints] Nm/rad, of a controller that acts within the step
+    damping: jax.Array  # [joints] Nm s/rad, of such a controller and its back electromotive force
     rotor: jax.Array  # [joints] kg m^2, the rotor's part of the joint's inertia
-    carried: jax.Array  # [joints] Nm, the part of the torque that accelerates the rotor along with the joint
+    link: jax.Array  # [joints] share of the joint's inertia that is not the rotor's
+    carried: jax.Array  # [joints] Nm that would accelerate the rotor as its link accelerates without any torque on it
     body_velocity: jax.Array  # [bodies, 3] m/s of the centres of mass
     between: jax.Array  # [joints] rad, how far targets are from the held ones if they move on between rows
 
@@ -61,7 +59,8 @@ class Chain:
     Three arguments of its methods are always the same:
 
     - `values` holds [places] by effect and parameter, in the form that effects read. Zero means no effect.
-    - `memory` is a dictionary: what each effect remembers, by its name, and `held`, the controller's last torque.
+    - `memory` is a dictionary: what each effect remembers, by its name, `held`, the controller's last torque, and
+      `passed`, the last torque on the joints.
     - `x` holds the controller's inputs of one step, [joints] each: `target` rad, `feed` Nm (torque sent directly),
       `stiffness` Nm/rad, `damping` Nm s/rad, `limit` Nm, `emf` Nm s/rad (back electromotive force, not limited), and
       `sample`, a scalar that is true where the controller reads the joint anew.
@@ -77,6 +76,8 @@ class Chain:
     """[joints] addresses of the joints' velocities."""
     bodies: np.ndarray
     """[bodies] ids of the bodies that a wrench may act on."""
+    period_s: float
+    """Of the controller."""
     lead_s: float = 0.0
     """How far positions of the simulation are ahead of its velocities; half a step makes semi-implicit Euler of second
     order, which is then the leapfrog scheme."""
@@ -94,11 +95,76 @@ class Chain:
         Returns:
           The robot and the memories after the step, and what was read before it: `q`, `dq` and `tau`, [joints] each.
         """
-        joint = self.joints(data)
-        bias, rotor = data.qfrc_bias[self.dof], model.dof_armature[self.dof]
-        # Encoders sit on the motor, which may run ahead of its joint.
-        motor = joint.at[0].add(self.ahead(memory)[0])
-        memory, (torque, read) = self.drive(values, memory, motor, x, rotor * data.qacc[self.dof], rotor)
+        # A rotor that is too light for its controller's period, or has no inertia in the model, would be thrown about:
+        # its controller acts continuously.
+        gain = (x["stiffness"] * self.period_s + x["damping"]) * self.period_s
+        within = jnp.clip(gain / jnp.maximum(model.dof_armature[self.dof], 1e-9) - 1.0, 0.0, 1.0)
+        running = self.ahead(memory)[1]
+        motor = self._motors(data, memory).at[1].add((1.0 - within) * running)
+        memory, torque, readings = self._control(values, memory, motor, x)
+        gains = {name: within * x[name] for name in ("stiffness", "damping", "emf")}
+        data, memory, torque = self._move(model, data, memory, values, torque, x | gains)
+        tau, memory = self.stage("torque_reading", values, torque, None, memory)
+        return data, memory, {"q": readings[0], "dq": readings[1] + within * running, "tau": tau}
+
+    def remember(self, values, memory: dict, motor: jax.Array, x) -> tuple[dict, jax.Array]:
+        """Fills the memories of controller and friction by a step of measured motion.
+
+        Args:
+          values: of the effects.
+          memory: before the step.
+          motor: true positions and velocities of the motors, seen at the joints, [2, joints].
+          x: the controller's inputs.
+
+        Returns:
+          The memories after the step, those of the transmission unchanged, and the motors' torques, [joints] Nm.
+        """
+        memory, torque, _ = self._control(values, memory, motor, x)
+        # Measured motion winds up the bristles as simulated motion does.
+        _, memory = self.stage("bristle", values, jnp.zeros_like(motor), self._now(x, motor), memory)
+        return memory | {"passed": torque}, torque
+
+    def follow(self, model: mjx.Model, data: mjx.Data, memory: dict, values, motor, torque, x) -> tuple[mjx.Data, dict]:
+        """Simulates one step of links whose motors moved as measured: what gears that give way make of that motion.
+
+        Each rotor is held to its measured motion by a controller of its own, in addition to the motor's torque. It is
+        no stiffer than the rotor is heavy, so where the rotor meets its link again, both feel it.
+
+        Args:
+          model: of the robot, effects on its fields included.
+          data: the robot before the step.
+          memory: before the step.
+          values: of the effects.
+          motor: measured positions and velocities of the motors, sensors' errors undone, [2, joints].
+          torque: of the motors, as `remember` returns it, [joints] Nm.
+          x: the controller's inputs.
+
+        Returns:
+          The robot and the memories after the step.
+        """
+        rotor = model.dof_armature[self.dof]
+        hold = {"stiffness": rotor * _HOLD_RAD_S**2, "damping": 2.0 * rotor * _HOLD_RAD_S}
+        position, speed = motor - self._motors(data, memory)
+        torque = torque + hold["stiffness"] * position + hold["damping"] * speed
+        return self._move(model, data, memory, values, torque, x | hold | {"emf": jnp.zeros_like(torque)})[:2]
+
+    def _motors(self, data: mjx.Data, memory: dict) -> jax.Array:
+        """Positions of the motors and velocities of the joints, [2, joints]: encoders sit on the motors."""
+        # How fast a motor runs ahead acts within the step (`envs.effects.transmission`).
+        return self.joints(data).at[0].add(self.ahead(memory)[0])
+
+    def _move(self, model, data, memory, values, torque, x) -> tuple[mjx.Data, dict, jax.Array]:
+        """Moves the robot by the torques of its motors, [joints] Nm; the third value is what reaches the joints."""
+        joint, rotor = self.joints(data), model.dof_armature[self.dof]
+        mobility, acceleration = model.dof_invweight0[self.dof], data.qacc[self.dof]
+        link = jnp.clip(1.0 - rotor * mobility, _LIGHTEST, 1.0)
+        # Less what the gears passed on in the step before. Else a rotor would expect the blow of the moment in which it
+        # met its link to go on, and leave it again.
+        alone = acceleration - (memory["passed"] - rotor * acceleration) * mobility / link
+        now = self._now(x, self._motors(data, memory)).replace(rotor=rotor, link=link, carried=rotor * alone)
+        torque, memory = self.stage("transmission", values, torque, now, memory)
+        memory["passed"] = torque
+        bias = data.qfrc_bias[self.dof]
         now = self._now(x, joint, jnp.maximum(jnp.abs(torque), jnp.abs(bias)), model, data)
         # Effects of friction and of forces from outside have no memory, but bristles have.
         friction, _ = self.stage("friction", values, model.dof_frictionloss[self.dof], now, memory)
@@ -111,7 +177,7 @@ class Chain:
             qfrc_applied=data.qfrc_applied.at[self.dof].set(torque + rubbing),
             xfrc_applied=data.xfrc_applied.at[self.bodies, :3].set(wrench.force),
         )
-        return stepping.step(moved, data), memory, read
+        return stepping.step(moved, data), memory, torque
 
     def read(self, values, memory: dict, joint: jax.Array, x) -> jax.Array:
         """Reads the joints through the effects of transmission and sensors, without advancing a memory.
@@ -174,20 +240,27 @@ class Chain:
           state: positions and velocities, [2, joints].
           x: the controller's inputs.
           past: positions [past, joints] rad that led to the state, which bristles remember; None where it never moved.
-          past_target: targets [past, joints] rad that led to the first one, which a slew limit may still be behind;
-            None where they never moved. Both are `envs.effects.memory.PAST_STEP_S` apart.
+          past_target: targets [past targets, joints] rad that led to the first one, which a slew limit may still be
+            behind; None where they never moved. For the time between two, see `envs.effects.memory`.
         """
         torque = self._law(x, x["target"] - state[0], state[1])
         # What reaches each of these stages in steady state, other effects left aside.
-        signals = {"sensor": state, "torque": torque, "transmission": torque}
+        signals = {"sensor": state, "torque": torque, "transmission": torque[None]}
         signals["bristle"] = state[:1] if past is None else past
         signals["command"] = x["target"][None] if past_target is None else past_target
-        memory = {"held": torque}
+        memory = {"held": torque, "passed": torque}
         for stage, signal in signals.items():
             for row in self.entering(stage):
                 if row.start is not None:
                     memory[row.name] = row.start(values[row.name], signal, self.dt)
         return memory
+
+    def pressed(self, values, torque: jax.Array) -> dict:
+        """Makes the memories of the transmission from torques [steps, joints] Nm on the gears, one step after another.
+
+        A rotor's own acceleration takes a part of the motor's torque, which does not press on the gears.
+        """
+        return {row.name: row.start(values[row.name], torque, self.dt) for row in self.entering("transmission")}
 
     @staticmethod
     def _law(x, error, speed) -> jax.Array:
@@ -195,21 +268,17 @@ class Chain:
         torque = x["stiffness"] * error - x["damping"] * speed
         return jnp.clip(torque, -x["limit"], x["limit"]) + x["feed"]
 
-    def drive(self, values, memory, motor, x, carried, rotor=None):
-        """Computes torques on the joints, from the motors' state through sensors, controller and transmission.
-
-        `step` calls it on simulated motors. `envs.rig` also calls it on measured ones, to fill the memories.
+    def _control(self, values, memory, motor, x):
+        """Computes the motors' torques, from their state through sensors and controller.
 
         Args:
           values: of the effects.
           memory: before the step.
           motor: true positions and velocities of the motors, seen at the joints, [2, joints].
           x: the controller's inputs.
-          carried: torque [joints] Nm that accelerates the rotors with the joints.
-          rotor: inertia of the rotors, [joints] kg m^2; None where their motion was measured and is not simulated.
 
         Returns:
-          The memories after the step; the torques on the joints [joints] Nm; and what is read, by signal.
+          The memories after the step, the torques of the motors [joints] Nm, and positions and velocities as read.
         """
         now = self._now(x, motor)
         readings, memory = self.stage("sensor", values, motor, now, memory)
@@ -220,17 +289,8 @@ class Chain:
         held = jnp.where(x["sample"], self._law(x, error, speed), memory["held"])
         memory["held"] = held
         torque, memory = self.stage("torque", values, held, now, memory)
-        none = jnp.zeros_like(held)
-        free = {"stiffness": none, "damping": none} if rotor is None else {"rotor": rotor}
-        now = now.replace(carried=carried, measured=rotor is None, **free)
-        if rotor is None:
-            # Measured motion winds up the bristles as simulated motion does.
-            _, memory = self.stage("bristle", values, jnp.zeros_like(motor), now, memory)
-        running = self.ahead(memory)[1]
         # Back electromotive force acts continuously, so it is not part of the held torque.
-        torque, memory = self.stage("transmission", values, torque - x["emf"] * motor[1], now, memory)
-        read, memory = self.stage("torque_reading", values, torque, now, memory)
-        return memory, (torque, {"q": readings[0], "dq": readings[1] + running, "tau": read})
+        return memory, torque - x["emf"] * motor[1], readings
 
     def ahead(self, memory) -> jax.Array:
         """Computes how far and how fast the motors run ahead of their joints, [2, joints] rad and rad/s.
@@ -250,8 +310,8 @@ class Chain:
             limit=x["limit"],
             stiffness=x["stiffness"],
             damping=x["damping"] + x["emf"],
-            measured=False,
             rotor=jnp.zeros_like(state[1]),
+            link=jnp.ones_like(state[1]),
             carried=jnp.zeros_like(state[1]),
             body_velocity=velocity,
             between=x["between"],

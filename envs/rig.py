@@ -37,6 +37,7 @@ System = tuple[mjx.Model, mjx.Data, jax.Array]
 # solver that has converged; with three iterations, up to 8.
 _ITERATIONS = 4
 _LONGEST_STEP_S = 0.001
+_PRESSED_S = 0.01  # over which the torque on the gears is taken: that of a measured motor is noisy
 
 
 class Rig:
@@ -103,7 +104,8 @@ class Rig:
         # A robot on a rig has no feet on the ground, so effects of contact have no place and drop out below.
         self.places = {"joint": self.joints, "body": self.bodies, "foot": (), "robot": ("robot",)}
         self.effects = {row.name: row for row in EVERY.values() if self.places[row.on] and row.needs != "free"}
-        self.chain = Chain(self.dt, tuple(self.effects.values()), self.qpos, self.dof, self._bodies, 0.5 * self.dt)
+        rows, period_s = tuple(self.effects.values()), 1.0 / control_hz
+        self.chain = Chain(self.dt, rows, self.qpos, self.dof, self._bodies, period_s, 0.5 * self.dt)
         self.axes = self._describe_axes()
         # The IMU is taken to sit on the first body, which carries the others.
         self._gravity = sensing.resting_gravity(model)
@@ -304,33 +306,46 @@ class Rig:
         for row in chain.entering("sensor"):
             if row.undo is not None:
                 truth = row.undo(values[row.name], truth, self.dt)
-        # Part of a motor's torque accelerates its own rotor and does not press on the gears (`envs.effects`).
-        rotor, acceleration = model.dof_armature[self.dof], jnp.gradient(truth[:, 1], self.dt, axis=0)
-        # Encoders sit on the motor. Until its offset from the joint is known, its readings stand for the joint's.
-        memory = chain.start(values, truth[0], jax.tree.map(lambda x: x[0], drive), segment.past, segment.past_target)
+        acceleration = jnp.gradient(truth[:, 1], self.dt, axis=0)
+        take = lambda inputs, index: jax.tree.map(lambda x: x[index], inputs)  # noqa: E731
+        first = chain.start(values, truth[0], take(drive, 0), segment.past, segment.past_target)
 
         def remember(memory, inputs):
-            state, carried, x = inputs
-            return chain.drive(values, memory, state, x, carried)[0], None
+            return chain.remember(values, memory, *inputs)
 
-        memory, _ = jax.lax.scan(remember, memory, (truth[:before], rotor * acceleration[:before], past))
-        start = truth[before] - chain.ahead(memory)
-        # The chain's first step needs an acceleration, for the rotors' torque.
-        data = self._data.replace(
-            qpos=self._data.qpos.at[self.qpos].set(start[0] + chain.lead_s * start[1]),
-            qvel=self._data.qvel.at[self.dof].set(start[1]),
-            qacc=self._data.qacc.at[self.dof].set(acceleration[before]),
-            qacc_warmstart=self._data.qacc.at[self.dof].set(acceleration[before]),
-        )
+        memory, torque = jax.lax.scan(remember, first, (truth[:before], past))
+        # Where the joints are behind their motors was not measured. It matters, and takes time, only if gears give way.
+        gears = [row.name for row in chain.entering("transmission")]
+        gives = [jnp.any(value != 0) for name in gears for value in values[name].values()]
+        begin = jnp.where(jnp.stack(gives).any(), 0, before)
+        pressing = torque - model.dof_armature[self.dof] * acceleration[:before]
+        first = first | chain.pressed(values, pressing[: round(_PRESSED_S / self.dt)])
+
+        def at(index, memory):
+            """The robot at a step of the history; encoders sit on the motors."""
+            state, speeding = truth[index] - chain.ahead(memory), acceleration[index]
+            return self._data.replace(
+                qpos=self._data.qpos.at[self.qpos].set(state[0] + chain.lead_s * state[1]),
+                qvel=self._data.qvel.at[self.dof].set(state[1]),
+                # The chain's first step needs an acceleration, for the rotors' torque.
+                qacc=self._data.qacc.at[self.dof].set(speeding),
+                qacc_warmstart=self._data.qacc.at[self.dof].set(speeding),
+            )
+
+        def follow(index, carry):
+            return chain.follow(model, *carry, values, truth[index], torque[index], take(past, index))
+
+        _, followed = jax.lax.fori_loop(begin, before, follow, (at(0, first), first))
+        memory = memory | {name: followed[name] for name in gears}
+        data = at(before, memory)
 
         def move(index, carry):
             data, memory, reads = carry
-            data, memory, read = chain.step(model, data, memory, values, take(index))
+            data, memory, read = chain.step(model, data, memory, values, take(future, index))
             return data, memory, jax.tree.map(lambda all, now: all.at[index].set(now), reads, read)
 
-        take = lambda index: jax.tree.map(lambda x: x[index], future)  # noqa: E731
         count = len(future["sample"])
-        one = jax.eval_shape(lambda: chain.step(model, data, memory, values, take(0))[2])
+        one = jax.eval_shape(lambda: chain.step(model, data, memory, values, take(future, 0))[2])
         reads = jax.tree.map(lambda x: jnp.zeros((count, *x.shape), x.dtype), one)
         _, _, read = jax.lax.fori_loop(0, count if steps is None else steps, move, (data, memory, reads))
         # The rows of a log lie between steps of the simulation, so readings are interpolated.

@@ -12,7 +12,7 @@ import chex
 import jax
 import numpy as np
 
-from envs.effects.memory import LONGEST_S, PAST_STEP_S
+from envs.effects.memory import LONGEST_S, PAST_STEP_S, PAST_TARGET_STEP_S
 from envs.logs import Run
 from envs.readings import aligned, hermite, noise, quantum_of
 from envs.smoothing import smoothed, velocity_lag
@@ -63,7 +63,7 @@ class Segment:
     # [past, joints] rad, smoothed positions every 10 ms in the 2 s that lead to the first of `measured`. They wind up
     # the bristles of dry friction; in slow motion the history alone is too short for that.
     past: jax.Array
-    # [past, joints] rad, the targets at the same times. A limit of their slew may still be far behind them.
+    # [past targets, joints] rad, every 2 ms in the same time. A limit of their slew may still be far behind them.
     past_target: jax.Array
     row_step: jax.Array  # [rows] the last step at or before each row; 0 is the segment's start
     row_share: jax.Array  # [rows] share of a step between that step and the row
@@ -241,7 +241,10 @@ def _of_run(run: Run, states: np.ndarray, start: np.ndarray, rows: np.ndarray, a
     # delay of whole rows would then seem likelier than any other.
     acceleration = np.gradient(velocity, run.time, axis=0)
     between_rows = [hermite(run.time, *pair, fine)[0] for pair in ((position, velocity), (velocity, acceleration))]
-    past = begin - HISTORY_S + PAST_STEP_S * np.arange(-round(_PAST_S / PAST_STEP_S), 1)
+    past, past_target = (
+        begin - HISTORY_S + step_s * np.arange(-round(_PAST_S / step_s), 1)
+        for step_s in (PAST_STEP_S, PAST_TARGET_STEP_S)
+    )
     return Segment(
         target=target,
         between=between,
@@ -250,7 +253,7 @@ def _of_run(run: Run, states: np.ndarray, start: np.ndarray, rows: np.ndarray, a
         sample=np.diff(ticks, axis=1, prepend=-np.inf) > 0,
         measured=np.stack(between_rows, axis=2).astype(np.float32),
         past=hermite(run.time, position, velocity, past)[0].astype(np.float32),
-        past_target=_between_rows(run, run.signals.get("target"), past)[0],
+        past_target=_between_rows(run, run.signals.get("target"), past_target)[0],
         row_step=step,
         row_share=np.clip(at - step, 0.0, 1.0).astype(np.float32),
     )

@@ -50,7 +50,7 @@ class CorrectedBiteno(Biteno):
         self._values = correction.values(places)
         # One step of the chain for each step of the physics; the controller reads the joints in every one.
         step = float(model.opt.timestep)
-        self._chain = Chain(step, self._rows, self.joint_qpos, self.joint_dof, np.array(bodies))
+        self._chain = Chain(step, self._rows, self.joint_qpos, self.joint_dof, np.array(bodies), step)
 
     def _prepare(self, model: mujoco.MjModel) -> None:
         # The chain computes the torques; MuJoCo's actuators stay in the model for their gains and limits.

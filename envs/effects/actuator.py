@@ -8,7 +8,7 @@ separates it from the others.
 import jax
 import jax.numpy as jnp
 
-from envs.effects.memory import PAST_STEP_S, as_it_is, delay_line, delayed, lagged
+from envs.effects.memory import PAST_TARGET_STEP_S, as_it_is, delay_line, delayed, lagged
 from jaxtune.types import Effect, Form, Parameter
 
 _ACTUATOR = {"family": "actuator", "on": "joint"}
@@ -74,8 +74,11 @@ def _followed(values, targets, dt):
     """Starts with a limited target that has followed past targets [past, joints] from the first of them."""
     del dt
     targets = jnp.atleast_2d(targets)
-    follow = lambda limited, target: (_nearer(values, limited, target, PAST_STEP_S), None)  # noqa: E731
-    return jax.lax.scan(follow, targets[0], targets[1:])[0]
+    # Takes time only where there is a limit.
+    begin = jnp.where((values["rad_per_s"] > 0).any(), 1, len(targets))
+    follow = lambda index, limited: _nearer(values, limited, targets[index], PAST_TARGET_STEP_S)  # noqa: E731
+    start = jnp.where(values["rad_per_s"] > 0, targets[0], targets[-1])
+    return jax.lax.fori_loop(begin, len(targets), follow, start)
 
 
 def _deadband(values, error, now, memory):

@@ -10,7 +10,10 @@ LONGEST_S = 0.04
 """Longest delay that a line can hold, in s. Simulations start with at least as much history (`envs.segments`)."""
 
 PAST_STEP_S = 0.01
-"""Time in s between the positions and targets that lead to the history of a segment (`envs.segments`)."""
+"""Time in s between the positions that lead to the history of a segment (`envs.segments`)."""
+
+PAST_TARGET_STEP_S = 0.002
+"""The same between targets, which may jump."""
 
 
 def as_it_is(values, signal: jax.Array, dt: float) -> jax.Array:
@@ -55,7 +58,7 @@ def delayed(line: jax.Array, signal: jax.Array, seconds: jax.Array, dt: float) -
 
 
 def lagged(memory: jax.Array, signal: jax.Array, seconds: jax.Array, dt: float) -> tuple[jax.Array, jax.Array]:
-    """Filters a signal by a first-order lag, seconds dy/dt = signal - y, exactly for a signal that is held over a step.
+    """Filters a signal that is held over each step by a first-order lag, seconds dy/dt = signal - y, exactly.
 
     Args:
       memory: y after the step before, [..., joints].
@@ -64,9 +67,33 @@ def lagged(memory: jax.Array, signal: jax.Array, seconds: jax.Array, dt: float) 
       dt: step of the simulation in s.
 
     Returns:
-      y after this step, twice: as the signal and as the memory.
+      The mean of y over this step, and y after it, which is the memory.
     """
+    stays, share = _decay(seconds, dt)
+    return signal + share * (memory - signal), signal + stays * (memory - signal)
+
+
+def filtered(memory: jax.Array, signal: jax.Array, seconds: jax.Array, dt: float) -> tuple[jax.Array, jax.Array]:
+    """Filters a signal that is linear between its samples by a first-order lag, seconds dy/dt = signal - y, exactly.
+
+    Args:
+      memory: y and the signal at the sample before, [2, ..., joints].
+      signal: [..., joints], at this sample.
+      seconds: time constant [joints]; the signal passes unchanged where it is zero.
+      dt: time between samples in s.
+
+    Returns:
+      y at this sample, and the memory.
+    """
+    stays, share = _decay(seconds, dt)
+    before, sample = memory
+    after = signal - share * (signal - sample) + stays * (before - sample)
+    return after, jnp.stack([after, signal])
+
+
+def _decay(seconds: jax.Array, dt: float) -> tuple[jax.Array, jax.Array]:
+    """What remains of a deviation at the end of a step, and in its mean."""
     # Exactly zero without a lag; the inner maximum keeps the derivative finite in the branch that is not taken.
-    stays = jnp.where(seconds > 0, jnp.exp(-dt / jnp.maximum(seconds, 1e-9)), 0.0)
-    memory = signal + stays * (memory - signal)
-    return memory, memory
+    constant = jnp.maximum(seconds, 1e-9)
+    stays = jnp.where(seconds > 0, jnp.exp(-dt / constant), 0.0)
+    return stays, jnp.where(seconds > 0, constant / dt * (1.0 - stays), 0.0)

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.effects.memory import as_it_is, delay_line, delayed, lagged
+from envs.effects.memory import delay_line, delayed, filtered
 from jaxtune.types import Effect, Form, Parameter
 
 _SENSING = {"family": "sensing"}
@@ -45,7 +45,13 @@ def _undo_delay(values, readings, dt):
 
 def _sensor_lag(values, readings, now, memory):
     """seconds d readings' / dt = readings - readings'."""
-    return lagged(memory, readings, values["seconds"], now.dt)
+    return filtered(memory, readings, values["seconds"], now.dt)
+
+
+def _behind(values, readings, dt):
+    """Starts a lag one step before the readings of a joint that has always moved at one speed."""
+    before = readings.at[0].add(-dt * readings[1])
+    return jnp.stack([before.at[0].add(-values["seconds"] * readings[1]), before])
 
 
 def _undo_lag(values, readings, dt):
@@ -101,7 +107,7 @@ ROWS = (
         parameters=(_SECONDS,),
         sizes=(0.001, 0.008),
         act=_sensor_lag,
-        start=as_it_is,
+        start=_behind,
         undo=_undo_lag,
         forms=(Form("delayed", "sensor_delay", "seconds"),),
         sentence="Positions and velocities are read through a low-pass filter.",

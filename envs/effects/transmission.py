@@ -4,34 +4,36 @@ Encoders sit on the motor. Backlash and compliance let the motor run ahead of it
 joint is a body of the model; the rotor's inertia J is part of its armature. The offset follows from the balance of
 torques on the rotor over one step of length dt. If o changes by d within the step, then
 
-- the controller, which reads the motor, gives kp d + kd d / dt less torque (stiffness kp, damping kd);
+- a controller that acts within the step gives kp d + kd d / dt less torque (stiffness kp, damping kd);
 - the rotor takes J (d / dt - rate) / dt to change the rate of its offset.
 
 Together the joint receives
 
     torque + J rate / dt - R d    with    R = kp + (kd + J / dt) / dt
 
-(`_passed`, `_resistance`). The torque that accelerates the rotor along with the joint does not press on the gears
-(`Now.carried`), so it is subtracted where the pressing torque decides how far o moves (`_pressing`). The memory is the
-offset in rad and its rate in rad/s, [2, joints].
+(`_passed`, `_resistance`). What presses on the gears is less, since the rotor accelerates along with its link. If the
+link has the inertia M and would accelerate by a without any torque on it (`Now.carried` is J a), that is
+
+    M / (M + J) (torque - J a + J rate / dt - R d)
+
+(`_pressing`, `Now.link`), and decides how far o moves. The memory is the offset in rad and its rate in rad/s,
+[2, joints].
 """
 
 import jax.numpy as jnp
 
 from jaxtune.types import Effect, Form, Parameter
 
-_SLOPE_S = 0.006  # over which the rate of a measured motor's offset is averaged
 _TRANSMISSION = {"family": "transmission", "on": "joint"}
 
 
 def _resistance(now):
     """R: torque that a motor loses for every rad that it runs ahead within a step, [joints] Nm/rad."""
-    # All terms are zero for a measured motor. Its offset then follows the pressing torque at once.
     return jnp.maximum(now.stiffness + (now.damping + now.rotor / now.dt) / now.dt, 1e-9)
 
 
 def _pressing(torque, now, rate):
-    """Torque that would press on the gears if the motor kept up with the joint, [joints] Nm."""
+    """Torque that would press on the gears of a fixed link if the motor kept up with it, [joints] Nm."""
     return torque - now.carried + now.rotor * rate / now.dt
 
 
@@ -46,36 +48,32 @@ def _backlash(values, torque, now, memory):
     offset, rate = memory
     half = 0.5 * values["rad"]
     following = jnp.clip(offset + _pressing(torque, now, rate) / _resistance(now), -half, half)
-    # The moment within a step at which a measured motor crossed the play is unknown, so its rate counts as zero.
-    rate = jnp.where(now.measured, 0.0, (following - offset) / now.dt)
-    return _passed(torque, now, memory, following), jnp.stack([following, rate])
+    return _passed(torque, now, memory, following), jnp.stack([following, (following - offset) / now.dt])
 
 
 def _compliance(values, torque, now, memory):
-    """A spring of stiffness k = 1 / softness that may harden: o' (1 + h o'^2) = softness (pressing + R (o - o'))."""
+    """A spring of stiffness k that may harden: k o' (1 + h o'^2) = M / (M + J) (pressing + R (o - o'))."""
     offset, rate = memory
-    softness = values["nm_per_rad"]
-    resistance = _resistance(now)
+    softness, resistance = values["nm_per_rad"] * now.link, _resistance(now)
     wound = softness * (_pressing(torque, now, rate) + resistance * offset)
     following = _root(1.0 + softness * resistance, values["hardening_per_rad2"], wound)
-    fresh = (following - offset) / now.dt
-    # The torque of a measured motor is known only row by row, so its slope is averaged over a few.
-    rate = jnp.where(now.measured, rate + now.dt / _SLOPE_S * (fresh - rate), fresh)
-    return _passed(torque, now, memory, following), jnp.stack([following, rate])
+    return _passed(torque, now, memory, following), jnp.stack([following, (following - offset) / now.dt])
 
 
 def _taken_up(values, torque, dt):
-    """Starts with the motor on the side of the play to which its torque drives it."""
+    """Starts with the motor on the side of the play to which torque [steps, joints] drives it."""
     del dt
-    offset = 0.5 * values["rad"] * jnp.sign(torque)
+    offset = 0.5 * values["rad"] * jnp.sign(torque.mean(axis=0))
     return jnp.stack([offset, jnp.zeros_like(offset)])
 
 
 def _wound_up(values, torque, dt):
-    """Starts with the spring wound up by the motor's torque: o (1 + h o^2) = softness torque."""
-    del dt
-    offset = _root(1.0, values["hardening_per_rad2"], values["nm_per_rad"] * torque)
-    return jnp.stack([offset, jnp.zeros_like(torque)])
+    """Starts with the spring wound up by torque [steps, joints], at its first step: o (1 + h o^2) = softness torque."""
+    wound = _root(1.0, values["hardening_per_rad2"], values["nm_per_rad"] * torque)
+    half = (len(wound) + 1) // 2
+    early, late = wound[:half].mean(axis=0), wound[-half:].mean(axis=0)
+    rate = (late - early) / (max(len(wound) - half, 1) * dt)
+    return jnp.stack([early - 0.5 * (half - 1) * dt * rate, rate])
 
 
 def _root(linear, cubic, value):

@@ -349,11 +349,11 @@ def test_targets_of_two_seconds_lead_to_a_segment():
     number = np.arange(len(time), dtype=float)[:, None] * [1.0, -1.0]
     cut = segments.cut([run(time, target=number)], 0.15, DT)
     past, first = np.asarray(cut.segments.past_target), np.asarray(cut.segments.target)[:, 0]
-    assert past.shape[1:] == (201, 2)
+    assert past.shape[1:] == (1001, 2)
     np.testing.assert_array_equal(past[:, -1], first)
-    # Every second row, from the run's first one on.
-    expected = np.maximum(first[:, None, 0] - 2.0 * np.arange(200, -1, -1), 0.0)
-    np.testing.assert_array_equal(past[..., 0], expected)
+    # A row holds for 5 ms, and the first one counts from long ago.
+    rows = np.floor(first[:, None, 0] - 0.4 * np.arange(1000, -1, -1) + 1e-6)
+    np.testing.assert_array_equal(past[..., 0], np.maximum(rows, 0.0))
 
 
 def test_torques_between_rows_are_lines_where_the_log_says_so(moving):
