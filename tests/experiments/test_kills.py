@@ -25,7 +25,7 @@ def killed(imports, options, begun, kills, rng):
     end(start(imports, options))
 
 
-def check_train(tmp_path, kills, updates=60):
+def check_train(tmp_path, kills, updates=20):
     options = ["--robot", ROBOT, "--preset", "smoke", "--updates", str(updates), "--out"]
     end(start(TRAIN, [*options, str(tmp_path / "whole")]))
     out = tmp_path / "killed"

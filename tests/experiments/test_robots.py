@@ -100,7 +100,7 @@ def test_a_simulator_brings_its_table_and_an_environment_is_proposed_one():
         kind(ROBOT).chosen("mass,gravity")
 
 
-@pytest.mark.parametrize("name", ["simulator", "keyed"])
+@pytest.mark.parametrize("name", ["simulator", pytest.param("keyed", marks=pytest.mark.slow)])
 def test_a_policy_trains_on_robots_that_start_anew(name):
     robot = kind(f"{FILE}:{name}")
     learner = Learner(PRESETS["smoke"], robot.chosen("mass,delay"), kind=robot)
@@ -127,6 +127,7 @@ def trained(tmp_path_factory):
     return out
 
 
+@pytest.mark.slow
 def test_the_whole_comparison_runs_on_another_robot(trained, tmp_path):
     out = tmp_path / "run"
     sim2sim.main(

@@ -299,7 +299,7 @@ class Stopped(Exception):
     """The run was killed."""
 
 
-@pytest.mark.parametrize("method", ["dr", "ours"])
+@pytest.mark.parametrize("method", [pytest.param("dr", marks=pytest.mark.slow), "ours"])
 def test_a_run_stopped_after_every_file_is_the_same_run(method, sled, tmp_path, monkeypatch):
     args, programs, robot = sled
     args = replace(args, method=method)

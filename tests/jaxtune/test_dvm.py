@@ -184,6 +184,7 @@ def test_windows_after_a_fall_are_not_valid(score):
     np.testing.assert_array_equal(valid.reshape(3, 3), [[0, 0, 0], [1, 1, 0], [1, 1, 1]])
 
 
+@pytest.mark.slow
 def test_few_windows_are_still_each_others_neighbours():
     """Episodes of one window each, fewer than references: copies would bring the reach to nothing."""
     dist, slider = toys.uniform(CENTRE, radius=0.2), toys.Slider(steps=CONFIG.window)

@@ -56,6 +56,7 @@ def plain(nominal):
 everywhere = partial(dict.fromkeys, constants.JOINTS)
 
 
+@pytest.mark.slow
 def test_without_effects_it_is_the_robot_that_it_was(plain):
     start, states = Walker(robot())()
     np.testing.assert_allclose(start.obs, plain[0].obs, atol=1e-6)
@@ -103,6 +104,7 @@ def test_a_biased_encoder_is_seen_by_the_policy_and_by_the_controller(plain):
     assert (states.qpos[5:10, 7 + knee] < plain[1].qpos[5:10, 7 + knee]).all()
 
 
+@pytest.mark.slow
 def test_it_trains_behind_braxs_interface():
     effects = {"torque_lag": everywhere({"seconds": 0.01}), "backlash": {"left_hip": {"rad": 0.02}}}
     env = TrainingBatch(robot(**effects, load_friction=everywhere({"ratio": 0.1})), ENTRIES, 2000)

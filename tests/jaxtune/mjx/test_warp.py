@@ -23,6 +23,7 @@ def sleds():
     return {env.impl: Simulator(env(), steps=STEPS, parameters=TABLE) for env in (Sled, Warped)}
 
 
+@pytest.mark.slow
 def test_every_robot_has_its_own_parameters(sleds):
     coords = dists.sample(jax.random.PRNGKey(1), sleds["jax"].dist(0.3), 5)
     expected, found = (
