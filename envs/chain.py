@@ -60,7 +60,7 @@ class Chain:
 
     - `values` holds [places] by effect and parameter, in the form that effects read. Zero means no effect.
     - `memory` is a dictionary: what each effect remembers, by its name, `held`, the controller's last torque, and
-      `passed`, the last torque on the joints.
+      `passed`, the last torque on the joints (of motors in a history: theirs).
     - `x` holds the controller's inputs of one step, [joints] each: `target` rad, `feed` Nm (torque sent directly),
       `stiffness` Nm/rad, `damping` Nm s/rad, `limit` Nm, `emf` Nm s/rad (back electromotive force, not limited), and
       `sample`, a scalar that is true where the controller reads the joint anew.
@@ -95,20 +95,17 @@ class Chain:
         Returns:
           The robot and the memories after the step, and what was read before it: `q`, `dq` and `tau`, [joints] each.
         """
-        # A rotor that is too light for its controller's period, or has no inertia in the model, would be thrown about:
-        # its controller acts continuously.
-        gain = (x["stiffness"] * self.period_s + x["damping"]) * self.period_s
-        within = jnp.clip(gain / jnp.maximum(model.dof_armature[self.dof], 1e-9) - 1.0, 0.0, 1.0)
-        running = self.ahead(memory)[1]
-        motor = self._motors(data, memory).at[1].add((1.0 - within) * running)
+        joint = self.joints(data)
+        motor, running, within = self._seen(joint, memory, x, model.dof_armature[self.dof])
         memory, torque, readings = self._control(values, memory, motor, x)
-        gains = {name: within * x[name] for name in ("stiffness", "damping", "emf")}
+        gains = {name: within * x[name] for name in ("stiffness", "damping")}
+        torque = torque - x["emf"] * joint[1]
         data, memory, torque = self._move(model, data, memory, values, torque, x | gains)
         tau, memory = self.stage("torque_reading", values, torque, None, memory)
-        return data, memory, {"q": readings[0], "dq": readings[1] + within * running, "tau": tau}
+        return data, memory, {"q": readings[0], "dq": readings[1] + running, "tau": tau}
 
     def remember(self, values, memory: dict, motor: jax.Array, x) -> tuple[dict, jax.Array]:
-        """Fills the memories of controller and friction by a step of measured motion.
+        """Fills the memories of sensors, controller and friction by a step of measured motion.
 
         Args:
           values: of the effects.
@@ -120,6 +117,7 @@ class Chain:
           The memories after the step, those of the transmission unchanged, and the motors' torques, [joints] Nm.
         """
         memory, torque, _ = self._control(values, memory, motor, x)
+        torque = torque - x["emf"] * motor[1]
         # Measured motion winds up the bristles as simulated motion does.
         _, memory = self.stage("bristle", values, jnp.zeros_like(motor), self._now(x, motor), memory)
         return memory | {"passed": torque}, torque
@@ -144,14 +142,32 @@ class Chain:
         """
         rotor = model.dof_armature[self.dof]
         hold = {"stiffness": rotor * _HOLD_RAD_S**2, "damping": 2.0 * rotor * _HOLD_RAD_S}
-        position, speed = motor - self._motors(data, memory)
+        joint = self.joints(data)
+        # How fast it runs ahead acts within the step (`envs.effects.transmission`).
+        position, speed = motor - joint.at[0].add(self.ahead(memory)[0])
         torque = torque + hold["stiffness"] * position + hold["damping"] * speed
         return self._move(model, data, memory, values, torque, x | hold | {"emf": jnp.zeros_like(torque)})[:2]
 
-    def _motors(self, data: mjx.Data, memory: dict) -> jax.Array:
-        """Positions of the motors and velocities of the joints, [2, joints]: encoders sit on the motors."""
-        # How fast a motor runs ahead acts within the step (`envs.effects.transmission`).
-        return self.joints(data).at[0].add(self.ahead(memory)[0])
+    def _seen(self, joint, memory, x, rotor) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """What encoders and controller see of the motors, on which they sit.
+
+        A controller acts on what it saw at the beginning of its period. A rotor that is too light for that, or has no
+        inertia in the model, would be thrown about, so its controller acts within every step.
+
+        Args:
+          joint: positions and velocities of the joints, [2, joints].
+          memory: of the effects.
+          x: the controller's inputs.
+          rotor: inertia of the rotors, [joints] kg m^2.
+
+        Returns:
+          Positions and velocities [2, joints]; the part of the motors' velocities [joints] that is not in them, because
+          it acts within the step; and the share [joints] of the gains that does.
+        """
+        far, fast = self.ahead(memory)
+        gain = (x["stiffness"] * self.period_s + x["damping"]) * self.period_s
+        within = jnp.clip(gain / jnp.maximum(rotor, 1e-9) - 1.0, 0.0, 1.0)
+        return joint + jnp.stack([far, (1.0 - within) * fast]), within * fast, within
 
     def _move(self, model, data, memory, values, torque, x) -> tuple[mjx.Data, dict, jax.Array]:
         """Moves the robot by the torques of its motors, [joints] Nm; the third value is what reaches the joints."""
@@ -161,7 +177,7 @@ class Chain:
         # Less what the gears passed on in the step before. Else a rotor would expect the blow of the moment in which it
         # met its link to go on, and leave it again.
         alone = acceleration - (memory["passed"] - rotor * acceleration) * mobility / link
-        now = self._now(x, self._motors(data, memory)).replace(rotor=rotor, link=link, carried=rotor * alone)
+        now = self._now(x, joint).replace(rotor=rotor, link=link, carried=rotor * alone)
         torque, memory = self.stage("transmission", values, torque, now, memory)
         memory["passed"] = torque
         bias = data.qfrc_bias[self.dof]
@@ -179,7 +195,7 @@ class Chain:
         )
         return stepping.step(moved, data), memory, torque
 
-    def read(self, values, memory: dict, joint: jax.Array, x) -> jax.Array:
+    def read(self, values, memory: dict, joint: jax.Array, x, rotor: jax.Array) -> jax.Array:
         """Reads the joints through the effects of transmission and sensors, without advancing a memory.
 
         Args:
@@ -187,15 +203,13 @@ class Chain:
           memory: as `step` or `start` left it.
           joint: true positions and velocities, [2, joints].
           x: the controller's inputs.
+          rotor: inertia of the rotors, [joints] kg m^2.
 
         Returns:
           Read positions and velocities, [2, joints].
         """
-        far, fast = self.ahead(memory)
-        motor = joint.at[0].add(far)
-        # The rate at which the motor runs ahead reaches the controller within the step; only the joint's motion is
-        # delayed.
-        return self.stage("sensor", values, motor, self._now(x, motor), memory)[0].at[1].add(fast)
+        motor, running, _ = self._seen(joint, memory, x, rotor)
+        return self.stage("sensor", values, motor, self._now(x, motor), memory)[0].at[1].add(running)
 
     def joints(self, data: mjx.Data) -> jax.Array:
         """Takes positions and velocities of the joints from MJX's data, [2, joints] rad and rad/s.
@@ -278,7 +292,8 @@ class Chain:
           x: the controller's inputs.
 
         Returns:
-          The memories after the step, the torques of the motors [joints] Nm, and positions and velocities as read.
+          The memories after the step, the torques of the motors [joints] Nm without back electromotive force, which
+          acts continuously, and positions and velocities as read.
         """
         now = self._now(x, motor)
         readings, memory = self.stage("sensor", values, motor, now, memory)
@@ -289,8 +304,7 @@ class Chain:
         held = jnp.where(x["sample"], self._law(x, error, speed), memory["held"])
         memory["held"] = held
         torque, memory = self.stage("torque", values, held, now, memory)
-        # Back electromotive force acts continuously, so it is not part of the held torque.
-        return memory, torque - x["emf"] * motor[1], readings
+        return memory, torque, readings
 
     def ahead(self, memory) -> jax.Array:
         """Computes how far and how fast the motors run ahead of their joints, [2, joints] rad and rad/s.

@@ -121,7 +121,8 @@ class Rig:
         """All that compiled programs depend on beside `system`: robots of equal layout can share them."""
         addresses = (self.qpos.tobytes(), self.dof.tobytes(), self._bodies.tobytes())
         frames = np.asarray(self._model.body_quat).tobytes()
-        return self.joints, self.bodies, self.dt, addresses, frames, jax.tree.structure(self.system)
+        paces = self.dt, self.control_hz
+        return self.joints, self.bodies, *paces, addresses, frames, jax.tree.structure(self.system)
 
     def on(self, system: System) -> "Rig":
         """Returns the rig with another robot of the same layout on it, also inside a compiled program."""
@@ -279,8 +280,9 @@ class Rig:
     def simulate(self, values: ByEffect, segment: Segment, steps: jax.Array | None = None) -> dict[str, jax.Array]:
         """Simulates a segment of a log under one hypothesis.
 
-        First the measured history before the segment fills the memories of the effects. Then the robot starts from its
-        measured state, with the errors of its sensors undone, and is simulated to the segment's end.
+        First the measured history before the segment fills the memories of the effects. Where gears give way, the
+        history is simulated as well, with rotors that move as measured, to know where their links are. Then the robot
+        starts from its measured state, with the errors of its sensors undone, and is simulated to the segment's end.
 
         Args:
           values: of all effects, as `values` returns them.
@@ -316,14 +318,13 @@ class Rig:
         memory, torque = jax.lax.scan(remember, first, (truth[:before], past))
         # Where the joints are behind their motors was not measured. It matters, and takes time, only if gears give way.
         gears = [row.name for row in chain.entering("transmission")]
-        gives = [jnp.any(value != 0) for name in gears for value in values[name].values()]
-        begin = jnp.where(jnp.stack(gives).any(), 0, before)
+        gives = jnp.stack([jnp.any(value != 0) for name in gears for value in values[name].values()]).any()
         pressing = torque - model.dof_armature[self.dof] * acceleration[:before]
         first = first | chain.pressed(values, pressing[: round(_PRESSED_S / self.dt)])
 
-        def at(index, memory):
-            """The robot at a step of the history; encoders sit on the motors."""
-            state, speeding = truth[index] - chain.ahead(memory), acceleration[index]
+        def at(index, memory, speeding):
+            """The robot at a step of the history, with accelerations [joints]; encoders sit on the motors."""
+            state = truth[index] - chain.ahead(memory)
             return self._data.replace(
                 qpos=self._data.qpos.at[self.qpos].set(state[0] + chain.lead_s * state[1]),
                 qvel=self._data.qvel.at[self.dof].set(state[1]),
@@ -335,9 +336,11 @@ class Rig:
         def follow(index, carry):
             return chain.follow(model, *carry, values, truth[index], torque[index], take(past, index))
 
-        _, followed = jax.lax.fori_loop(begin, before, follow, (at(0, first), first))
+        begun = at(0, first, acceleration[0]), first
+        data, followed = jax.lax.fori_loop(jnp.where(gives, 0, before), before, follow, begun)
         memory = memory | {name: followed[name] for name in gears}
-        data = at(before, memory)
+        memory["passed"] = jnp.where(gives, followed["passed"], memory["passed"])
+        data = at(before, memory, jnp.where(gives, data.qacc[self.dof], acceleration[before]))
 
         def move(index, carry):
             data, memory, reads = carry

@@ -320,8 +320,8 @@ class Effect:
     act: Callable[..., Any] | None = None
     """Transforms the stage's signal; None for an effect that changes fields of the model."""
     start: Callable[..., Any] | None = None
-    """`start(values, signal, dt) -> memory`: the memory in steady state, after a constant input signal. None where the
-    effect has no memory."""
+    """`start(values, signal, dt) -> memory`: the memory after what the robot did before, which the stage's signal tells
+    (`envs.chain.Chain.start`). None where the effect has no memory."""
     undo: Callable[..., Any] | None = None
     """For a sensor effect, `undo(values, readings, dt) -> truth`: recovers true positions and velocities from recorded
     ones, [time, 2, joints]."""

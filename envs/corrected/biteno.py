@@ -105,9 +105,9 @@ class CorrectedBiteno(Biteno):
         if not state.memory:
             return readings
         joint = jnp.stack([readings["joint"], readings["joint_velocity"]])
-        read = self._chain.read(
-            self._values, state.memory, joint, self._controller_inputs(self._model, readings["joint"])
-        )
+        inputs = self._controller_inputs(self._model, readings["joint"])
+        rotor = self._model.dof_armature[self.joint_dof]
+        read = self._chain.read(self._values, state.memory, joint, inputs, rotor)
         gravity, _ = self._chain.stage("gravity", self._values, readings["gravity"], None, {})
         return readings | {"joint": read[0], "joint_velocity": read[1], "gravity": gravity}
 

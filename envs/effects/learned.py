@@ -21,8 +21,8 @@ def _learned_torque(values, torque, now, memory):
     """
     past_torque, past_speed = memory
     seconds = jnp.full_like(torque, _HISTORY_S)
-    past_torque, _ = lagged(past_torque, torque, seconds, now.dt)
-    past_speed, _ = lagged(past_speed, now.speed, seconds, now.dt)
+    _, past_torque = lagged(past_torque, torque, seconds, now.dt)
+    _, past_speed = lagged(past_speed, now.speed, seconds, now.dt)
     features = {
         "constant_nm": 1.0,
         "sine_nm": jnp.sin(now.position),

@@ -17,7 +17,7 @@ PAST_TARGET_STEP_S = 0.002
 
 
 def as_it_is(values, signal: jax.Array, dt: float) -> jax.Array:
-    """Starts the memory of a lag or a slew limit whose input has always been this signal: the signal itself.
+    """Starts the memory of a lag whose input has always been this signal: the signal itself.
 
     `values` and `dt` are not used; every effect's `start` takes them.
     """

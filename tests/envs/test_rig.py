@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
@@ -224,7 +225,6 @@ SWING = np.array([0.4, -0.5]) + np.array([0.3, 0.4]) * np.sin(2 * np.pi * np.arr
         ("command_delay", {"seconds": 0.008}, 0.3e-3),
         ("torque_lag", {"seconds": 0.008}, 0.3e-3),
         ("target_slew", {"rad_per_s": 1.0}, 4e-3),
-        ("torque_limit", {"torque_nm": 5.0}, 0.3e-3),
         ("backlash", {"rad": 0.02}, 1e-3),
         ("backlash", {"rad": 0.005}, 0.8e-3),
         ("compliance", {"nm_per_rad": 200.0}, 2e-3),
@@ -265,11 +265,15 @@ def of_two_bodies(effect, rotor):
     return model
 
 
-@pytest.mark.parametrize(("rotor", "most"), [(0.005, 9e-3), (0.2, 3e-3)])
+@pytest.mark.parametrize(
+    ("rotor", "rate_hz", "period", "most"),
+    [(0.0001, 1000.0, 1e-4, 9e-3), (0.005, 200.0, 5e-3, 9e-3), (0.2, 200.0, 5e-3, 3e-3)],
+)
 @pytest.mark.parametrize("effect", GEARS)
-def test_gears_between_a_rotor_and_a_link_are_those_of_two_bodies(effect, rotor, most):
-    # The forearm has 0.013 kg m^2, so rotors are lighter or much heavier. The light ones swing by 0.8 rad.
-    arm = rigs.Player(Rig(with_rotor(rotor), rigs.ARM_JOINTS, rigs.CONTROL_HZ))
+def test_gears_between_a_rotor_and_a_link_are_those_of_two_bodies(effect, rotor, rate_hz, period, most):
+    # The forearm has 0.013 kg m^2, so rotors are lighter or much heavier. The light ones swing by 0.8 rad. For the
+    # lightest one the rig's controller acts continuously: once in a period it would throw it about.
+    arm = rigs.Player(Rig(with_rotor(rotor), rigs.ARM_JOINTS, rate_hz))
     model = of_two_bodies(effect, rotor)
     data, start = mujoco.MjData(model), np.array([0.4, -0.9])
     data.qpos[:2] = start
@@ -284,13 +288,49 @@ def test_gears_between_a_rotor_and_a_link_are_those_of_two_bodies(effect, rotor,
     target[70:] = motor - np.array([0.1, 0.4])
     read = arm.play(rigs.segment(arm.rig, motor, target, kp, kd), **{effect: {"elbow": GEARS[effect]}})
     expected = []
-    for step in range(rigs.STEPS):
-        expected.append(data.qpos[:2].copy())
-        if step % 5 == 0:
-            data.qfrc_applied[:2] = kp * (target[step] - data.qpos[:2]) - kd * data.qvel[:2]
-        mujoco.mj_step(model, data, 10)
+    for step in range(10 * rigs.STEPS):
+        if step % 10 == 0:
+            expected.append(data.qpos[:2].copy())
+        if step % round(period / model.opt.timestep) == 0:
+            data.qfrc_applied[:2] = kp * (target[step // 10] - data.qpos[:2]) - kd * data.qvel[:2]
+        mujoco.mj_step(model, data)
     error = np.abs(read["q"] - expected).max(axis=0)
     assert error.max() < most
+
+
+def test_rotors_without_inertia_and_motors_that_are_off_come_to_rest(arm):
+    spec = with_rotor(0.0)
+    spec.joint("shoulder").armature = 0.0
+    light = rigs.Player(Rig(spec, rigs.ARM_JOINTS, rigs.CONTROL_HZ))
+    for gears in ({"backlash": {"elbow": {"rad": 0.04}}}, {"compliance": {"elbow": {"nm_per_rad": 60.0}}}):
+        for drive in ({"kp": 20.0, "kd": 0.4}, {"limit": 0.0}, {"feed": [0.5, -0.2], "emf": 0.1}):
+            read = light.play(rigs.segment(light.rig, START, START, **drive), **gears)
+            assert all(np.isfinite(values).all() for values in read.values())
+            without = light.play(rigs.segment(light.rig, START, START, **drive))["q"]
+            assert np.abs(read["q"] - without).max() < 0.1
+
+
+def test_robots_of_other_controllers_share_no_program(arm):
+    other = Rig(mujoco.MjSpec.from_string(rigs.ARM), rigs.ARM_JOINTS, 5 * rigs.CONTROL_HZ)
+    assert other.dt == arm.rig.dt
+    assert other.layout != arm.rig.layout
+
+
+def test_what_is_read_is_what_the_next_step_reads(arm):
+    """Also where play and a sensor's lag are at one joint: in a walk the policy reads, and then the step does."""
+    rig, vector = arm.rig, arm.vector(backlash={"elbow": {"rad": 0.04}}, sensor_lag={"elbow": {"seconds": 0.01}})
+    values, segment = rig.values(rig.tree(vector)), rigs.segment(rig, START, START, kp=20.0, kd=0.4, speed=[1.0, -2.0])
+    model, chain = jax.jit(rig.model)(values), rig.chain
+    x = {name: getattr(segment, name)[0] for name in ("target", "between", "feed", "stiffness", "damping", "limit")}
+    x |= {"emf": segment.emf[0], "sample": np.ones((), bool)}
+    data = rig._data.replace(qpos=jnp.asarray(START, jnp.float32), qvel=jnp.array([1.0, -2.0]))
+    memory, step = chain.start(values, chain.joints(data), x), jax.jit(chain.step)
+    for _ in range(5):
+        joint, before = chain.joints(data), memory
+        read = chain.read(values, before, joint, x, model.dof_armature[rig.dof])
+        data, memory, expected = step(model, data, before, values, x)
+        np.testing.assert_allclose(read, [expected["q"], expected["dq"]], atol=1e-5)
+    assert np.abs(chain.ahead(memory)[1]).max() > 0.1
 
 
 def test_the_imu_reads_the_models_gravity():

@@ -511,6 +511,12 @@ def test_the_learned_torque_is_a_sum_of_features_of_the_joint_and_its_short_hist
     np.testing.assert_allclose(torque(0.3, 2.0, late_share=1.0), 0.5, rtol=1e-5)
     fresh = torque(0.3, 2.0, past=(0.0, 0.0), late_share=1.0) - 0.5
     assert ((fresh > 0.45) & (fresh < 0.5)).all()
+    # After 30 ms a torque of one is 1 / e ahead of what is remembered of it.
+    memory, values = jnp.zeros((2, JOINTS)), values_of(LEARNED, **(zero | {"late_share": 1.0}))
+    for _ in range(30):
+        got, memory = LEARNED.act(values, jnp.ones(JOINTS), now(1.0), memory)
+    np.testing.assert_allclose(memory, 1.0 - np.exp(-1.0), rtol=1e-5)
+    np.testing.assert_allclose(got, 1.0 + np.exp(-1.0), rtol=1e-5)
 
 
 def test_the_damping_gain_scales_what_the_controller_damps():
