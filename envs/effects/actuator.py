@@ -37,12 +37,13 @@ def _torque_limit(values, torque, now, memory):
 
 
 def _torque_speed(values, torque, now, memory):
-    """torque' = clip(torque, -limit - c speed, limit - c speed), a DC motor's torque-speed line.
+    """torque' = clip(torque, min(-limit - c speed, 0), max(limit - c speed, 0)), a DC motor's torque-speed line.
 
-    The limit is the controller's; c is what the back electromotive force takes from it.
+    The limit is the controller's; c is what the back electromotive force takes from it. Beyond the speed at which
+    nothing is left the motor gives no torque; it does not brake on its own.
     """
     drop = values["nm_s_per_rad"] * now.speed
-    low, high = -now.limit - drop, now.limit - drop
+    low, high = jnp.minimum(-now.limit - drop, 0.0), jnp.maximum(now.limit - drop, 0.0)
     # A motor that is off has a limit of zero. The line alone would then brake or drive the joint.
     there = (values["nm_s_per_rad"] > 0) & (now.limit > 0)
     return jnp.where(there, jnp.clip(torque, low, high), torque), memory

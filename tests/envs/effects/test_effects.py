@@ -302,6 +302,8 @@ def test_a_motor_gives_less_the_faster_it_turns():
     np.testing.assert_allclose(most(-4.0, 10.0), -4.0, rtol=1e-6)
     np.testing.assert_allclose(most(2.9, 10.0), 2.9, rtol=1e-6)
     np.testing.assert_allclose(most(4.0, 0.0), 4.0, rtol=1e-6)
+    # From 25 rad/s on nothing is left, and it does not turn round.
+    np.testing.assert_allclose([most(4.0, 40.0), most(-4.0, -40.0)], [[0.0, 4.0], [0.0, -4.0]], atol=1e-6)
 
 
 def test_a_motor_that_is_off_gives_no_torque_at_any_speed():
