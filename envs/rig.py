@@ -281,8 +281,9 @@ class Rig:
         """Simulates a segment of a log under one hypothesis.
 
         First the measured history before the segment fills the memories of the effects. Where gears give way, the
-        history is simulated as well, with rotors that move as measured, to know where their links are. Then the robot
-        starts from its measured state, with the errors of its sensors undone, and is simulated to the segment's end.
+        history is simulated as well, with rotors held to their measured motion, to know where their links are. Then the
+        robot starts from its measured state, with the errors of its sensors undone, and is simulated to the segment's
+        end.
 
         Args:
           values: of all effects, as `values` returns them.
@@ -294,6 +295,29 @@ class Rig:
           Readings at the segment's rows by signal: `q`, `dq` and `tau` [rows, joints], `gravity` [rows, 3].
         """
         model = self.model(values)
+        chain = self.chain
+        data, memory, future = self._begin(model, values, segment)
+        take = lambda index: jax.tree.map(lambda x: x[index], future)  # noqa: E731
+
+        def move(index, carry):
+            data, memory, reads = carry
+            data, memory, read = chain.step(model, data, memory, values, take(index))
+            return data, memory, jax.tree.map(lambda all, now: all.at[index].set(now), reads, read)
+
+        count = len(future["sample"])
+        one = jax.eval_shape(lambda: chain.step(model, data, memory, values, take(0))[2])
+        reads = jax.tree.map(lambda x: jnp.zeros((count, *x.shape), x.dtype), one)
+        _, _, read = jax.lax.fori_loop(0, count if steps is None else steps, move, (data, memory, reads))
+        # The rows of a log lie between steps of the simulation, so readings are interpolated.
+        step, share = segment.row_step, segment.row_share[:, None]
+        following = jnp.minimum(step + 1, len(future["sample"]) - 1)
+        read = jax.tree.map(lambda x: x[step] + share * (x[following] - x[step]), read)
+        # The base does not move, so the IMU reads the same at all rows.
+        gravity, _ = chain.stage("gravity", values, self._gravity, None, {})
+        return read | {"gravity": jnp.broadcast_to(gravity, (len(step), 3))}
+
+    def _begin(self, model, values, segment) -> tuple[mjx.Data, dict, dict]:
+        """The robot and the memories at a segment's start, and what its controller is given from there on."""
         # Measured states go on for `LONGEST_S` after the start, because undoing a delay needs later readings.
         before = len(segment.measured) - 1 - round(LONGEST_S / self.dt)
         drive = {
@@ -303,8 +327,7 @@ class Rig:
         past = jax.tree.map(lambda x: x[:before], drive)
         future = jax.tree.map(lambda x: x[before:], drive)
         # The readings as they would have been without this hypothesis' sensor errors.
-        truth = segment.measured
-        chain = self.chain
+        truth, chain = segment.measured, self.chain
         for row in chain.entering("sensor"):
             if row.undo is not None:
                 truth = row.undo(values[row.name], truth, self.dt)
@@ -341,20 +364,4 @@ class Rig:
         memory = memory | {name: followed[name] for name in gears}
         memory["passed"] = jnp.where(gives, followed["passed"], memory["passed"])
         data = at(before, memory, jnp.where(gives, data.qacc[self.dof], acceleration[before]))
-
-        def move(index, carry):
-            data, memory, reads = carry
-            data, memory, read = chain.step(model, data, memory, values, take(future, index))
-            return data, memory, jax.tree.map(lambda all, now: all.at[index].set(now), reads, read)
-
-        count = len(future["sample"])
-        one = jax.eval_shape(lambda: chain.step(model, data, memory, values, take(future, 0))[2])
-        reads = jax.tree.map(lambda x: jnp.zeros((count, *x.shape), x.dtype), one)
-        _, _, read = jax.lax.fori_loop(0, count if steps is None else steps, move, (data, memory, reads))
-        # The rows of a log lie between steps of the simulation, so readings are interpolated.
-        step, share = segment.row_step, segment.row_share[:, None]
-        following = jnp.minimum(step + 1, len(future["sample"]) - 1)
-        read = jax.tree.map(lambda x: x[step] + share * (x[following] - x[step]), read)
-        # The base does not move, so the IMU reads the same at all rows.
-        gravity, _ = chain.stage("gravity", values, self._gravity, None, {})
-        return read | {"gravity": jnp.broadcast_to(gravity, (len(step), 3))}
+        return data, memory, future
