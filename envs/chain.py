@@ -22,6 +22,7 @@ MIN_FRICTION_NM = 1e-6
 MJX solves for friction only in joints that had some when the model was put on the device, and brakes a joint whose
 bound is exactly zero."""
 
+_LIGHT = 0.05  # share of a joint's inertia under which its rotor is a light one
 _LIGHTEST = 0.01  # least share of a joint's inertia that its link has; the rest is the rotor's
 _HOLD_RAD_S = 200.0  # pace of the controller that holds rotors to their measured motion: 5 ms, some steps
 
@@ -59,8 +60,9 @@ class Chain:
     Three arguments of its methods are always the same:
 
     - `values` holds [places] by effect and parameter, in the form that effects read. Zero means no effect.
-    - `memory` is a dictionary: what each effect remembers, by its name, `held`, the controller's last torque, and
-      `passed`, the last torque on the joints (of motors in a history: theirs).
+    - `memory` is a dictionary: what each effect remembers, by its name, `held`, the controller's last torque, `passed`,
+      the last torque on the joints (of motors in a history: theirs), and `within`, the share of its gains with which
+      the controller acted within the last step.
     - `x` holds the controller's inputs of one step, [joints] each: `target` rad, `feed` Nm (torque sent directly),
       `stiffness` Nm/rad, `damping` Nm s/rad, `limit` Nm, `emf` Nm s/rad (back electromotive force, not limited), and
       `sample`, a scalar that is true where the controller reads the joint anew.
@@ -95,9 +97,9 @@ class Chain:
         Returns:
           The robot and the memories after the step, and what was read before it: `q`, `dq` and `tau`, [joints] each.
         """
-        joint = self.joints(data)
-        motor, running, within = self._seen(joint, memory, x, model.dof_armature[self.dof])
-        memory, torque, readings = self._control(values, memory, motor, x)
+        joint, within = self.joints(data), self._within(model, x)
+        motor, running = self._seen(joint, memory, within)
+        memory, torque, readings = self._control(values, memory | {"within": within}, motor, x)
         gains = {name: within * x[name] for name in ("stiffness", "damping")}
         torque = torque - x["emf"] * joint[1]
         data, memory, torque = self._move(model, data, memory, values, torque, x | gains)
@@ -126,7 +128,9 @@ class Chain:
         """Simulates one step of links whose motors moved as measured: what gears that give way make of that motion.
 
         Each rotor is held to its measured motion by a controller of its own, in addition to the motor's torque. It is
-        no stiffer than the rotor is heavy, so where the rotor meets its link again, both feel it.
+        no stiffer than the rotor is heavy, or a twentieth of the joint where it is lighter, so where the rotor meets
+        its link again, both feel it. Sensors remember the motors as the controller would have seen
+        them (`_within`).
 
         Args:
           model: of the robot, effects on its fields included.
@@ -140,34 +144,39 @@ class Chain:
         Returns:
           The robot and the memories after the step.
         """
-        rotor = model.dof_armature[self.dof]
-        hold = {"stiffness": rotor * _HOLD_RAD_S**2, "damping": 2.0 * rotor * _HOLD_RAD_S}
-        joint = self.joints(data)
+        joint, (far, fast) = self.joints(data), self.ahead(memory)
+        seen = motor.at[1].add(-self._within(model, x) * fast)
+        _, memory = self.stage("sensor", values, seen, self._now(x, seen), memory)
+        held = jnp.maximum(model.dof_armature[self.dof], _LIGHT / model.dof_invweight0[self.dof])
+        hold = {"stiffness": held * _HOLD_RAD_S**2, "damping": 2.0 * held * _HOLD_RAD_S}
         # How fast it runs ahead acts within the step (`envs.effects.transmission`).
-        position, speed = motor - joint.at[0].add(self.ahead(memory)[0])
+        position, speed = motor - joint.at[0].add(far)
         torque = torque + hold["stiffness"] * position + hold["damping"] * speed
         return self._move(model, data, memory, values, torque, x | hold | {"emf": jnp.zeros_like(torque)})[:2]
 
-    def _seen(self, joint, memory, x, rotor) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """What encoders and controller see of the motors, on which they sit.
+    def _within(self, model, x) -> jax.Array:
+        """Share of the controller's gains that acts within the step, [joints].
 
         A controller acts on what it saw at the beginning of its period. A rotor that is too light for that, or has no
         inertia in the model, would be thrown about, so its controller acts within every step.
+        """
+        gain = (x["stiffness"] * self.period_s + x["damping"]) * self.period_s
+        return jnp.clip(gain / jnp.maximum(model.dof_armature[self.dof], 1e-9) - 1.0, 0.0, 1.0)
+
+    def _seen(self, joint, memory, within) -> tuple[jax.Array, jax.Array]:
+        """What encoders and controller see of the motors, on which they sit.
 
         Args:
           joint: positions and velocities of the joints, [2, joints].
           memory: of the effects.
-          x: the controller's inputs.
-          rotor: inertia of the rotors, [joints] kg m^2.
+          within: share of the controller's gains that acts within the step, [joints].
 
         Returns:
-          Positions and velocities [2, joints]; the part of the motors' velocities [joints] that is not in them, because
-          it acts within the step; and the share [joints] of the gains that does.
+          Positions and velocities [2, joints], and the part of the motors' velocities [joints] that is not in them,
+          because it acts within the step.
         """
         far, fast = self.ahead(memory)
-        gain = (x["stiffness"] * self.period_s + x["damping"]) * self.period_s
-        within = jnp.clip(gain / jnp.maximum(rotor, 1e-9) - 1.0, 0.0, 1.0)
-        return joint + jnp.stack([far, (1.0 - within) * fast]), within * fast, within
+        return joint + jnp.stack([far, (1.0 - within) * fast]), within * fast
 
     def _move(self, model, data, memory, values, torque, x) -> tuple[mjx.Data, dict, jax.Array]:
         """Moves the robot by the torques of its motors, [joints] Nm; the third value is what reaches the joints."""
@@ -195,7 +204,7 @@ class Chain:
         )
         return stepping.step(moved, data), memory, torque
 
-    def read(self, values, memory: dict, joint: jax.Array, x, rotor: jax.Array) -> jax.Array:
+    def read(self, values, memory: dict, joint: jax.Array, x) -> jax.Array:
         """Reads the joints through the effects of transmission and sensors, without advancing a memory.
 
         Args:
@@ -203,12 +212,11 @@ class Chain:
           memory: as `step` or `start` left it.
           joint: true positions and velocities, [2, joints].
           x: the controller's inputs.
-          rotor: inertia of the rotors, [joints] kg m^2.
 
         Returns:
           Read positions and velocities, [2, joints].
         """
-        motor, running, _ = self._seen(joint, memory, x, rotor)
+        motor, running = self._seen(joint, memory, memory["within"])
         return self.stage("sensor", values, motor, self._now(x, motor), memory)[0].at[1].add(running)
 
     def joints(self, data: mjx.Data) -> jax.Array:
@@ -218,6 +226,10 @@ class Chain:
         """
         speed = data.qvel[self.dof]
         return jnp.stack([data.qpos[self.qpos] - self.lead_s * speed, speed])
+
+    def light(self, model: mjx.Model) -> jax.Array:
+        """Says how light rotors are: 1 without inertia, 0 from a twentieth of the joint's on, [joints]."""
+        return jnp.clip(1.0 - model.dof_armature[self.dof] * model.dof_invweight0[self.dof] / _LIGHT, 0.0, 1.0)
 
     def entering(self, stage: str) -> list[Effect]:
         """Lists the effects that enter a stage (`jaxtune.types.Effect.enters`), in the order in which they act."""
@@ -262,7 +274,7 @@ class Chain:
         signals = {"sensor": state, "torque": torque, "transmission": torque[None]}
         signals["bristle"] = state[:1] if past is None else past
         signals["command"] = x["target"][None] if past_target is None else past_target
-        memory = {"held": torque, "passed": torque}
+        memory = {"held": torque, "passed": torque, "within": jnp.zeros_like(torque)}
         for stage, signal in signals.items():
             for row in self.entering(stage):
                 if row.start is not None:

@@ -37,6 +37,9 @@ System = tuple[mjx.Model, mjx.Data, jax.Array]
 # solver that has converged; with three iterations, up to 8.
 _ITERATIONS = 4
 _LONGEST_STEP_S = 0.001
+# Stages whose memories depend on where links are, not on measured motors alone.
+_FOLLOWED = ("transmission", "bristle", "sensor")
+_RATE_S = 0.012  # over which a light rotor's speed within its gears is taken, where a segment begins
 _PRESSED_S = 0.01  # over which the torque on the gears is taken: that of a measured motor is noisy
 
 
@@ -339,9 +342,9 @@ class Rig:
             return chain.remember(values, memory, *inputs)
 
         memory, torque = jax.lax.scan(remember, first, (truth[:before], past))
-        # Where the joints are behind their motors was not measured. It matters, and takes time, only if gears give way.
+        # Where joints are behind their motors was not measured. It matters, and takes time, only if gears give way.
         gears = [row.name for row in chain.entering("transmission")]
-        gives = jnp.stack([jnp.any(value != 0) for name in gears for value in values[name].values()]).any()
+        gives = jnp.stack([value != 0 for name in gears for value in values[name].values()]).any(axis=0)
         pressing = torque - model.dof_armature[self.dof] * acceleration[:before]
         first = first | chain.pressed(values, pressing[: round(_PRESSED_S / self.dt)])
 
@@ -357,11 +360,17 @@ class Rig:
             )
 
         def follow(index, carry):
-            return chain.follow(model, *carry, values, truth[index], torque[index], take(past, index))
+            data, memory, rates = carry
+            data, memory = chain.follow(model, data, memory, values, truth[index], torque[index], take(past, index))
+            # A light rotor's speed within its gears jumps from step to step.
+            rates = {name: rate + self.dt / _RATE_S * (memory[name][1] - rate) for name, rate in rates.items()}
+            return data, memory, rates
 
-        begun = at(0, first, acceleration[0]), first
-        data, followed = jax.lax.fori_loop(jnp.where(gives, 0, before), before, follow, begun)
-        memory = memory | {name: followed[name] for name in gears}
-        memory["passed"] = jnp.where(gives, followed["passed"], memory["passed"])
+        begun = at(0, first, acceleration[0]), first, {name: first[name][1] for name in gears}
+        data, followed, rates = jax.lax.fori_loop(jnp.where(gives.any(), 0, before), before, follow, begun)
+        for name in ["passed", *(row.name for row in chain.rows if row.enters in _FOLLOWED and row.start is not None)]:
+            memory[name] = jnp.where(gives, followed[name], memory[name])
+        for name in gears:
+            memory[name] = memory[name].at[1].add(chain.light(model) * (rates[name] - memory[name][1]))
         data = at(before, memory, jnp.where(gives, data.qacc[self.dof], acceleration[before]))
         return data, memory, future

@@ -60,6 +60,8 @@ class Args:
     """Size of the run: smoke (seconds, to see that it works), cpu (two cores) or gpu (one GPU)."""
     envs: tuple[int, ...] = ()
     """Numbers of environments of speed; the preset's if not given."""
+    physics: tuple[Literal["exact", "fast"], ...] = ("exact", "fast")
+    """Physics of speed."""
     policy: str = "walk"
     """Policy that walks: walk (ships with the package), or a folder of experiments.train."""
     seeds: tuple[int, ...] = tuple(range(10))
@@ -71,7 +73,7 @@ class Args:
 
 
 def speed(args: Args) -> dict:
-    """Measures environment steps per second of whole PPO updates (rollout and learning), with exact and fast physics.
+    """Measures environment steps per second of whole PPO updates (rollout and learning).
 
     The first call compiles and is listed separately. The speed is that of the fastest of three further calls, because
     other work on the machine can only slow a call down.
@@ -80,7 +82,7 @@ def speed(args: Args) -> dict:
       `first_call_s` and `steps_per_second` by physics and number of environments.
     """
     rows, sizes = {}, preset(args.preset)
-    for physics, envs in itertools.product(("exact", "fast"), args.envs or (sizes.ppo.num_envs,)):
+    for physics, envs in itertools.product(args.physics, args.envs or (sizes.ppo.num_envs,)):
         sizes = dataclasses.replace(
             sizes,
             task=dataclasses.replace(sizes.task, physics=physics),

@@ -57,7 +57,10 @@ def commands(sizes: str, out: Path) -> dict[str, list[str]]:
     settings = ["0.5", "1.0"] if small else ["0.25", "0.5", "1.0", "2.0"]
     tune = ["experiments.sim2sim", "--preset", sizes, "--methods", "ours"]
     return {
-        "speed": ["experiments.bench", "speed", "--preset", sizes, "--envs", *envs, "--out", str(out / "bench")],
+        "speed": [
+            *["experiments.bench", "speed", "--preset", sizes, "--physics", "exact", "--envs", *envs],
+            *["--out", str(out / "bench")],
+        ],
         "policy": ["experiments.train", "--preset", sizes, "--out", str(out / "policy")],
         "walk": [
             *["experiments.evaluate", "--preset", sizes, "--policy", str(out / "policy"), "--out", str(out / "walk")],

@@ -106,8 +106,7 @@ class CorrectedBiteno(Biteno):
             return readings
         joint = jnp.stack([readings["joint"], readings["joint_velocity"]])
         inputs = self._controller_inputs(self._model, readings["joint"])
-        rotor = self._model.dof_armature[self.joint_dof]
-        read = self._chain.read(self._values, state.memory, joint, inputs, rotor)
+        read = self._chain.read(self._values, state.memory, joint, inputs)
         gravity, _ = self._chain.stage("gravity", self._values, readings["gravity"], None, {})
         return readings | {"joint": read[0], "joint_velocity": read[1], "gravity": gravity}
 
