@@ -179,27 +179,33 @@ class Chain:
         return joint + jnp.stack([far, (1.0 - within) * fast]), within * fast
 
     def _move(self, model, data, memory, values, torque, x) -> tuple[mjx.Data, dict, jax.Array]:
-        """Moves the robot by the torques of its motors, [joints] Nm; the third value is what reaches the joints."""
+        """Moves the robot by the torques of its motors, [joints] Nm; the third value is what they gave in the step."""
         joint, rotor = self.joints(data), model.dof_armature[self.dof]
         mobility, acceleration = model.dof_invweight0[self.dof], data.qacc[self.dof]
         link = jnp.clip(1.0 - rotor * mobility, _LIGHTEST, 1.0)
         # Less what the gears passed on in the step before. Else a rotor would expect the blow of the moment in which it
         # met its link to go on, and leave it again.
         alone = acceleration - (memory["passed"] - rotor * acceleration) * mobility / link
-        now = self._now(x, joint).replace(rotor=rotor, link=link, carried=rotor * alone)
-        torque, memory = self.stage("transmission", values, torque, now, memory)
-        memory["passed"] = torque
-        bias = data.qfrc_bias[self.dof]
-        now = self._now(x, joint, jnp.maximum(jnp.abs(torque), jnp.abs(bias)), model, data)
+        load = jnp.maximum(jnp.abs(torque), jnp.abs(data.qfrc_bias[self.dof]))
+        now = self._now(x, joint, load, model, data).replace(rotor=rotor, link=link, carried=rotor * alone)
         # Effects of friction and of forces from outside have no memory, but bristles have.
         friction, _ = self.stage("friction", values, model.dof_frictionloss[self.dof], now, memory)
+        signal, before = jnp.stack([torque, friction, model.dof_damping[self.dof]]), self.ahead(memory)[0]
+        (passed, friction, damping), memory = self.stage("transmission", values, signal, now, memory)
+        memory["passed"] = passed
+        # What its controller gave while the motor ran ahead within the step.
+        far, fast = self.ahead(memory)
+        torque = torque - now.stiffness * (far - before) - now.damping * fast
         calm = Wrench(torque=jnp.zeros(len(self.dof)), force=jnp.zeros((len(self.bodies), 3)))
         wrench, _ = self.stage("wrench", values, calm, now, memory)
         (friction, rubbing), memory = self.stage("bristle", values, jnp.stack([friction, wrench.torque]), now, memory)
         friction = jnp.maximum(friction, MIN_FRICTION_NM)
-        moved = model.replace(dof_frictionloss=model.dof_frictionloss.at[self.dof].set(friction))
+        moved = model.replace(
+            dof_frictionloss=model.dof_frictionloss.at[self.dof].set(friction),
+            dof_damping=model.dof_damping.at[self.dof].set(damping),
+        )
         data = data.replace(
-            qfrc_applied=data.qfrc_applied.at[self.dof].set(torque + rubbing),
+            qfrc_applied=data.qfrc_applied.at[self.dof].set(passed + rubbing),
             xfrc_applied=data.xfrc_applied.at[self.bodies, :3].set(wrench.force),
         )
         return stepping.step(moved, data), memory, torque

@@ -74,7 +74,7 @@ class CorrectedBiteno(Biteno):
     def simulate(self, params: parameters.Params, state: State, drive: Drive) -> Motion:
         """Simulates a policy step in MJX, through the effects; see `Biteno.simulate`.
 
-        The `Motion` has the memories of the effects as well, and the torques that act on the joints, friction apart.
+        The `Motion` has the memories of the effects as well, and the torques of the motors.
         """
         model = self.model(params)
         data = self._data.replace(

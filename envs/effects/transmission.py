@@ -11,13 +11,18 @@ Together the joint receives
 
     torque + J rate / dt - R d    with    R = kp + (kd + J / dt) / dt
 
-(`_passed`, `_resistance`). What presses on the gears is less, since the rotor accelerates along with its link. If the
+(`_gears`). What presses on the gears is less, since the rotor accelerates along with its link. If the
 link has the inertia M and would accelerate by a without any torque on it (`Now.carried` is J a), that is
 
     M / (M + J) (torque - J a + J rate / dt - R d)
 
-(`_pressing`, `Now.link`), and decides how far o moves. The memory is the offset in rad and its rate in rad/s,
+(`Now.link`), and decides how far o moves. The memory is the offset in rad and its rate in rad/s,
 [2, joints].
+
+Friction and damping are at the joint or before the gears, at the motor (`at_motor` is that share). There they act on
+the motor's speed v + d / dt, where v is the joint's. Dry friction of the bound F takes the torque f with |f| <= F that
+would stop the motor, or F. The signal of this stage is [3, joints]: torque in Nm, and the bound in Nm and the damping
+in Nm s/rad of the joint, from which the motor's are taken.
 """
 
 import jax.numpy as jnp
@@ -25,39 +30,55 @@ import jax.numpy as jnp
 from jaxtune.types import Effect, Form, Parameter
 
 _TRANSMISSION = {"family": "transmission", "on": "joint"}
+_AT_MOTOR = Parameter(name="at_motor", bounds=(0.0, 1.0), prior=0.5)
 
 
-def _resistance(now):
-    """R: torque that a motor loses for every rad that it runs ahead within a step, [joints] Nm/rad."""
-    return jnp.maximum(now.stiffness + (now.damping + now.rotor / now.dt) / now.dt, 1e-9)
+def _gears(values, there, signal, now, rate):
+    """What moves the rotor within its gears, and what of friction and damping is at the motor, if gears are `there`.
+
+    Returns:
+      [joints] each: torque on the rotor if it kept up with its joint in Nm; R, the torque that it loses for every rad
+      that it runs ahead within a step, in Nm/rad; and bound in Nm and damping in Nm s/rad at the motor.
+    """
+    torque, bound, damping = signal
+    share = jnp.where(there, values["at_motor"], 0.0)
+    rubs, slows = share * jnp.maximum(bound, 0.0), share * damping
+    resistance = jnp.maximum(now.stiffness + (now.damping + slows + now.rotor / now.dt) / now.dt, 1e-9)
+    return torque - slows * now.speed + now.rotor * rate / now.dt, resistance, rubs, slows
 
 
-def _pressing(torque, now, rate):
-    """Torque that would press on the gears of a fixed link if the motor kept up with it, [joints] Nm."""
-    return torque - now.carried + now.rotor * rate / now.dt
+def _backlash(values, signal, now, memory):
+    """o' = clip(o + (pressing - f) / R, -rad / 2, rad / 2): inside the play the motor runs free, at its ends it pushes.
 
-
-def _passed(torque, now, memory, following):
-    """Torque that moves the joint, [joints] Nm: the motor's less what its offset took within the step."""
-    offset, rate = memory
-    return torque + now.rotor * rate / now.dt - _resistance(now) * (following - offset)
-
-
-def _backlash(values, torque, now, memory):
-    """o' = clip(o + pressing / R, -rad / 2, rad / 2): inside the play the motor runs free, at its ends it pushes."""
+    There dry friction is of motor and joint as one, which is left to the joint.
+    """
     offset, rate = memory
     half = 0.5 * values["rad"]
-    following = jnp.clip(offset + _pressing(torque, now, rate) / _resistance(now), -half, half)
-    return _passed(torque, now, memory, following), jnp.stack([following, (following - offset) / now.dt])
+    torque, resistance, rubs, slows = _gears(values, half > 0, signal, now, rate)
+    pressing = torque - now.carried
+    friction = jnp.clip(pressing + resistance * now.dt * now.speed, -rubs, rubs)
+    free = offset + (pressing - friction) / resistance
+    following = jnp.clip(free, -half, half)
+    inside = following == free
+    passed = torque - resistance * (following - offset) - jnp.where(inside, friction, 0.0)
+    left = signal[1:] - jnp.stack([jnp.where(inside, rubs, 0.0), slows])
+    return jnp.stack([passed, *left]), jnp.stack([following, (following - offset) / now.dt])
 
 
-def _compliance(values, torque, now, memory):
-    """A spring of stiffness k that may harden: k o' (1 + h o'^2) = M / (M + J) (pressing + R (o - o'))."""
+def _compliance(values, signal, now, memory):
+    """A spring of stiffness k that may harden: k o' (1 + h o'^2) = M / (M + J) (pressing - f + R (o - o'))."""
     offset, rate = memory
-    softness, resistance = values["nm_per_rad"] * now.link, _resistance(now)
-    wound = softness * (_pressing(torque, now, rate) + resistance * offset)
-    following = _root(1.0 + softness * resistance, values["hardening_per_rad2"], wound)
-    return _passed(torque, now, memory, following), jnp.stack([following, (following - offset) / now.dt])
+    softness, hardening = values["nm_per_rad"] * now.link, values["hardening_per_rad2"]
+    torque, resistance, rubs, slows = _gears(values, softness > 0, signal, now, rate)
+    pressing = torque - now.carried + resistance * offset
+    # Where the offset would be if the motor stood still, and the friction that it takes.
+    still = offset - now.dt * now.speed
+    wound = still * (1.0 + hardening * still**2) / jnp.maximum(softness, 1e-9)
+    friction = jnp.clip(pressing - resistance * still - wound, -rubs, rubs)
+    following = _root(1.0 + softness * resistance, hardening, softness * (pressing - friction))
+    passed = torque - resistance * (following - offset) - friction
+    left = signal[1:] - jnp.stack([rubs, slows])
+    return jnp.stack([passed, *left]), jnp.stack([following, (following - offset) / now.dt])
 
 
 def _taken_up(values, torque, dt):
@@ -87,11 +108,11 @@ ROWS = (
     Effect(
         name="backlash",
         enters="transmission",
-        parameters=(Parameter(name="rad", scale="angle", bounds=(0.0, 0.2), prior=0.02),),
+        parameters=(Parameter(name="rad", scale="angle", bounds=(0.0, 0.2), prior=0.02), _AT_MOTOR),
         sizes=(0.003, 0.02),
         act=_backlash,
         start=_taken_up,
-        forms=(Form("compliant", "compliance", "nm_per_rad"),),
+        forms=(Form("compliant", "compliance", "nm_per_rad"), Form("motor_friction", "backlash", "at_motor")),
         sentence="The gears have backlash: the motor turns a little before the joint does.",
         excited_by="slow triangular reversals through the posture without gravity torque",
         **_TRANSMISSION,
@@ -102,11 +123,15 @@ ROWS = (
         parameters=(
             Parameter(name="nm_per_rad", form="reciprocal", scale="stiffness", bounds=(0.0, 20.0), prior=1.0),
             Parameter(name="hardening_per_rad2", bounds=(0.0, 200.0), prior=30.0),
+            _AT_MOTOR,
         ),
         sizes=(0.2, 2.0),
         act=_compliance,
         start=_wound_up,
-        forms=(Form("hardening", "compliance", "hardening_per_rad2"),),
+        forms=(
+            Form("hardening", "compliance", "hardening_per_rad2"),
+            Form("motor_friction", "compliance", "at_motor"),
+        ),
         sentence="A spring sits between motor and joint.",
         excited_by="a chirp through its resonance, and postures of high gravity torque",
         **_TRANSMISSION,

@@ -253,16 +253,19 @@ def test_a_segment_begins_where_gears_have_left_light_and_heavy_rotors(rotor, na
 GEARS = {"backlash": {"rad": 0.04}, "compliance": {"nm_per_rad": 60.0}}
 
 
-def with_rotor(rotor):
-    """The arm with another rotor at its elbow, and no damping, which would be of the rotor or of the link."""
+def with_rotor(rotor, friction=0.0, damping=0.0):
+    """The arm with another rotor at its elbow. What rubs there would be of the rotor or of the link."""
     spec = mujoco.MjSpec.from_string(rigs.ARM)
-    spec.joint("elbow").armature, spec.joint("elbow").damping = rotor, [0.0, 0.0, 0.0]
+    elbow = spec.joint("elbow")
+    elbow.armature, elbow.frictionloss, elbow.damping = rotor, friction, [damping, 0.0, 0.0]
     return spec
 
 
-def of_two_bodies(effect, rotor):
-    """That arm in MuJoCo C, its rotor a body: between it and the forearm is a joint with a range or with a spring."""
-    spec = with_rotor(rotor)
+def of_two_bodies(effect, spec):
+    """That arm in MuJoCo C, its rotor a body: between it and the forearm is a joint with a range or with a spring.
+
+    What rubs, rubs at the rotor.
+    """
     motor = spec.joint("elbow")
     gears = motor.parent.add_joint(name="gears", axis=motor.axis, pos=motor.pos, type=motor.type)
     if effect == "backlash":
@@ -277,15 +280,22 @@ def of_two_bodies(effect, rotor):
 
 
 @pytest.mark.parametrize(
-    ("rotor", "rate_hz", "period", "most"),
-    [(0.0001, 1000.0, 1e-4, 9e-3), (0.005, 200.0, 5e-3, 9e-3), (0.2, 200.0, 5e-3, 3e-3)],
+    ("rotor", "rubs", "rate_hz", "period", "most"),
+    [
+        (0.0001, {}, 1000.0, 1e-4, 9e-3),
+        (0.005, {}, 200.0, 5e-3, 9e-3),
+        (0.2, {}, 200.0, 5e-3, 3e-3),
+        (0.005, {"friction": 0.5, "damping": 0.1}, 200.0, 5e-3, 9e-3),
+        (0.2, {"friction": 1.0, "damping": 0.5}, 200.0, 5e-3, 5e-3),
+    ],
 )
 @pytest.mark.parametrize("effect", GEARS)
-def test_gears_between_a_rotor_and_a_link_are_those_of_two_bodies(effect, rotor, rate_hz, period, most):
+def test_gears_between_a_rotor_and_a_link_are_those_of_two_bodies(effect, rotor, rubs, rate_hz, period, most):
     # The forearm has 0.013 kg m^2, so rotors are lighter or much heavier. The light ones swing by 0.8 rad. For the
     # lightest one the rig's controller acts continuously: once in a period it would throw it about.
-    arm = rigs.Player(Rig(with_rotor(rotor), rigs.ARM_JOINTS, rate_hz))
-    model = of_two_bodies(effect, rotor)
+    spec, gears = with_rotor(rotor, **rubs), GEARS[effect] | {"at_motor": float(bool(rubs))}
+    arm = rigs.Player(Rig(spec, rigs.ARM_JOINTS, rate_hz))
+    model = of_two_bodies(effect, spec)
     data, start = mujoco.MjData(model), np.array([0.4, -0.9])
     data.qpos[:2] = start
     mujoco.mj_forward(model, data)
@@ -297,7 +307,8 @@ def test_gears_between_a_rotor_and_a_link_are_those_of_two_bodies(effect, rotor,
     target = np.tile(motor + np.array([0.1, 0.4]), (rigs.STEPS, 1))
     target[0] = motor + gravity / kp
     target[70:] = motor - np.array([0.1, 0.4])
-    read = arm.play(rigs.segment(arm.rig, motor, target, kp, kd), **{effect: {"elbow": GEARS[effect]}})
+    segment = rigs.segment(arm.rig, motor, target, kp, kd)
+    read, at_joint = (arm.play(segment, **{effect: {"elbow": one}})["q"] for one in (gears, GEARS[effect]))
     expected = []
     for step in range(10 * rigs.STEPS):
         if step % 10 == 0:
@@ -305,8 +316,9 @@ def test_gears_between_a_rotor_and_a_link_are_those_of_two_bodies(effect, rotor,
         if step % round(period / model.opt.timestep) == 0:
             data.qfrc_applied[:2] = kp * (target[step // 10] - data.qpos[:2]) - kd * data.qvel[:2]
         mujoco.mj_step(model, data)
-    error = np.abs(read["q"] - expected).max(axis=0)
-    assert error.max() < most
+    error = np.abs(read - expected).max()
+    assert error < most
+    assert not rubs or np.abs(at_joint - expected).max() > 3 * error
 
 
 def test_rotors_without_inertia_and_motors_that_are_off_stay_with_their_links():
