@@ -34,7 +34,7 @@ class Now:
     dt: float  # step of the simulation in s
     position: jax.Array  # [joints] rad
     speed: jax.Array  # [joints] rad/s
-    load: jax.Array  # [joints] Nm on the gears: the larger of motor torque and of gravity and Coriolis torque
+    load: jax.Array  # [joints] Nm, the larger of the motor's torque and of gravity and Coriolis torque
     limit: jax.Array  # [joints] Nm, largest torque of the controller
     stiffness: jax.Array  # [joints] Nm/rad, of a controller that acts within the step
     damping: jax.Array  # [joints] Nm s/rad, of such a controller and its back electromotive force
@@ -144,9 +144,9 @@ class Chain:
         Returns:
           The robot and the memories after the step.
         """
-        joint, (far, fast) = self.joints(data), self.ahead(memory)
-        seen = motor.at[1].add(-self._within(model, x) * fast)
-        _, memory = self.stage("sensor", values, seen, self._now(x, seen), memory)
+        joint, (far, fast), within = self.joints(data), self.ahead(memory), self._within(model, x)
+        seen = motor.at[1].add(-within * fast)
+        _, memory = self.stage("sensor", values, seen, self._now(x, seen), memory | {"within": within})
         held = jnp.maximum(model.dof_armature[self.dof], _LIGHT / model.dof_invweight0[self.dof])
         hold = {"stiffness": held * _HOLD_RAD_S**2, "damping": 2.0 * held * _HOLD_RAD_S}
         # How fast it runs ahead acts within the step (`envs.effects.transmission`).
@@ -186,13 +186,16 @@ class Chain:
         # Less what the gears passed on in the step before. Else a rotor would expect the blow of the moment in which it
         # met its link to go on, and leave it again.
         alone = acceleration - (memory["passed"] - rotor * acceleration) * mobility / link
-        load = jnp.maximum(jnp.abs(torque), jnp.abs(data.qfrc_bias[self.dof]))
+        before, fast = self.ahead(memory)
+        given = torque - (x["damping"] + x["emf"]) * fast
+        load = jnp.maximum(jnp.abs(given), jnp.abs(data.qfrc_bias[self.dof]))
         now = self._now(x, joint, load, model, data).replace(rotor=rotor, link=link, carried=rotor * alone)
         # Effects of friction and of forces from outside have no memory, but bristles have.
         friction, _ = self.stage("friction", values, model.dof_frictionloss[self.dof], now, memory)
-        signal, before = jnp.stack([torque, friction, model.dof_damping[self.dof]]), self.ahead(memory)[0]
-        (passed, friction, damping), memory = self.stage("transmission", values, signal, now, memory)
-        memory["passed"] = passed
+        none = jnp.zeros_like(torque)
+        signal = jnp.stack([torque, friction, model.dof_damping[self.dof], none, none])
+        (passed, friction, damping, rubs, slows), memory = self.stage("transmission", values, signal, now, memory)
+        share, friction, damping = rubs / jnp.maximum(friction + rubs, 1e-9), friction + rubs, damping + slows
         # What its controller gave while the motor ran ahead within the step.
         far, fast = self.ahead(memory)
         torque = torque - now.stiffness * (far - before) - now.damping * fast
@@ -208,7 +211,11 @@ class Chain:
             qfrc_applied=data.qfrc_applied.at[self.dof].set(passed + rubbing),
             xfrc_applied=data.xfrc_applied.at[self.bodies, :3].set(wrench.force),
         )
-        return stepping.step(moved, data), memory, torque
+        data = stepping.step(moved, data)
+        # Motor and link may rub as one. What that takes of the motor's torque does not come from the link.
+        rubbed = stepping.dry_friction(data)[self.dof] + rubbing - wrench.torque
+        memory["passed"] = passed + share * rubbed - slows * joint[1]
+        return data, memory, torque
 
     def read(self, values, memory: dict, joint: jax.Array, x) -> jax.Array:
         """Reads the joints through the effects of transmission and sensors, without advancing a memory.

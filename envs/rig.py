@@ -343,8 +343,8 @@ class Rig:
 
         memory, torque = jax.lax.scan(remember, first, (truth[:before], past))
         # Where joints are behind their motors was not measured. It matters, and takes time, only if gears give way.
-        gears = [row.name for row in chain.entering("transmission")]
-        gives = jnp.stack([value != 0 for name in gears for value in values[name].values()]).any(axis=0)
+        gears = {row.name: row.parameters[0].name for row in chain.entering("transmission")}
+        gives = jnp.stack([values[name][size] != 0 for name, size in gears.items()]).any(axis=0)
         pressing = torque - model.dof_armature[self.dof] * acceleration[:before]
         first = first | chain.pressed(values, pressing[: round(_PRESSED_S / self.dt)])
 

@@ -95,6 +95,13 @@ def solve(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     return data.replace(qacc=found, qfrc_constraint=jacobian.T @ force, _impl=rows.replace(efc_force=force))
 
 
+def dry_friction(data: mjx.Data) -> jax.Array:
+    """Torques of dry friction in a step that `step` has taken, [dofs] Nm."""
+    rows = data._impl
+    rubs = slice(rows.ne, rows.ne + rows.nf)
+    return rows.efc_J[rubs].T @ rows.efc_force[rubs] if rows.nf else jnp.zeros_like(data.qvel)
+
+
 def _solved(matrix: jax.Array, vector: jax.Array) -> jax.Array:
     """Solves a small positive definite system by elimination without pivots, which is fastest for many side by side."""
     both = jnp.concatenate([matrix, vector[:, None]], axis=1)

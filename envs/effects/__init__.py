@@ -11,6 +11,8 @@ of their rows:
 
     motor -torque_reading-> recorded torque
 
+The stage `transmission` may take friction and damping from the joint, for they may be the motor's.
+
 Values of zero leave the signal unchanged, so an effect is absent where its values are zero. That is why limits and
 stiffnesses enter `act` as reciprocals, and ratios as logarithms.
 

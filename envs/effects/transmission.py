@@ -11,7 +11,7 @@ Together the joint receives
 
     torque + J rate / dt - R d    with    R = kp + (kd + J / dt) / dt
 
-(`_gears`). What presses on the gears is less, since the rotor accelerates along with its link. If the
+(`_resistance`). What presses on the gears is less, since the rotor accelerates along with its link. If the
 link has the inertia M and would accelerate by a without any torque on it (`Now.carried` is J a), that is
 
     M / (M + J) (torque - J a + J rate / dt - R d)
@@ -20,9 +20,10 @@ link has the inertia M and would accelerate by a without any torque on it (`Now.
 [2, joints].
 
 Friction and damping are at the joint or before the gears, at the motor (`at_motor` is that share). There they act on
-the motor's speed v + d / dt, where v is the joint's. Dry friction of the bound F takes the torque f with |f| <= F that
-would stop the motor, or F. The signal of this stage is [3, joints]: torque in Nm, and the bound in Nm and the damping
-in Nm s/rad of the joint, from which the motor's are taken.
+the motor's speed v + d / dt, where v is the joint's. So damping D is added to kd above and takes D v of the torque, and
+dry friction of the bound F takes the torque f with |f| <= F that would stop the motor, or F. The signal of this stage
+is [5, joints]: torque in Nm, bound in Nm and damping in Nm s/rad of the joint, and those of the motor. What no row has
+used of the motor's is the joint's again, because the two move as one.
 """
 
 import jax.numpy as jnp
@@ -33,52 +34,62 @@ _TRANSMISSION = {"family": "transmission", "on": "joint"}
 _AT_MOTOR = Parameter(name="at_motor", bounds=(0.0, 1.0), prior=0.5)
 
 
-def _gears(values, there, signal, now, rate):
-    """What moves the rotor within its gears, and what of friction and damping is at the motor, if gears are `there`.
+def _shared(values, there, signal):
+    """Takes the motor's share out of the joint's friction and damping, where gears are `there`.
 
     Returns:
-      [joints] each: torque on the rotor if it kept up with its joint in Nm; R, the torque that it loses for every rad
-      that it runs ahead within a step, in Nm/rad; and bound in Nm and damping in Nm s/rad at the motor.
+      Torque of the motor [joints] Nm, and bound in Nm and damping in Nm s/rad of joint and of motor, [2, joints] each.
     """
-    torque, bound, damping = signal
-    share = jnp.where(there, values["at_motor"], 0.0)
-    rubs, slows = share * jnp.maximum(bound, 0.0), share * damping
-    resistance = jnp.maximum(now.stiffness + (now.damping + slows + now.rotor / now.dt) / now.dt, 1e-9)
-    return torque - slows * now.speed + now.rotor * rate / now.dt, resistance, rubs, slows
+    joint, motor = signal[1:3], signal[3:5]
+    taken = jnp.where(there, values["at_motor"], 0.0) * joint
+    return signal[0], joint - taken, motor + taken
+
+
+def _resistance(now, slows=0.0):
+    """R: torque that a motor loses for every rad that it runs ahead within a step, [joints] Nm/rad."""
+    return jnp.maximum(now.stiffness + (now.damping + slows + now.rotor / now.dt) / now.dt, 1e-9)
+
+
+def _stopping(torque, bound):
+    """Torque of dry friction, [joints] Nm: what would stop the motor, or its bound."""
+    return jnp.where(bound > 0, jnp.clip(torque, -bound, bound), 0.0)
 
 
 def _backlash(values, signal, now, memory):
     """o' = clip(o + (pressing - f) / R, -rad / 2, rad / 2): inside the play the motor runs free, at its ends it pushes.
 
-    There dry friction is of motor and joint as one, which is left to the joint.
+    There motor and joint rub as one.
     """
     offset, rate = memory
     half = 0.5 * values["rad"]
-    torque, resistance, rubs, slows = _gears(values, half > 0, signal, now, rate)
-    pressing = torque - now.carried
-    friction = jnp.clip(pressing + resistance * now.dt * now.speed, -rubs, rubs)
-    free = offset + (pressing - friction) / resistance
-    following = jnp.clip(free, -half, half)
-    inside = following == free
-    passed = torque - resistance * (following - offset) - jnp.where(inside, friction, 0.0)
-    left = signal[1:] - jnp.stack([jnp.where(inside, rubs, 0.0), slows])
-    return jnp.stack([passed, *left]), jnp.stack([following, (following - offset) / now.dt])
+    torque, joint, motor = _shared(values, half > 0, signal)
+    torque, (bound, slows), resistance = torque + now.rotor * rate / now.dt, motor, _resistance(now, motor[1])
+    pressing = torque - now.carried - slows * now.speed
+    friction = _stopping(pressing + resistance * now.dt * now.speed, bound)
+    following = jnp.clip(offset + (pressing - friction) / resistance, -half, half)
+    inside = jnp.abs(following) < half
+    rubs = jnp.where(inside, slows * (now.speed + (following - offset) / now.dt) + friction, 0.0)
+    passed = torque - _resistance(now) * (following - offset) - rubs
+    signal = jnp.stack([passed, *joint, *jnp.where(inside, 0.0, motor)])
+    return signal, jnp.stack([following, (following - offset) / now.dt])
 
 
 def _compliance(values, signal, now, memory):
     """A spring of stiffness k that may harden: k o' (1 + h o'^2) = M / (M + J) (pressing - f + R (o - o'))."""
     offset, rate = memory
     softness, hardening = values["nm_per_rad"] * now.link, values["hardening_per_rad2"]
-    torque, resistance, rubs, slows = _gears(values, softness > 0, signal, now, rate)
+    torque, joint, motor = _shared(values, softness > 0, signal)
+    bound, slows = jnp.where(softness > 0, motor, 0.0)
+    torque, resistance = torque + now.rotor * rate / now.dt - slows * now.speed, _resistance(now, slows)
     pressing = torque - now.carried + resistance * offset
-    # Where the offset would be if the motor stood still, and the friction that it takes.
+    # Where the offset would be if the motor stood still, and the spring's torque there.
     still = offset - now.dt * now.speed
     wound = still * (1.0 + hardening * still**2) / jnp.maximum(softness, 1e-9)
-    friction = jnp.clip(pressing - resistance * still - wound, -rubs, rubs)
+    friction = _stopping(pressing - resistance * still - wound, bound)
     following = _root(1.0 + softness * resistance, hardening, softness * (pressing - friction))
     passed = torque - resistance * (following - offset) - friction
-    left = signal[1:] - jnp.stack([rubs, slows])
-    return jnp.stack([passed, *left]), jnp.stack([following, (following - offset) / now.dt])
+    signal = jnp.stack([passed, *joint, *jnp.where(softness > 0, 0.0, motor)])
+    return signal, jnp.stack([following, (following - offset) / now.dt])
 
 
 def _taken_up(values, torque, dt):

@@ -279,6 +279,21 @@ def of_two_bodies(effect, spec):
     return model
 
 
+def read_and_true(rig, vector, segment):
+    """Positions that are read of a robot, which are those of its motors, and those of its joints, [steps, joints]."""
+    values = rig.values(rig.tree(vector))
+    model = rig.model(values)
+    data, memory, future = rig._begin(model, values, segment)
+
+    def step(carry, x):
+        data, memory = carry
+        joint = rig.chain.joints(data)[0]
+        data, memory, read = rig.chain.step(model, data, memory, values, x)
+        return (data, memory), (read["q"], joint)
+
+    return jax.lax.scan(step, (data, memory), future)[1]
+
+
 @pytest.mark.parametrize(
     ("rotor", "rubs", "rate_hz", "period", "most"),
     [
@@ -291,8 +306,9 @@ def of_two_bodies(effect, spec):
 )
 @pytest.mark.parametrize("effect", GEARS)
 def test_gears_between_a_rotor_and_a_link_are_those_of_two_bodies(effect, rotor, rubs, rate_hz, period, most):
-    # The forearm has 0.013 kg m^2, so rotors are lighter or much heavier. The light ones swing by 0.8 rad. For the
-    # lightest one the rig's controller acts continuously: once in a period it would throw it about.
+    # What is read, and where the links are. The forearm has 0.013 kg m^2, so rotors are lighter or much heavier. The
+    # light ones swing by 0.8 rad. For the lightest one the rig's controller acts continuously: once in a period it
+    # would throw it about.
     spec, gears = with_rotor(rotor, **rubs), GEARS[effect] | {"at_motor": float(bool(rubs))}
     arm = rigs.Player(Rig(spec, rigs.ARM_JOINTS, rate_hz))
     model = of_two_bodies(effect, spec)
@@ -308,17 +324,22 @@ def test_gears_between_a_rotor_and_a_link_are_those_of_two_bodies(effect, rotor,
     target[0] = motor + gravity / kp
     target[70:] = motor - np.array([0.1, 0.4])
     segment = rigs.segment(arm.rig, motor, target, kp, kd)
-    read, at_joint = (arm.play(segment, **{effect: {"elbow": one}})["q"] for one in (gears, GEARS[effect]))
+    play = jax.jit(lambda vector, segment: jnp.hstack(read_and_true(arm.rig, vector, segment)))
+    found, at_joint = (
+        np.asarray(play(arm.vector(**{effect: {"elbow": one}}), segment)) for one in (gears, GEARS[effect])
+    )
     expected = []
     for step in range(10 * rigs.STEPS):
         if step % 10 == 0:
-            expected.append(data.qpos[:2].copy())
+            shoulder, rotor, link = data.qpos
+            expected.append([shoulder, rotor, shoulder, rotor + link])
         if step % round(period / model.opt.timestep) == 0:
             data.qfrc_applied[:2] = kp * (target[step // 10] - data.qpos[:2]) - kd * data.qvel[:2]
         mujoco.mj_step(model, data)
-    error = np.abs(read - expected).max()
-    assert error < most
-    assert not rubs or np.abs(at_joint - expected).max() > 3 * error
+    error, at_the_joint = (np.abs(one - expected).max(axis=0) for one in (found, at_joint))
+    assert error[:2].max() < most
+    assert error[2:].max() < 1.4 * most
+    assert not rubs or at_the_joint.max() > 2.5 * error.max()
 
 
 def test_rotors_without_inertia_and_motors_that_are_off_stay_with_their_links():
@@ -355,8 +376,8 @@ def test_what_is_read_is_what_the_next_step_reads(rotor):
     x["target"], fast = START - 1.0, 0.0
     for _ in range(5):
         joint, before = chain.joints(data), memory
+        read = chain.read(values, before, joint, x)
         data, memory, expected = step(model, data, before, values, x)
-        read = chain.read(values, before | {"within": memory["within"]}, joint, x)
         np.testing.assert_allclose(read, [expected["q"], expected["dq"]], atol=1e-5)
         fast = max(fast, np.abs(chain.ahead(before)[1]).max())
     assert fast > 0.1

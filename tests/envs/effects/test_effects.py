@@ -42,7 +42,7 @@ def now(speed=0.0, **fields):
 
 def signal_of(row, rng):
     """Some signal of the stage that a row enters."""
-    shapes = {"sensor": (2, JOINTS), "bristle": (2, JOINTS), "transmission": (3, JOINTS), "gravity": (3,)}
+    shapes = {"sensor": (2, JOINTS), "bristle": (2, JOINTS), "transmission": (5, JOINTS), "gravity": (3,)}
     shape = shapes.get(row.enters, (JOINTS,))
     if row.enters == "wrench":
         return Wrench(torque=draw(rng, (JOINTS,)), force=draw(rng, (JOINTS, 3)))
@@ -338,7 +338,8 @@ def wound(name, targets, damping=0.0, stiffness=20.0, rotor=0.0, feed=0.0, rubs=
 
     def step(memory, target):
         torque = stiffness * (target - memory[0]) + feed
-        signal, memory = row.act(values, jnp.stack([torque, *(one * jnp.ones(JOINTS) for one in rubs)]), at, memory)
+        signal = jnp.stack([torque, *(one * jnp.ones(JOINTS) for one in (*rubs, 0.0, 0.0))])
+        signal, memory = row.act(values, signal, at, memory)
         return memory, (signal[0], memory[0])
 
     _, (torque, offset) = jax.lax.scan(
@@ -401,7 +402,7 @@ def test_a_joint_that_goes_on_without_its_motor_has_no_rotor():
     values = values_of(row, rad=0.4)
     rotor, carried = jnp.full(JOINTS, 0.01), jnp.full(JOINTS, 0.3)
     at = now(stiffness=jnp.zeros(JOINTS), rotor=rotor, carried=carried)
-    (torque, *_), memory = row.act(values, jnp.zeros((3, JOINTS)), at, jnp.zeros((2, JOINTS)))
+    (torque, *_), memory = row.act(values, jnp.zeros((5, JOINTS)), at, jnp.zeros((2, JOINTS)))
     np.testing.assert_allclose(torque, 0.3, rtol=1e-5)
     np.testing.assert_allclose(memory[1], -0.3 / 0.01 * DT, rtol=1e-5)
 
@@ -450,14 +451,21 @@ def test_damping_at_the_motor_slows_it_within_its_play():
 
 @pytest.mark.parametrize(("name", "physical"), [("backlash", {"rad": 0.02}), ("compliance", {"nm_per_rad": 60.0})])
 def test_what_rubs_at_the_motor_does_not_rub_at_the_joint(name, physical):
-    row = LIBRARY[name]
-    values, signal = values_of(row, at_motor=0.25, **physical), jnp.full((3, JOINTS), 0.1)
-    (_, bound, damping), _ = row.act(values, signal, now(speed=0.1), jnp.zeros((2, JOINTS)))
-    np.testing.assert_allclose([bound, damping], 0.075, rtol=1e-5)
-    # At the ends of the play motor and joint are one.
-    (_, bound, damping), _ = row.act(values, signal * jnp.array([[100.0], [1.0], [1.0]]), now(), jnp.zeros((2, JOINTS)))
-    np.testing.assert_allclose(bound, 0.1 if name == "backlash" else 0.075, rtol=1e-5)
-    np.testing.assert_allclose(damping, 0.075, rtol=1e-5)
+    row, rubs = LIBRARY[name], jnp.array([[0.0], [0.1], [0.2], [0.0], [0.0]]) * jnp.ones(JOINTS)
+    values = values_of(row, at_motor=0.25, **physical)
+    signal, _ = row.act(values, rubs, now(speed=0.1), jnp.zeros((2, JOINTS)))
+    np.testing.assert_allclose(signal[1:, 0], [0.075, 0.15, 0.0, 0.0], rtol=1e-5)
+    # At the ends of the play motor and joint are one, and what comes next may use what is the motor's.
+    signal, _ = row.act(values, rubs.at[0].set(10.0), now(), jnp.zeros((2, JOINTS)))
+    left = [0.025, 0.05] if name == "backlash" else [0.0, 0.0]
+    np.testing.assert_allclose(signal[1:, 0], [0.075, 0.15, *left], rtol=1e-5)
+
+
+@pytest.mark.parametrize(("name", "physical"), [("backlash", {"rad": 0.0}), ("compliance", {"nm_per_rad": np.inf})])
+def test_without_gears_nothing_is_before_them(name, physical):
+    row, signal = LIBRARY[name], draw(np.random.default_rng(0), (5, JOINTS))
+    got, _ = row.act(values_of(row, at_motor=1.0, **physical), signal, now(speed=0.1), jnp.zeros((2, JOINTS)))
+    np.testing.assert_array_equal(got, signal)
 
 
 # Sensing.
