@@ -65,5 +65,6 @@ def test_a_slide_has_no_angles():
     np.testing.assert_allclose(found["angle"], [1.0, 0.05])
     np.testing.assert_allclose(found["stiffness"], found["torque"] / [0.02, 0.001], rtol=1e-6)
     for name in ("deadband", "backlash", "encoder_bias"):
-        axes = {axis.place: axis.scale for axis in rig.scaled(found).axes if axis.effect == name}
+        angles = [axis for axis in rig.scaled(found).axes if (axis.effect, axis.parameter) == (name, "rad")]
+        axes = {axis.place: axis.scale for axis in angles}
         assert axes == pytest.approx({"shoulder": 1.0, "elbow": 0.05})
