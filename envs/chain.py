@@ -61,8 +61,8 @@ class Chain:
 
     - `values` holds [places] by effect and parameter, in the form that effects read. Zero means no effect.
     - `memory` is a dictionary: what each effect remembers, by its name, `held`, the controller's last torque, `passed`,
-      the last torque on the joints (of motors in a history: theirs), and `within`, the share of its gains with which
-      the controller acted within the last step.
+      the motors' torque on the joints in the last step, less what rubs at the motors (in a history: all of it), and
+      `within`, the share of its gains with which the controller acted within the last step.
     - `x` holds the controller's inputs of one step, [joints] each: `target` rad, `feed` Nm (torque sent directly),
       `stiffness` Nm/rad, `damping` Nm s/rad, `limit` Nm, `emf` Nm s/rad (back electromotive force, not limited), and
       `sample`, a scalar that is true where the controller reads the joint anew.
@@ -129,8 +129,7 @@ class Chain:
 
         Each rotor is held to its measured motion by a controller of its own, in addition to the motor's torque. It is
         no stiffer than the rotor is heavy, or a twentieth of the joint where it is lighter, so where the rotor meets
-        its link again, both feel it. Sensors remember the motors as the controller would have seen
-        them (`_within`).
+        its link again, both feel it. Sensors remember the motors as the controller would have seen them (`_within`).
 
         Args:
           model: of the robot, effects on its fields included.

@@ -95,6 +95,7 @@ def solve(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     return data.replace(qacc=found, qfrc_constraint=jacobian.T @ force, _impl=rows.replace(efc_force=force))
 
 
+@devices.precisely
 def dry_friction(data: mjx.Data) -> jax.Array:
     """Torques of dry friction in a step that `step` has taken, [dofs] Nm."""
     rows = data._impl

@@ -41,7 +41,8 @@ def _shared(values, there, signal):
       Torque of the motor [joints] Nm, and bound in Nm and damping in Nm s/rad of joint and of motor, [2, joints] each.
     """
     joint, motor = signal[1:3], signal[3:5]
-    taken = jnp.where(there, values["at_motor"], 0.0) * joint
+    # A hypothesis may ask for less friction than none.
+    taken = jnp.where(there, values["at_motor"], 0.0) * jnp.maximum(joint, 0.0)
     return signal[0], joint - taken, motor + taken
 
 

@@ -338,7 +338,8 @@ def test_gears_between_a_rotor_and_a_link_are_those_of_two_bodies(effect, rotor,
         mujoco.mj_step(model, data)
     error, at_the_joint = (np.abs(one - expected).max(axis=0) for one in (found, at_joint))
     assert error[:2].max() < most
-    assert error[2:].max() < 1.4 * most
+    # Where friction brakes a heavy rotor, its links would be twice as far off if it were taken for theirs.
+    assert error[2:].max() < (0.65 if rubs and effect == "backlash" else 1.4) * most
     assert not rubs or at_the_joint.max() > 2.5 * error.max()
 
 

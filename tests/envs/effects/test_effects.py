@@ -461,6 +461,13 @@ def test_what_rubs_at_the_motor_does_not_rub_at_the_joint(name, physical):
     np.testing.assert_allclose(signal[1:, 0], [0.075, 0.15, *left], rtol=1e-5)
 
 
+@pytest.mark.parametrize(("name", "physical"), [("backlash", {"rad": 0.02}), ("compliance", {"nm_per_rad": 60.0})])
+def test_a_motor_takes_nothing_of_less_friction_than_none(name, physical):
+    row, rubs = LIBRARY[name], jnp.array([[10.0], [-0.1], [0.2], [0.0], [0.0]]) * jnp.ones(JOINTS)
+    signal, _ = row.act(values_of(row, at_motor=1.0, **physical), rubs, now(), jnp.zeros((2, JOINTS)))
+    np.testing.assert_allclose([signal[1], signal[3]], [[-0.1] * JOINTS, [0.0] * JOINTS], rtol=1e-5)
+
+
 @pytest.mark.parametrize(("name", "physical"), [("backlash", {"rad": 0.0}), ("compliance", {"nm_per_rad": np.inf})])
 def test_without_gears_nothing_is_before_them(name, physical):
     row, signal = LIBRARY[name], draw(np.random.default_rng(0), (5, JOINTS))
