@@ -331,8 +331,8 @@ def test_gears_between_a_rotor_and_a_link_are_those_of_two_bodies(effect, rotor,
     expected = []
     for step in range(10 * rigs.STEPS):
         if step % 10 == 0:
-            shoulder, rotor, link = data.qpos
-            expected.append([shoulder, rotor, shoulder, rotor + link])
+            shoulder, elbow, ahead = data.qpos
+            expected.append([shoulder, elbow, shoulder, elbow + ahead])
         if step % round(period / model.opt.timestep) == 0:
             data.qfrc_applied[:2] = kp * (target[step // 10] - data.qpos[:2]) - kd * data.qvel[:2]
         mujoco.mj_step(model, data)
