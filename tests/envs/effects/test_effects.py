@@ -440,8 +440,8 @@ def test_a_motor_that_rubs_stays_behind_what_turns_it(name, physical):
 
 
 def test_damping_at_the_motor_slows_it_within_its_play():
-    # 5 Nm on 0.1 Nm s/rad and 0.001 kg m^2 end at 50 rad/s, with a time constant of 10 ms. Half of the damping makes both
-    # twice as large. Steps are taken by their end.
+    # 5 Nm on 0.1 Nm s/rad and 0.001 kg m^2 end at 50 rad/s, with a time constant of 10 ms. Half of the damping makes
+    # both twice as large. Steps are taken by their end.
     for share in (1.0, 0.5):
         _, offset = wound(
             "backlash", np.zeros(60), stiffness=0.0, rotor=0.001, feed=5.0, rubs=(0.0, 0.1), at_motor=share, rad=20.0
