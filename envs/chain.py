@@ -40,7 +40,9 @@ class Now:
     damping: jax.Array  # [joints] Nm s/rad, of such a controller and its back electromotive force
     rotor: jax.Array  # [joints] kg m^2, the rotor's part of the joint's inertia
     link: jax.Array  # [joints] share of the joint's inertia that is not the rotor's
-    carried: jax.Array  # [joints] Nm that would accelerate the rotor as its link accelerates without any torque on it
+    mobility: jax.Array  # [joints] 1/(kg m^2), the inverse of the link's part of the joint's inertia
+    alone: jax.Array  # [joints] rad/s^2, acceleration of the link without the torque of its gears and its dry friction
+    braking: jax.Array  # [joints] 1/s, the pace at which dry friction stops a joint that it can stop
     body_velocity: jax.Array  # [bodies, 3] m/s of the centres of mass
     between: jax.Array  # [joints] rad, how far targets are from the held ones if they move on between rows
 
@@ -61,8 +63,9 @@ class Chain:
 
     - `values` holds [places] by effect and parameter, in the form that effects read. Zero means no effect.
     - `memory` is a dictionary: what each effect remembers, by its name, `held`, the controller's last torque, `passed`,
-      the motors' torque on the joints in the last step, less what rubs at the motors (in a history: all of it), and
-      `within`, the share of its gains with which the controller acted within the last step.
+      the motors' torque on the joints in the last step, less what rubs at the motors (in a history: all of it),
+      `rubbed`, the torque of the links' dry friction in it, and `within`, the share of its gains with which the
+      controller acted within it.
     - `x` holds the controller's inputs of one step, [joints] each: `target` rad, `feed` Nm (torque sent directly),
       `stiffness` Nm/rad, `damping` Nm s/rad, `limit` Nm, `emf` Nm s/rad (back electromotive force, not limited), and
       `sample`, a scalar that is true where the controller reads the joint anew.
@@ -122,7 +125,7 @@ class Chain:
         torque = torque - x["emf"] * motor[1]
         # Measured motion winds up the bristles as simulated motion does.
         _, memory = self.stage("bristle", values, jnp.zeros_like(motor), self._now(x, motor), memory)
-        return memory | {"passed": torque}, torque
+        return memory | {"passed": torque, "rubbed": jnp.zeros_like(torque)}, torque
 
     def follow(self, model: mjx.Model, data: mjx.Data, memory: dict, values, motor, torque, x) -> tuple[mjx.Data, dict]:
         """Simulates one step of links whose motors moved as measured: what gears that give way make of that motion.
@@ -179,16 +182,13 @@ class Chain:
 
     def _move(self, model, data, memory, values, torque, x) -> tuple[mjx.Data, dict, jax.Array]:
         """Moves the robot by the torques of its motors, [joints] Nm; the third value is what they gave in the step."""
-        joint, rotor = self.joints(data), model.dof_armature[self.dof]
-        mobility, acceleration = model.dof_invweight0[self.dof], data.qacc[self.dof]
-        link = jnp.clip(1.0 - rotor * mobility, _LIGHTEST, 1.0)
-        # Less what the gears passed on in the step before. Else a rotor would expect the blow of the moment in which it
-        # met its link to go on, and leave it again.
-        alone = acceleration - (memory["passed"] - rotor * acceleration) * mobility / link
-        before, fast = self.ahead(memory)
+        joint, (before, fast) = self.joints(data), self.ahead(memory)
         given = torque - (x["damping"] + x["emf"]) * fast
-        load = jnp.maximum(jnp.abs(given), jnp.abs(data.qfrc_bias[self.dof]))
-        now = self._now(x, joint, load, model, data).replace(rotor=rotor, link=link, carried=rotor * alone)
+        now = self._now(x, joint).replace(
+            load=jnp.maximum(jnp.abs(given), jnp.abs(data.qfrc_bias[self.dof])),
+            body_velocity=_velocity(model, data)[self.bodies],
+            **self._rotors_and_links(model, data, memory),
+        )
         # Effects of friction and of forces from outside have no memory, but bristles have.
         friction, _ = self.stage("friction", values, model.dof_frictionloss[self.dof], now, memory)
         none = jnp.zeros_like(torque)
@@ -213,8 +213,25 @@ class Chain:
         data = stepping.step(moved, data)
         # Motor and link may rub as one. What that takes of the motor's torque does not come from the link.
         rubbed = stepping.dry_friction(data)[self.dof] + rubbing - wrench.torque
-        memory["passed"] = passed + share * rubbed - slows * joint[1]
+        memory |= {"passed": passed + share * rubbed - slows * joint[1], "rubbed": (1.0 - share) * rubbed}
         return data, memory, torque
+
+    def _rotors_and_links(self, model, data, memory) -> dict:
+        """What `Now` says of rotors and their links before a step."""
+        rotor, mobility, acceleration = model.dof_armature[self.dof], model.dof_invweight0, data.qacc[self.dof]
+        link = jnp.clip(1.0 - rotor * mobility[self.dof], _LIGHTEST, 1.0)
+        mobility = mobility[self.dof] / link
+        # Less what gears and friction gave in the step before. Else a rotor would expect the blow of the moment in
+        # which it met its link to go on, and leave it again; and a link that its friction has just stopped to turn
+        # back.
+        given = memory["passed"] - rotor * acceleration + memory["rubbed"]
+        return {
+            "rotor": rotor,
+            "link": link,
+            "mobility": mobility,
+            "alone": acceleration - given * mobility,
+            "braking": stepping.braking(model)[self.dof],
+        }
 
     def read(self, values, memory: dict, joint: jax.Array, x) -> jax.Array:
         """Reads the joints through the effects of transmission and sensors, without advancing a memory.
@@ -286,7 +303,8 @@ class Chain:
         signals = {"sensor": state, "torque": torque, "transmission": torque[None]}
         signals["bristle"] = state[:1] if past is None else past
         signals["command"] = x["target"][None] if past_target is None else past_target
-        memory = {"held": torque, "passed": torque, "within": jnp.zeros_like(torque)}
+        none = jnp.zeros_like(torque)
+        memory = {"held": torque, "passed": torque, "rubbed": none, "within": none}
         for stage, signal in signals.items():
             for row in self.entering(stage):
                 if row.start is not None:
@@ -338,20 +356,23 @@ class Chain:
         rows = self.entering("transmission")
         return sum((memory[row.name] for row in rows), start=jnp.zeros((2, len(self.dof))))
 
-    def _now(self, x, state, load=0.0, model=None, data=None) -> Now:
-        velocity = jnp.zeros((len(self.bodies), 3)) if data is None else _velocity(model, data)[self.bodies]
+    def _now(self, x, state) -> Now:
+        """`Now` of a robot whose forces, rotors and links do not matter."""
+        none = jnp.zeros_like(state[1])
         return Now(
             dt=self.dt,
             position=state[0],
             speed=state[1],
-            load=load * jnp.ones_like(state[1]),
+            load=none,
             limit=x["limit"],
             stiffness=x["stiffness"],
             damping=x["damping"] + x["emf"],
-            rotor=jnp.zeros_like(state[1]),
-            link=jnp.ones_like(state[1]),
-            carried=jnp.zeros_like(state[1]),
-            body_velocity=velocity,
+            rotor=none,
+            link=none + 1.0,
+            mobility=none,
+            alone=none,
+            braking=none,
+            body_velocity=jnp.zeros((len(self.bodies), 3)),
             between=x["between"],
         )
 

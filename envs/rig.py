@@ -369,7 +369,7 @@ class Rig:
         begun = at(0, first, acceleration[0]), first, {name: first[name][1] for name in gears}
         data, followed, rates = jax.lax.fori_loop(jnp.where(gives.any(), 0, before), before, follow, begun)
         rows = (row.name for row in chain.rows if row.enters in _FOLLOWED and row.start is not None)
-        for name in ("passed", "within", *rows):
+        for name in ("passed", "rubbed", "within", *rows):
             memory[name] = jnp.where(gives, followed[name], memory[name])
         for name in gears:
             memory[name] = memory[name].at[1].add(chain.light(model) * (rates[name] - memory[name][1]))

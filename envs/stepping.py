@@ -95,6 +95,13 @@ def solve(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     return data.replace(qacc=found, qfrc_constraint=jacobian.T @ force, _impl=rows.replace(efc_force=force))
 
 
+def braking(model: mjx.Model) -> jax.Array:
+    """Paces at which dry friction stops joints, [dofs] 1/s (mujoco.readthedocs.io: "Modeling", "Solver parameters")."""
+    time, damping = model.dof_solref[:, 0], model.dof_solref[:, 1]
+    pace = 2.0 / jnp.maximum(time, 2.0 * model.opt.timestep)
+    return jnp.where(time > 0, pace, -damping) / model.dof_solimp[:, 1]
+
+
 @devices.precisely
 def dry_friction(data: mjx.Data) -> jax.Array:
     """Torques of dry friction in a step that `step` has taken, [dofs] Nm."""

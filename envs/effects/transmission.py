@@ -12,12 +12,16 @@ Together the joint receives
     torque + J rate / dt - R d    with    R = kp + (kd + J / dt) / dt
 
 (`_resistance`). What presses on the gears is less, since the rotor accelerates along with its link. If the
-link has the inertia M and would accelerate by a without any torque on it (`Now.carried` is J a), that is
+link has the inertia M and would accelerate by a without them, that is
 
     M / (M + J) (torque - J a + J rate / dt - R d)
 
 (`Now.link`), and decides how far o moves. The memory is the offset in rad and its rate in rad/s,
 [2, joints].
+
+Without its gears and without dry friction the link would accelerate by `Now.alone`. Dry friction stops it at MuJoCo's
+pace if it can: the acceleration is then -b v (`Now.braking`), whatever presses on the gears. Else a is `Now.alone` less
+the bound over M (`Now.mobility` is 1 / M).
 
 Friction and damping are at the joint or before the gears, at the motor (`at_motor` is that share). There they act on
 the motor's speed v + d / dt, where v is the joint's. So damping D is added to kd above and takes D v of the torque, and
@@ -65,7 +69,8 @@ def _backlash(values, signal, now, memory):
     half = 0.5 * values["rad"]
     torque, joint, motor = _shared(values, half > 0, signal)
     torque, (bound, slows), resistance = torque + now.rotor * rate / now.dt, motor, _resistance(now, motor[1])
-    pressing = torque - now.carried - slows * now.speed
+    alone = now.alone - _stopping(now.alone + now.braking * now.speed, now.mobility * joint[0])
+    pressing = torque - now.rotor * alone - slows * now.speed
     friction = _stopping(pressing + resistance * now.dt * now.speed, bound)
     following = jnp.clip(offset + (pressing - friction) / resistance, -half, half)
     inside = jnp.abs(following) < half
@@ -76,18 +81,35 @@ def _backlash(values, signal, now, memory):
 
 
 def _compliance(values, signal, now, memory):
-    """A spring of stiffness k that may harden: k o' (1 + h o'^2) = M / (M + J) (pressing - f + R (o - o'))."""
+    """A spring of stiffness k that may harden: k o' (1 + h o'^2) = M / (M + J) (pressing - f + R (o - o')).
+
+    Without the factor M / (M + J) where friction stops the link.
+    """
     offset, rate = memory
-    softness, hardening = values["nm_per_rad"] * now.link, values["hardening_per_rad2"]
+    softness, hardening = values["nm_per_rad"], values["hardening_per_rad2"]
     torque, joint, motor = _shared(values, softness > 0, signal)
     bound, slows = jnp.where(softness > 0, motor, 0.0)
     torque, resistance = torque + now.rotor * rate / now.dt - slows * now.speed, _resistance(now, slows)
-    pressing = torque - now.carried + resistance * offset
-    # Where the offset would be if the motor stood still, and the spring's torque there.
-    still = offset - now.dt * now.speed
-    wound = still * (1.0 + hardening * still**2) / jnp.maximum(softness, 1e-9)
-    friction = _stopping(pressing - resistance * still - wound, bound)
-    following = _root(1.0 + softness * resistance, hardening, softness * (pressing - friction))
+    still = offset - now.dt * now.speed  # the offset if the motor stood still
+
+    def beside(link, acceleration):
+        """Offset and friction of the motor, [2, joints], if its link accelerates by this without the spring.
+
+        The spring moves the link by `link` of what it would move a light one.
+        """
+        soft = softness * link
+        pressing = torque - now.rotor * acceleration + resistance * offset
+        wound = still * (1.0 + hardening * still**2) / jnp.maximum(soft, 1e-9)
+        friction = _stopping(pressing - resistance * still - wound, bound)
+        return jnp.stack([_root(1.0 + soft * resistance, hardening, soft * (pressing - friction)), friction])
+
+    stopped = -now.braking * now.speed
+    following, friction = beside(1.0, stopped)
+    pressing = torque - now.rotor * stopped - resistance * (following - offset) - friction
+    # What the link's friction would have to do, and can.
+    needed, most = now.alone + now.mobility * pressing - stopped, now.mobility * jnp.maximum(joint[0], 0.0)
+    sliding = beside(now.link, now.alone - jnp.clip(needed, -most, most))
+    following, friction = jnp.where(jnp.abs(needed) < most, jnp.stack([following, friction]), sliding)
     passed = torque - resistance * (following - offset) - friction
     signal = jnp.stack([passed, *joint, *jnp.where(softness > 0, 0.0, motor)])
     return signal, jnp.stack([following, (following - offset) / now.dt])

@@ -261,12 +261,16 @@ def with_rotor(rotor, friction=0.0, damping=0.0):
     return spec
 
 
-def of_two_bodies(effect, spec):
-    """That arm in MuJoCo C, its rotor a body: between it and the forearm is a joint with a range or with a spring.
-
-    What rubs, rubs at the rotor.
-    """
+def of_two_bodies(effect, spec, at_motor):
+    """That arm in MuJoCo C, its rotor a body: between it and the forearm is a joint with a range or with a spring."""
     motor = spec.joint("elbow")
+    if at_motor < 1.0:
+        # A tendon along both joints rubs as the link does.
+        link = spec.add_tendon(name="link", frictionloss=(1.0 - at_motor) * motor.frictionloss)
+        link.damping = (1.0 - at_motor) * motor.damping
+        motor.frictionloss, motor.damping = at_motor * motor.frictionloss, at_motor * motor.damping
+        for joint in ("elbow", "gears"):
+            link.wrap_joint(joint, 1.0)
     gears = motor.parent.add_joint(name="gears", axis=motor.axis, pos=motor.pos, type=motor.type)
     if effect == "backlash":
         half = 0.5 * GEARS[effect]["rad"]
@@ -309,9 +313,22 @@ def test_gears_between_a_rotor_and_a_link_are_those_of_two_bodies(effect, rotor,
     # What is read, and where the links are. The forearm has 0.013 kg m^2, so rotors are lighter or much heavier. The
     # light ones swing by 0.8 rad. For the lightest one the rig's controller acts continuously: once in a period it
     # would throw it about.
-    spec, gears = with_rotor(rotor, **rubs), GEARS[effect] | {"at_motor": float(bool(rubs))}
-    arm = rigs.Player(Rig(spec, rigs.ARM_JOINTS, rate_hz))
-    model = of_two_bodies(effect, spec)
+    arm = rigs.Player(Rig(with_rotor(rotor, **rubs), rigs.ARM_JOINTS, rate_hz))
+    play = jax.jit(lambda vector, segment: jnp.hstack(read_and_true(arm.rig, vector, segment)))
+    for at_motor in (0.0, 0.5, 1.0) if rubs else (0.0,):
+        expected, segment = pushed(arm, of_two_bodies(effect, with_rotor(rotor, **rubs), at_motor), effect, period)
+        right, wrong = (
+            np.abs(play(arm.vector(**{effect: {"elbow": gears}}), segment) - expected).max(axis=0)
+            for gears in (GEARS[effect] | {"at_motor": share} for share in (at_motor, 1.0 - at_motor))
+        )
+        assert right[:2].max() < most
+        assert right[2:].max() < (0.65 if rubs and effect == "backlash" else 1.4) * most
+        # Where it rubs makes a difference.
+        assert not rubs or at_motor == 0.5 or wrong.max() > 2.5 * right.max()
+
+
+def pushed(arm, model, effect, period):
+    """Sends the forearm there and back: motors and links [steps, joints] in MuJoCo C, and the segment for the rig."""
     data, start = mujoco.MjData(model), np.array([0.4, -0.9])
     data.qpos[:2] = start
     mujoco.mj_forward(model, data)
@@ -323,11 +340,6 @@ def test_gears_between_a_rotor_and_a_link_are_those_of_two_bodies(effect, rotor,
     target = np.tile(motor + np.array([0.1, 0.4]), (rigs.STEPS, 1))
     target[0] = motor + gravity / kp
     target[70:] = motor - np.array([0.1, 0.4])
-    segment = rigs.segment(arm.rig, motor, target, kp, kd)
-    play = jax.jit(lambda vector, segment: jnp.hstack(read_and_true(arm.rig, vector, segment)))
-    found, at_joint = (
-        np.asarray(play(arm.vector(**{effect: {"elbow": one}}), segment)) for one in (gears, GEARS[effect])
-    )
     expected = []
     for step in range(10 * rigs.STEPS):
         if step % 10 == 0:
@@ -336,11 +348,7 @@ def test_gears_between_a_rotor_and_a_link_are_those_of_two_bodies(effect, rotor,
         if step % round(period / model.opt.timestep) == 0:
             data.qfrc_applied[:2] = kp * (target[step // 10] - data.qpos[:2]) - kd * data.qvel[:2]
         mujoco.mj_step(model, data)
-    error, at_the_joint = (np.abs(one - expected).max(axis=0) for one in (found, at_joint))
-    assert error[:2].max() < most
-    # Where friction brakes a heavy rotor, its links would be twice as far off if it were taken for theirs.
-    assert error[2:].max() < (0.65 if rubs and effect == "backlash" else 1.4) * most
-    assert not rubs or at_the_joint.max() > 2.5 * error.max()
+    return np.array(expected), rigs.segment(arm.rig, motor, target, kp, kd)
 
 
 def test_rotors_without_inertia_and_motors_that_are_off_stay_with_their_links():

@@ -33,7 +33,9 @@ def now(speed=0.0, **fields):
         "damping": 0.0 * joints,
         "rotor": 0.0 * joints,
         "link": joints,
-        "carried": 0.0 * joints,
+        "mobility": 0.0 * joints,
+        "alone": 0.0 * joints,
+        "braking": 0.0 * joints,
         "body_velocity": np.zeros((JOINTS, 3), np.float32),
         "between": joints * 0.0,
     }
@@ -138,7 +140,7 @@ def test_what_is_not_there_changes_nothing(row):
         load=rng.uniform(0, 9, JOINTS),
         damping=rng.uniform(0, 1, JOINTS),
         rotor=np.full(JOINTS, 0.01, np.float32),
-        carried=rng.uniform(-1, 1, JOINTS),
+        alone=rng.uniform(-100, 100, JOINTS),
         limit=np.full(JOINTS, 0.1),  # less than the torque, which a controller without a limit of its own may have
         body_velocity=rng.uniform(-9, 9, (JOINTS, 3)),
     )
@@ -400,8 +402,7 @@ def test_a_joint_that_goes_on_without_its_motor_has_no_rotor():
     # which nobody drives, stays behind.
     row = LIBRARY["backlash"]
     values = values_of(row, rad=0.4)
-    rotor, carried = jnp.full(JOINTS, 0.01), jnp.full(JOINTS, 0.3)
-    at = now(stiffness=jnp.zeros(JOINTS), rotor=rotor, carried=carried)
+    at = now(stiffness=jnp.zeros(JOINTS), rotor=jnp.full(JOINTS, 0.01), alone=jnp.full(JOINTS, 30.0))
     (torque, *_), memory = row.act(values, jnp.zeros((5, JOINTS)), at, jnp.zeros((2, JOINTS)))
     np.testing.assert_allclose(torque, 0.3, rtol=1e-5)
     np.testing.assert_allclose(memory[1], -0.3 / 0.01 * DT, rtol=1e-5)
