@@ -14,6 +14,7 @@ Departures from the paper:
 
 - A window enters as its moments (means, spreads, covariances), since a network that sees the raw steps of a few hundred
   episodes overfits to them. BayesSim (Ramos et al., RSS 2019) likewise reads covariances of states and actions.
+  `SPMConfig.reads` has the raw steps, to compare with.
 - The answer has a sign. The paper's rule `mu + alpha q` with q in (0, 1) can only raise a parameter.
 - Guesses are drawn over the whole query box independently of the truth, the centre among them. Only then is
   p(truth > guess), as a function of the guess, one minus a distribution function, so that a sweep is a posterior.
@@ -21,6 +22,7 @@ Departures from the paper:
 """
 
 from dataclasses import dataclass
+from typing import Literal
 
 import chex
 import jax
@@ -48,6 +50,8 @@ class SPMConfig:
     """Steps in a window."""
     stride: int = 10
     """Steps from the start of one window to the next, where a set of episodes is scored."""
+    reads: Literal["moments", "steps"] = "moments"
+    """What the encoder sees of a window: its moments, or its raw steps as in the paper."""
     hidden: tuple[int, int, int] = (256, 128, 128)
     """Layer widths of the window's encoder; the guess's encoder has a quarter of them."""
     head: int = 64
@@ -104,13 +108,14 @@ class SPM:
 
     variables: dict
     steps: windows.Scaler  # scales the channels of each step
-    moments: windows.Scaler  # scales the moments of each window
+    inputs: windows.Scaler  # scales what the encoder sees of each window
     dist: ParamDist  # the distribution it was trained on
 
 
-def _read(steps: windows.Scaler, moments: windows.Scaler, window: Float[Array, "batch time channels"]):
-    """Computes the network's input: the standardised moments of each window, clipped."""
-    return moments.clipped(windows.moments(steps(window)))
+def _read(config: SPMConfig, steps: windows.Scaler, window: Float[Array, "batch time channels"]):
+    """Computes what the encoder sees of each window, [batch, inputs], before it is standardised."""
+    standardised = steps(window)
+    return windows.moments(standardised) if config.reads == "moments" else standardised.reshape(len(window), -1)
 
 
 def train(
@@ -134,15 +139,15 @@ def train(
       average over the box, so 0.55 with four guesses. A loss near that says that the episodes do not show the
       coordinates.
     """
-    key_init, key_moments, key_train = jax.random.split(key, 3)
+    key_init, key_inputs, key_train = jax.random.split(key, 3)
     trajectory, coords = devices.gather((trajectory, coords))
     truth = dists.normalise(dist, coords)
     low, high = dists.normalised_box(dist)
     steps = windows.fit_scaler(trajectory)
-    window, _ = windows.draw(key_moments, trajectory, _SCALED, config.window)
-    moments = windows.scaler(windows.moments(steps(window)))
+    window, _ = windows.draw(key_inputs, trajectory, _SCALED, config.window)
+    inputs = windows.scaler(_read(config, steps, window))
     network = _Network(config, truth.shape[-1])
-    variables = network.init(key_init, moments.mean[None], jnp.zeros((1, 1, truth.shape[-1])))
+    variables = network.init(key_init, inputs.mean[None], jnp.zeros((1, 1, truth.shape[-1])))
     schedule = optax.cosine_onecycle_schedule(config.train_steps, config.learning_rate)
     optimizer = optax.adamw(schedule, weight_decay=config.weight_decay)
 
@@ -152,13 +157,13 @@ def train(
         shape = (config.batch, config.guesses, truth.shape[-1])
         # `vote` asks about the centre, so the centre is among the guesses of every window.
         guesses = jax.random.uniform(key_guess, shape, minval=low, maxval=high).at[:, 0].set(0.0)
-        logits = network.apply(variables, _read(steps, moments, window), guesses)
+        logits = network.apply(variables, inputs.clipped(_read(config, steps, window)), guesses)
         label = truth[episode][:, None] > guesses
         # The mean over windows and guesses, summed over coordinates; what is reported is per coordinate again.
         return optax.sigmoid_binary_cross_entropy(logits, label).mean(axis=(0, 1)).sum()
 
     variables, last = descend(key_train, loss, variables, optimizer, config.train_steps)
-    return SPM(variables=variables, steps=steps, moments=moments, dist=dist), last / truth.shape[-1]
+    return SPM(variables=variables, steps=steps, inputs=inputs, dist=dist), last / truth.shape[-1]
 
 
 def logits(
@@ -183,8 +188,8 @@ def logits(
     # A broken simulation may leave nan behind, which a weight of zero would not remove.
     cut = jnp.where(valid[:, None, None], cut, spm.steps.mean)
     network = _Network(config, guesses.shape[-1])
-    moments = _read(spm.steps, spm.moments, cut)
-    answers = network.apply(spm.variables, moments, jnp.broadcast_to(guesses, (len(cut), *guesses.shape)))
+    inputs = spm.inputs.clipped(_read(config, spm.steps, cut))
+    answers = network.apply(spm.variables, inputs, jnp.broadcast_to(guesses, (len(cut), *guesses.shape)))
     return _masked_mean(answers, valid)
 
 

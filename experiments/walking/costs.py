@@ -3,6 +3,7 @@
 `experiments.bench` prints all four.
 """
 
+import dataclasses
 import gc
 import os
 import time
@@ -28,6 +29,7 @@ from jaxtune.mjx import parameters
 
 _STEPS = 50  # in which the speed of MuJoCo C is measured
 _SETTLED = 5  # tunings after which memory should be flat
+_MODELS = 5  # search-parameter models whose mean is compared with one
 _TIMES = 3  # runs of a program, of which the fastest counts
 
 
@@ -162,12 +164,24 @@ def estimates(sizes: Preset, policy: str, radius: float, seeds: Sequence[int]) -
     machine, config = learner.tuner(), sizes.tuner
     dist = learner.dist(parameters.nominal(learner.entries), radius)
     start = starting_policy(policy, learner)
-    fit_spm = lambda key, data: spm.train(key, config.spm, data.trajectory, data.sampled_coords, dist)[0]  # noqa: E731
-    regress = lambda key, data: regression.train(  # noqa: E731
-        config.regression, data.trajectory, data.sampled_coords, dist
-    )
+
+    def fit(sizes, key, data):
+        return spm.train(key, sizes, data.trajectory, data.sampled_coords, dist)[0]
+
+    def fit_several(key, data):
+        return jax.lax.map(lambda key: fit(config.spm, key, data), jax.random.split(key, _MODELS))
+
+    def mean_estimate(models, measured):
+        return jax.vmap(partial(spm.estimate, config.spm), (0, None))(models, measured).mean(axis=0)
+
+    def regress(key, data):
+        return regression.train(config.regression, data.trajectory, data.sampled_coords, dist)
+
+    raw = dataclasses.replace(config.spm, reads="steps")
     methods = {
-        "search-parameter model": (fit_spm, partial(spm.estimate, config.spm)),
+        "search-parameter model": (partial(fit, config.spm), partial(spm.estimate, config.spm)),
+        "search-parameter model of raw steps": (partial(fit, raw), partial(spm.estimate, raw)),
+        f"{_MODELS} search-parameter models, mean": (fit_several, mean_estimate),
         "regression": (regress, partial(regression.estimate, config.regression)),
     }
     collect = _compiled(lambda key: machine.collect(key, start, dist))
@@ -176,8 +190,8 @@ def estimates(sizes: Preset, policy: str, radius: float, seeds: Sequence[int]) -
         key_collect, key_fit = jax.random.split(jax.random.PRNGKey(seed))
         data = collect(key_collect)
         truth = np.asarray(dists.normalise(dist, data.held_out_coords))
-        for name, (fit, answer) in methods.items():
-            model, seconds = _timed(fit, (key_fit, data))
+        for name, (train, answer) in methods.items():
+            model, seconds = _timed(train, (key_fit, data))
             every = _compiled(
                 lambda model, sets, answer=answer: devices.in_chunks(answer, (sets,), rules.SETS, shared=(model,))
             )

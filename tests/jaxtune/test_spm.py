@@ -1,3 +1,4 @@
+import dataclasses
 import functools
 
 import jax
@@ -61,6 +62,15 @@ def test_vote_points_to_the_truth_of_each_parameter_alone(vote, name, index):
 @pytest.mark.parametrize("mass", [-0.7, 0.0, 0.7])
 def test_estimate_is_the_truth(estimate, friction, mass):
     np.testing.assert_allclose(estimate(measured(friction=friction, mass=mass))[FRICTION:], [friction, mass], atol=0.2)
+
+
+def test_a_model_reads_raw_steps_as_well(simulated):
+    config = dataclasses.replace(CONFIG, reads="steps")
+    model, _ = toys.train_spm(jax.random.key(2), config, *simulated)
+    estimate = jax.jit(lambda measured: spm.estimate(config, model, measured))
+    for mass in (-0.7, 0.7):
+        np.testing.assert_allclose(estimate(measured(mass=mass))[MASS], mass, atol=0.3)
+    assert len(model.inputs.mean) == CONFIG.window * len(model.steps.mean)
 
 
 def test_estimate_of_a_truth_outside_is_the_edge_of_the_box(estimate):
@@ -145,7 +155,7 @@ def with_logits(monkeypatch, curve):
     bounds = {"a": jnp.float32(-1), "b": jnp.float32(-1)}, {"a": jnp.float32(1), "b": jnp.float32(1)}
     dist = dists.make({"a": jnp.float32(0), "b": jnp.float32(0.75)}, 0.5, *bounds)
     scaler = windows.Scaler(mean=jnp.zeros(3), std=jnp.ones(3), varies=jnp.ones(3, bool))
-    return SPM(variables={}, steps=scaler, moments=scaler, dist=dist)
+    return SPM(variables={}, steps=scaler, inputs=scaler, dist=dist)
 
 
 @pytest.mark.parametrize("truth", [(-0.83, 0.41), (0.0, 0.0), (0.999, -0.999)])
