@@ -182,8 +182,11 @@ def _facts_as_meta(log: Log) -> dict:
 
 def _run(path: Path, meta: Meta, needed: str) -> tuple[Run, list[str]]:
     """Reads a run, and notes about what was made of it."""
-    columns, notes = read_bag(path, meta.columns) if is_bag(path) else (READERS[path.suffix](path), [])
-    # All columns are checked, also those that the format does not know: a NaN in any of them means a damaged file.
+    columns, notes = read_bag(path, meta.columns) if is_bag(path) else (READERS[path.suffix](path, meta.uses), [])
+    for name in [name for name in columns if not meta.uses(name)]:
+        if columns[name] is None or not np.isfinite(columns[name]).all():
+            del columns[name]
+            notes.append(f"{path.stem}: column '{name}' was left out: it is not known, and not all finite numbers")
     for name, values in columns.items():
         refuse_first(path, name, values, ~np.isfinite(values), "a finite number")
     columns = _rename(path, columns, meta)

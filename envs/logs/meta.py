@@ -19,6 +19,7 @@ from envs.logs.format import (
     FACTS,
     JOINT_SIGNALS,
     MEASURED,
+    OBSERVATION,
     SCALAR_SIGNALS,
     SPLITS,
     VECTOR_SIGNALS,
@@ -131,6 +132,12 @@ class Meta:
         runs = meta.get("runs")
         names = dict.fromkeys(runs if isinstance(runs, dict) else ())
         self.runs = {name: self._read_run(name, entry) for name, entry in self._mapping("runs", runs, names).items()}
+
+    def uses(self, name: str) -> bool:
+        """Says whether a column of a run's file is read, or would be if its name were not misspelt."""
+        signal = name.partition(".")[0].casefold()
+        ours = ("t", OBSERVATION, *JOINT_SIGNALS, *VECTOR_SIGNALS, *SCALAR_SIGNALS)
+        return signal in ours or name in self.columns.values()
 
     def _read_convention(self, meta: Mapping[str, Any], movable: Mapping[str, bool] | None) -> Convention:
         sign = self._mapping("sign", meta.get("sign"), dict.fromkeys(self.joints))

@@ -1,10 +1,10 @@
 """Reads and writes tables of numbers (CSV, NPZ, Parquet); refuses a bad cell with its file, row and column.
 
-Rows are counted from 1, without the header.
+Rows are counted from 1, without the header. Columns that nobody uses may hold what they like.
 """
 
 import csv
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -84,7 +84,7 @@ def _cells(path: Path) -> int:
     return int(counts[0] + counts[1:].max())
 
 
-def _read_csv(path: Path) -> dict[str, np.ndarray]:
+def _read_csv(path: Path, used: Callable[[str], bool]) -> dict[str, np.ndarray | None]:
     try:
         check_size(path, _CELL_BYTES // _SHORTEST_CELL * path.stat().st_size)
     except TooLarge:
@@ -99,23 +99,39 @@ def _read_csv(path: Path) -> dict[str, np.ndarray]:
             raise ValueError(f"{path}, column '{name}': expected a name that is there once")
     if not names:
         raise ValueError(f"{path}: is empty")
-    # No text counts as a missing value, so that an empty cell or "NA" is refused instead of becoming a NaN.
-    options = pyarrow.csv.ConvertOptions(
-        column_types=dict.fromkeys(names, pyarrow.float64()), null_values=[], strings_can_be_null=False
-    )
+    types = dict.fromkeys(names, pyarrow.float64())
     try:
-        # An empty line is a row without cells, which is refused too.
-        parse = pyarrow.csv.ParseOptions(ignore_empty_lines=False)
-        table = pyarrow.csv.read_csv(path, convert_options=options, parse_options=parse)
+        return {name: values.to_numpy() for name, values in _parse_csv(path, types).items()}
+    except pyarrow.ArrowInvalid:
+        types |= {name: pyarrow.string() for name in names if not used(name)}
+    try:
+        return {name: _numbers(values) for name, values in _parse_csv(path, types).items()}
     except pyarrow.ArrowInvalid as error:
         # Arrow's message does not name row and column.
-        return _read_csv_by_row(path, names, error)
-    return {name: table[name].to_numpy() for name in names}
+        return _read_csv_by_row(path, names, used, error)
 
 
-def _read_csv_by_row(path: Path, names: list[str], error: Exception) -> dict[str, np.ndarray]:
+def _parse_csv(path: Path, types: dict[str, pyarrow.DataType]) -> dict[str, pyarrow.ChunkedArray]:
+    # No text counts as a missing value, so that an empty cell or "NA" is refused instead of becoming a NaN.
+    options = pyarrow.csv.ConvertOptions(column_types=types, null_values=[], strings_can_be_null=False)
+    # An empty line is a row without cells, which is refused too.
+    parse = pyarrow.csv.ParseOptions(ignore_empty_lines=False)
+    table = pyarrow.csv.read_csv(path, convert_options=options, parse_options=parse)
+    return {name: table[name] for name in types}
+
+
+def _numbers(values: pyarrow.ChunkedArray) -> np.ndarray | None:
+    try:
+        return values.cast(pyarrow.float64()).to_numpy()
+    except pyarrow.ArrowInvalid:
+        return None
+
+
+def _read_csv_by_row(
+    path: Path, names: list[str], used: Callable[[str], bool], error: Exception
+) -> dict[str, np.ndarray | None]:
     """Reads a CSV row by row, slowly, to find the row and column of an error."""
-    rows = []
+    read, rows = [index for index, name in enumerate(names) if used(name)], []
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
             reader = csv.reader(file, strict=True)
@@ -125,11 +141,11 @@ def _read_csv_by_row(path: Path, names: list[str], error: Exception) -> dict[str
                     raise ValueError(
                         f"{path}, row {len(rows) + 1}: got {len(cells)} cells, expected {len(names)}"
                     ) from error
-                rows.append([_cell(path, len(rows) + 1, *pair) for pair in zip(names, cells, strict=True)])
+                rows.append([_cell(path, len(rows) + 1, names[index], cells[index]) for index in read])
     except (UnicodeDecodeError, csv.Error) as worse:
         raise ValueError(f"{path}, row {len(rows) + 1}: {worse}") from worse
-    table = np.array(rows, float).reshape(len(rows), len(names))
-    return dict(zip(names, table.T, strict=True))
+    table = np.array(rows, float).reshape(len(rows), len(read))
+    return dict.fromkeys(names) | {names[index]: values for index, values in zip(read, table.T, strict=True)}
 
 
 def _cell(path: Path, row: int, name: str, text: str) -> float:
@@ -141,7 +157,7 @@ def _cell(path: Path, row: int, name: str, text: str) -> float:
         raise ValueError(f"{path}, row {row}, column '{name}': got '{text}', expected a number") from None
 
 
-def _read_npz(path: Path) -> dict[str, np.ndarray]:
+def _read_npz(path: Path, used: Callable[[str], bool]) -> dict[str, np.ndarray | None]:
     check_archive(path)
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
@@ -152,21 +168,25 @@ def _read_npz(path: Path) -> dict[str, np.ndarray]:
     if isinstance(observation, np.ndarray) and observation.ndim == 2:
         del columns["obs"]
         columns |= {f"obs.{number}": values for number, values in enumerate(observation.T)}
+    rows, found = None, {}
     for name, values in columns.items():
         # NumPy returns members of an archive that are not arrays as bytes.
         if not isinstance(values, np.ndarray):
-            raise ValueError(f"{path}, column '{name}': got {type(values).__name__}, expected an array")
-        if values.ndim != 1 or values.dtype.kind not in "fiub":
-            raise ValueError(
-                f"{path}, column '{name}': got shape {values.shape} of {values.dtype}, expected one row of numbers"
-            )
-        expected = len(next(iter(columns.values())))
-        if len(values) != expected:
-            raise ValueError(f"{path}, column '{name}': got {len(values)} rows, expected {expected}")
-    return {name: values.astype(float) for name, values in columns.items()}
+            wrong = f"got {type(values).__name__}, expected an array"
+        elif values.ndim != 1 or values.dtype.kind not in "fiub":
+            wrong = f"got shape {values.shape} of {values.dtype}, expected one row of numbers"
+        elif rows not in (None, len(values)):
+            wrong = f"got {len(values)} rows, expected {rows}"
+        else:
+            wrong = None
+            rows = len(values) if used(name) else rows
+        if wrong and used(name):
+            raise ValueError(f"{path}, column '{name}': {wrong}")
+        found[name] = None if wrong else values.astype(float)
+    return {name: None if values is None or len(values) != rows else values for name, values in found.items()}
 
 
-def _read_parquet(path: Path) -> dict[str, np.ndarray]:
+def _read_parquet(path: Path, used: Callable[[str], bool]) -> dict[str, np.ndarray | None]:
     try:
         # What a table holds stands in its footer; the pages of a column of equal values are tiny.
         held = pyarrow.parquet.read_metadata(path)
@@ -184,13 +204,13 @@ def _read_parquet(path: Path) -> dict[str, np.ndarray]:
     for name, values in zip(table.column_names, table.columns, strict=True):
         if not name or name in columns:
             raise ValueError(f"{path}, column '{name}': expected a name that is there once")
-        kind = values.type
-        if not any(is_a(kind) for is_a in _NUMBERS):
-            raise ValueError(f"{path}, column '{name}': got {kind}, expected numbers")
-        if values.null_count:
+        numbers = any(is_a(values.type) for is_a in _NUMBERS)
+        if used(name) and not numbers:
+            raise ValueError(f"{path}, column '{name}': got {values.type}, expected numbers")
+        if used(name) and values.null_count:
             row = int(np.argmax(values.is_null().to_numpy()))
             raise ValueError(f"{path}, row {row + 1}, column '{name}': is empty, expected a number")
-        columns[name] = values.to_numpy().astype(float)
+        columns[name] = values.to_numpy().astype(float) if numbers and not values.null_count else None
     return columns
 
 
@@ -208,6 +228,7 @@ def _write_parquet(path: Path, columns: Mapping[str, np.ndarray]) -> None:
 
 _NUMBERS = (pyarrow.types.is_floating, pyarrow.types.is_integer, pyarrow.types.is_boolean)
 READERS = {".csv": _read_csv, ".npz": _read_npz, ".parquet": _read_parquet}
-"""Readers by suffix: from a path to columns [rows] by name."""
+"""Readers by suffix: from a path, and a function that says whether a column of that name is used, to columns [rows] by
+name. A column that is not used is None where it is not all numbers."""
 WRITERS = {".csv": _write_csv, ".npz": _write_npz, ".parquet": _write_parquet}
 """Writers by suffix: of columns [rows] by name to a path."""
