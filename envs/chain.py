@@ -42,7 +42,8 @@ class Now:
     link: jax.Array  # [joints] share of the joint's inertia that is not the rotor's
     mobility: jax.Array  # [joints] 1/(kg m^2), the inverse of the link's part of the joint's inertia
     alone: jax.Array  # [joints] rad/s^2, acceleration of the link without the torque of its gears and its dry friction
-    braking: jax.Array  # [joints] 1/s, the pace at which dry friction stops a joint that it can stop
+    stopped: jax.Array  # [joints] rad/s^2, acceleration of a joint that dry friction can stop
+    rigid: jax.Array  # [joints] share of dry friction that is not of bristles
     body_velocity: jax.Array  # [bodies, 3] m/s of the centres of mass
     between: jax.Array  # [joints] rad, how far targets are from the held ones if they move on between rows
 
@@ -63,9 +64,8 @@ class Chain:
 
     - `values` holds [places] by effect and parameter, in the form that effects read. Zero means no effect.
     - `memory` is a dictionary: what each effect remembers, by its name, `held`, the controller's last torque, `passed`,
-      the motors' torque on the joints in the last step, less what rubs at the motors (in a history: all of it),
-      `rubbed`, the torque of the links' dry friction in it, and `within`, the share of its gains with which the
-      controller acted within it.
+      the torque of motors and of dry friction on the joints in the last step, less what bristles rub at links (in a
+      history: the motors' torque), and `within`, the share of its gains with which the controller acted within it.
     - `x` holds the controller's inputs of one step, [joints] each: `target` rad, `feed` Nm (torque sent directly),
       `stiffness` Nm/rad, `damping` Nm s/rad, `limit` Nm, `emf` Nm s/rad (back electromotive force, not limited), and
       `sample`, a scalar that is true where the controller reads the joint anew.
@@ -125,7 +125,7 @@ class Chain:
         torque = torque - x["emf"] * motor[1]
         # Measured motion winds up the bristles as simulated motion does.
         _, memory = self.stage("bristle", values, jnp.zeros_like(motor), self._now(x, motor), memory)
-        return memory | {"passed": torque, "rubbed": jnp.zeros_like(torque)}, torque
+        return memory | {"passed": torque}, torque
 
     def follow(self, model: mjx.Model, data: mjx.Data, memory: dict, values, motor, torque, x) -> tuple[mjx.Data, dict]:
         """Simulates one step of links whose motors moved as measured: what gears that give way make of that motion.
@@ -192,6 +192,8 @@ class Chain:
         # Effects of friction and of forces from outside have no memory, but bristles have.
         friction, _ = self.stage("friction", values, model.dof_frictionloss[self.dof], now, memory)
         none = jnp.zeros_like(torque)
+        (left, _), _ = self.stage("bristle", values, jnp.stack([friction, none]), now, memory)
+        now = now.replace(rigid=left / jnp.maximum(friction, MIN_FRICTION_NM))
         signal = jnp.stack([torque, friction, model.dof_damping[self.dof], none, none])
         (passed, friction, damping, rubs, slows), memory = self.stage("transmission", values, signal, now, memory)
         share, friction, damping = rubs / jnp.maximum(friction + rubs, 1e-9), friction + rubs, damping + slows
@@ -212,8 +214,8 @@ class Chain:
         )
         data = stepping.step(moved, data)
         # Motor and link may rub as one. What that takes of the motor's torque does not come from the link.
-        rubbed = stepping.dry_friction(data)[self.dof] + rubbing - wrench.torque
-        memory |= {"passed": passed + share * rubbed - slows * joint[1], "rubbed": (1.0 - share) * rubbed}
+        memory["passed"] = passed - slows * joint[1] + share * (rubbing - wrench.torque)
+        memory["passed"] += stepping.dry_friction(data)[self.dof]
         return data, memory, torque
 
     def _rotors_and_links(self, model, data, memory) -> dict:
@@ -224,13 +226,13 @@ class Chain:
         # Less what gears and friction gave in the step before. Else a rotor would expect the blow of the moment in
         # which it met its link to go on, and leave it again; and a link that its friction has just stopped to turn
         # back.
-        given = memory["passed"] - rotor * acceleration + memory["rubbed"]
+        given = memory["passed"] - rotor * acceleration
         return {
             "rotor": rotor,
             "link": link,
             "mobility": mobility,
             "alone": acceleration - given * mobility,
-            "braking": stepping.braking(model)[self.dof],
+            "stopped": stepping.stopped(model, data)[self.dof],
         }
 
     def read(self, values, memory: dict, joint: jax.Array, x) -> jax.Array:
@@ -303,8 +305,7 @@ class Chain:
         signals = {"sensor": state, "torque": torque, "transmission": torque[None]}
         signals["bristle"] = state[:1] if past is None else past
         signals["command"] = x["target"][None] if past_target is None else past_target
-        none = jnp.zeros_like(torque)
-        memory = {"held": torque, "passed": torque, "rubbed": none, "within": none}
+        memory = {"held": torque, "passed": torque, "within": jnp.zeros_like(torque)}
         for stage, signal in signals.items():
             for row in self.entering(stage):
                 if row.start is not None:
@@ -371,7 +372,8 @@ class Chain:
             link=none + 1.0,
             mobility=none,
             alone=none,
-            braking=none,
+            stopped=none,
+            rigid=none + 1.0,
             body_velocity=jnp.zeros((len(self.bodies), 3)),
             between=x["between"],
         )

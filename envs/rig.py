@@ -348,10 +348,10 @@ class Rig:
         pressing = torque - model.dof_armature[self.dof] * acceleration[:before]
         first = first | chain.pressed(values, pressing[: round(_PRESSED_S / self.dt)])
 
-        def at(index, memory, speeding):
+        def at(index, data, memory, speeding):
             """The robot at a step of the history, with accelerations [joints]; encoders sit on the motors."""
             state = truth[index] - chain.ahead(memory)
-            return self._data.replace(
+            return data.replace(
                 qpos=self._data.qpos.at[self.qpos].set(state[0] + chain.lead_s * state[1]),
                 qvel=self._data.qvel.at[self.dof].set(state[1]),
                 # The chain's first step needs an acceleration, for the rotors' torque.
@@ -366,12 +366,12 @@ class Rig:
             rates = {name: rate + self.dt / _RATE_S * (memory[name][1] - rate) for name, rate in rates.items()}
             return data, memory, rates
 
-        begun = at(0, first, acceleration[0]), first, {name: first[name][1] for name in gears}
+        begun = at(0, self._data, first, acceleration[0]), first, {name: first[name][1] for name in gears}
         data, followed, rates = jax.lax.fori_loop(jnp.where(gives.any(), 0, before), before, follow, begun)
         rows = (row.name for row in chain.rows if row.enters in _FOLLOWED and row.start is not None)
-        for name in ("passed", "rubbed", "within", *rows):
+        for name in ("passed", "within", *rows):
             memory[name] = jnp.where(gives, followed[name], memory[name])
         for name in gears:
             memory[name] = memory[name].at[1].add(chain.light(model) * (rates[name] - memory[name][1]))
-        data = at(before, memory, jnp.where(gives, data.qacc[self.dof], acceleration[before]))
+        data = at(before, data, memory, jnp.where(gives, data.qacc[self.dof], acceleration[before]))
         return data, memory, future

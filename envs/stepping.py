@@ -95,11 +95,15 @@ def solve(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     return data.replace(qacc=found, qfrc_constraint=jacobian.T @ force, _impl=rows.replace(efc_force=force))
 
 
-def braking(model: mjx.Model) -> jax.Array:
-    """Paces at which dry friction stops joints, [dofs] 1/s (mujoco.readthedocs.io: "Modeling", "Solver parameters")."""
-    time, damping = model.dof_solref[:, 0], model.dof_solref[:, 1]
-    pace = 2.0 / jnp.maximum(time, 2.0 * model.opt.timestep)
-    return jnp.where(time > 0, pace, -damping) / model.dof_solimp[:, 1]
+def stopped(model: mjx.Model, data: mjx.Data) -> jax.Array:
+    """Computes how joints accelerate that dry friction can stop, [dofs] rad/s^2.
+
+    MuJoCo's friction stops a joint exponentially, and lets it creep under a load (mujoco.readthedocs.io, "Modeling",
+    "Solver parameters"; the load is that of the step that `step` has taken last).
+    """
+    (time, damping), (least, most) = model.dof_solref.T, model.dof_solimp.T[:2]
+    pace = jnp.where(time > 0, 2.0 / jnp.maximum(time, 2.0 * model.opt.timestep), -damping) / most
+    return -pace * data.qvel - (1.0 - least) / least * model.dof_invweight0 * dry_friction(data)
 
 
 @devices.precisely

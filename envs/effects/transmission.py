@@ -19,9 +19,9 @@ link has the inertia M and would accelerate by a without them, that is
 (`Now.link`), and decides how far o moves. The memory is the offset in rad and its rate in rad/s,
 [2, joints].
 
-Without its gears and without dry friction the link would accelerate by `Now.alone`. Dry friction stops it at MuJoCo's
-pace if it can: the acceleration is then -b v (`Now.braking`), whatever presses on the gears. Else a is `Now.alone` less
-the bound over M (`Now.mobility` is 1 / M).
+Without its gears and without dry friction the link would accelerate by `Now.alone`. If dry friction can stop it, its
+acceleration is `Now.stopped`, whatever presses on the gears. Else a is `Now.alone` less the bound over M, which is one
+over `Now.mobility`. Bristles follow the joint's speed from step to step, so their torque is in `Now.alone`.
 
 Friction and damping are at the joint or before the gears, at the motor (`at_motor` is that share). There they act on
 the motor's speed v + d / dt, where v is the joint's. So damping D is added to kd above and takes D v of the torque, and
@@ -69,7 +69,7 @@ def _backlash(values, signal, now, memory):
     half = 0.5 * values["rad"]
     torque, joint, motor = _shared(values, half > 0, signal)
     torque, (bound, slows), resistance = torque + now.rotor * rate / now.dt, motor, _resistance(now, motor[1])
-    alone = now.alone - _stopping(now.alone + now.braking * now.speed, now.mobility * joint[0])
+    alone = now.alone - _stopping(now.alone - now.stopped, now.mobility * now.rigid * joint[0])
     pressing = torque - now.rotor * alone - slows * now.speed
     friction = _stopping(pressing + resistance * now.dt * now.speed, bound)
     following = jnp.clip(offset + (pressing - friction) / resistance, -half, half)
@@ -103,11 +103,11 @@ def _compliance(values, signal, now, memory):
         friction = _stopping(pressing - resistance * still - wound, bound)
         return jnp.stack([_root(1.0 + soft * resistance, hardening, soft * (pressing - friction)), friction])
 
-    stopped = -now.braking * now.speed
-    following, friction = beside(1.0, stopped)
-    pressing = torque - now.rotor * stopped - resistance * (following - offset) - friction
+    following, friction = beside(1.0, now.stopped)
+    pressing = torque - now.rotor * now.stopped - resistance * (following - offset) - friction
     # What the link's friction would have to do, and can.
-    needed, most = now.alone + now.mobility * pressing - stopped, now.mobility * jnp.maximum(joint[0], 0.0)
+    needed = now.alone + now.mobility * pressing - now.stopped
+    most = now.mobility * now.rigid * jnp.maximum(joint[0], 0.0)
     sliding = beside(now.link, now.alone - jnp.clip(needed, -most, most))
     following, friction = jnp.where(jnp.abs(needed) < most, jnp.stack([following, friction]), sliding)
     passed = torque - resistance * (following - offset) - friction

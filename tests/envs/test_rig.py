@@ -327,8 +327,35 @@ def test_gears_between_a_rotor_and_a_link_are_those_of_two_bodies(effect, rotor,
         assert not rubs or at_motor == 0.5 or wrong.max() > 2.5 * right.max()
 
 
-def pushed(arm, model, effect, period):
-    """Sends the forearm there and back: motors and links [steps, joints] in MuJoCo C, and the segment for the rig."""
+@pytest.mark.parametrize("effect", GEARS)
+def test_bristles_of_a_link_behind_its_gears_rub_as_those_of_two_bodies(effect):
+    arm = rigs.Player(Rig(with_rotor(0.2, friction=1.0), rigs.ARM_JOINTS, 200.0))
+    play = jax.jit(lambda vector, segment: jnp.hstack(read_and_true(arm.rig, vector, segment)))
+    wound = 0.0
+
+    def bristles(speed):
+        nonlocal wound
+        wound = np.clip(wound + 1e-4 * speed / 0.05, -1.0, 1.0)
+        return -wound
+
+    expected, segment = pushed(arm, of_two_bodies(effect, with_rotor(0.2), 0.0), effect, 5e-3, rub=bristles)
+    effects = {effect: {"elbow": GEARS[effect]}, "presliding": {"elbow": {"travel_rad": 0.05}}}
+    assert np.abs(play(arm.vector(**effects), segment) - expected).max() < 5e-3
+
+
+def pushed(arm, model, effect, period, rub=lambda speed: 0.0):
+    """Sends the forearm there and back.
+
+    Args:
+      arm: on the rig.
+      model: of two bodies, for MuJoCo C.
+      effect: of its gears.
+      period: of the controller in s.
+      rub: torque on the link in Nm at its speed in rad/s, beside the friction of the model.
+
+    Returns:
+      Motors and links [steps, joints] in MuJoCo C, and the segment for the rig.
+    """
     data, start = mujoco.MjData(model), np.array([0.4, -0.9])
     data.qpos[:2] = start
     mujoco.mj_forward(model, data)
@@ -346,7 +373,8 @@ def pushed(arm, model, effect, period):
             shoulder, elbow, ahead = data.qpos
             expected.append([shoulder, elbow, shoulder, elbow + ahead])
         if step % round(period / model.opt.timestep) == 0:
-            data.qfrc_applied[:2] = kp * (target[step // 10] - data.qpos[:2]) - kd * data.qvel[:2]
+            torque = kp * (target[step // 10] - data.qpos[:2]) - kd * data.qvel[:2]
+        data.qfrc_applied[:] = np.array([*torque, 0.0]) + rub(data.qvel[1] + data.qvel[2]) * np.array([0.0, 1.0, 1.0])
         mujoco.mj_step(model, data)
     return np.array(expected), rigs.segment(arm.rig, motor, target, kp, kd)
 

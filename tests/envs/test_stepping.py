@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from mujoco import mjx
 
-from envs.stepping import step
+from envs.stepping import step, stopped
 
 _ARM = """
 <mujoco>
@@ -86,3 +86,30 @@ def test_half_a_second_is_that_of_a_solver_that_has_converged(torque):
     end = jax.jit(lambda one: jax.lax.fori_loop(0, 500, lambda _, one: step(device, one), one))(start)
     np.testing.assert_allclose(end.qpos, data.qpos, atol=2e-4)
     assert (abs(data.qpos[0]) > 0.01) == (torque > 1)
+
+
+def test_friction_stops_joints_at_the_pace_that_is_foretold():
+    # Thrown against its friction, which holds it against gravity: first it brakes, at last it creeps.
+    model = converged("""
+    <mujoco>
+      <option timestep="0.001"/>
+      <worldbody>
+        <body>
+          <joint axis="0 1 0" armature="0.01" frictionloss="9"/>
+          <geom type="capsule" size="0.03" fromto="0 0 0 0 0 -0.3" mass="1.2"/>
+        </body>
+      </worldbody>
+    </mujoco>
+    """)
+    model.opt.iterations = 6
+    device = mjx.put_model(model)
+    data = mjx.make_data(device).replace(qpos=jnp.array([0.9]), qvel=jnp.array([0.1]))
+    advance, accelerations = jax.jit(step), []
+    for _ in range(300):
+        before = stopped(device, data)
+        data = advance(device, data)
+        accelerations.append((before[0], data.qacc[0]))
+    foretold, found = np.array(accelerations)[1:].T  # the first step has no load of one before
+    np.testing.assert_allclose(foretold, found, rtol=0.02, atol=0.02)
+    assert found[0] < -5.0
+    assert abs(found[-1]) < 1e-2 < 100.0 * abs(data.qvel[0])

@@ -35,7 +35,8 @@ def now(speed=0.0, **fields):
         "link": joints,
         "mobility": 0.0 * joints,
         "alone": 0.0 * joints,
-        "braking": 0.0 * joints,
+        "stopped": 0.0 * joints,
+        "rigid": joints,
         "body_velocity": np.zeros((JOINTS, 3), np.float32),
         "between": joints * 0.0,
     }
@@ -406,6 +407,23 @@ def test_a_joint_that_goes_on_without_its_motor_has_no_rotor():
     (torque, *_), memory = row.act(values, jnp.zeros((5, JOINTS)), at, jnp.zeros((2, JOINTS)))
     np.testing.assert_allclose(torque, 0.3, rtol=1e-5)
     np.testing.assert_allclose(memory[1], -0.3 / 0.01 * DT, rtol=1e-5)
+
+
+@pytest.mark.parametrize(("bound", "rate"), [(1.0, 0.0), (0.4, -10.0)])
+def test_a_motor_stays_beside_a_link_that_friction_holds(bound, rate):
+    # Gravity would accelerate the link of 0.02 kg m^2 by 30 rad/s^2. It creeps under that load, without acceleration.
+    row = LIBRARY["backlash"]
+    free = jnp.full(JOINTS, 30.0)
+    at = now(
+        speed=0.05,
+        stiffness=jnp.zeros(JOINTS),
+        rotor=jnp.full(JOINTS, 0.01),
+        alone=free,
+        mobility=jnp.full(JOINTS, 50.0),
+    )
+    signal = jnp.zeros((5, JOINTS)).at[1].set(bound)
+    _, memory = row.act(values_of(row, rad=0.4), signal, at, jnp.zeros((2, JOINTS)))
+    np.testing.assert_allclose(memory[1], rate * DT, atol=1e-6)
 
 
 def test_a_spring_winds_up_by_torque_over_stiffness():
