@@ -153,7 +153,7 @@ class Bench(Benchmark):
         """
         sealed = self.truth_path(case)
         folder = self.out / "logs" / sealed.stem
-        if not sealed.exists():
+        if not (sealed.exists() and (folder / "log").exists()):
             truth, severity = self.truth(case)
             log = self.record(truth, self.seed(case))
             shutil.rmtree(folder, ignore_errors=True)

@@ -25,6 +25,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from jax.extend.core import Literal
 from jax.tree_util import Partial
 from mujoco import mjx
 
@@ -41,8 +42,26 @@ Act = Callable[[Any, Any, jax.Array], jax.Array]
 """A policy: `(policy, observation of one environment, key) -> action [act]`. The policy is a pytree of arrays."""
 _EXPLODED = 1e8  # an observation in whatever unit
 _DATA = ("data", "pipeline_state")
+_AT_RESET = {"qpos0", "key_qpos", "key_qvel"}  # fields that a robot may feel at the start of an episode alone
 WithModel = Callable[[Any, mjx.Model], Any]
 """`(env, model) -> env`: a copy of an environment that simulates this model."""
+
+
+def _reaching(function: Callable, inputs: Params, *others: Any) -> set[str]:
+    """Names of the inputs that any output of a function may depend on, by its equations; nothing is computed.
+
+    An equation that calls a program counts as one: all that goes in reaches all that comes out.
+    """
+    jaxpr = jax.make_jaxpr(function)(inputs, *others).jaxpr
+    reach = {var: {name} for var, name in zip(jaxpr.invars, sorted(inputs), strict=False)}
+
+    def of(variables) -> set[str]:
+        return set().union(*(reach.get(var, ()) for var in variables if not isinstance(var, Literal)))
+
+    for equation in jaxpr.eqns:
+        if names := of(equation.invars):
+            reach |= dict.fromkeys(equation.outvars, names)
+    return of(jaxpr.outvars)
 
 
 def with_model(env: Any, model: mjx.Model) -> Any:
@@ -111,6 +130,7 @@ class Simulator:
         self._check_delay()
         self._check_reach()
         self._check_reset()
+        self._check_influence()
 
     def _check_warp(self) -> None:
         """Checks that robots that Warp simulates side by side may differ in what the table changes."""
@@ -172,6 +192,19 @@ class Simulator:
                 f"{' and '.join(map(str, others))}, expected those of one robot: [obs], () and ()"
             )
         self.layout  # noqa: B018  names what is wrong with `observe`
+
+    def _check_influence(self) -> None:
+        """Checks that every parameter reaches the step of the environment, which may simulate another model."""
+        nominal = parameters.nominal(self.parameters)
+        start = jax.eval_shape(self.reset, nominal, jax.random.PRNGKey(0))
+        action = jax.ShapeDtypeStruct((self.action_size,), jnp.float32)
+        reach = _reaching(lambda *args: self.move(*args)[0], nominal, start, action)
+        for name, entry in self.parameters.items():
+            if name not in reach and not set(entry.field_names) <= _AT_RESET:
+                raise ValueError(
+                    f"parameter '{name}': got an environment whose step does not depend on it; expected with_model= "
+                    "that gives another model to what simulates, or other fields"
+                )
 
     @property
     def entries(self) -> Mapping[str, Entry]:

@@ -207,7 +207,7 @@ def write_case(case: FieldCase, error: float, seed: int, out: Path) -> Path:
     """
     name = f"case_{case.number:03d}"
     folder, sealed = out / "logs" / name / "log", out / "sealed" / f"{name}.json"
-    if sealed.exists():
+    if sealed.exists() and folder.exists():
         return folder
     scene, placed, trace = prepared(case, error, seed)
     rng = np.random.default_rng((seed, case.number, 99))

@@ -111,13 +111,12 @@ def test_a_step_that_is_not_finite_is_counted_and_masked(sim):
 
 
 def test_a_step_that_explodes_is_not_finite():
-    def step(state, action):
-        state = Sled.step(env, state, action)
-        return dataclasses.replace(state, obs=jnp.where(state.data.time > 0.3, 1e12, state.obs))
+    class Explosive(Sled):
+        def step(self, state, action):
+            state = super().step(state, action)
+            return dataclasses.replace(state, obs=jnp.where(state.data.time > 0.3, 1e12, state.obs))
 
-    env = Sled()
-    env.step = step
-    episodes = rollout(Simulator(env, steps=STEPS, parameters=TABLE), 7, act, 3.0, {"delay": jnp.zeros(2)})
+    episodes = rollout(Simulator(Explosive(), steps=STEPS, parameters=TABLE), 7, act, 3.0, {"delay": jnp.zeros(2)})
     assert episodes.not_finite.all()
     np.testing.assert_array_equal(episodes.alive.sum(axis=1), 15)
 
@@ -265,6 +264,14 @@ class Wrapped(Sled):
         return Sled()
 
 
+class Captured(Sled):
+    """Its step was compiled with the model that it was made with."""
+
+    def __init__(self):
+        super().__init__()
+        self.step = jax.jit(super().step)
+
+
 class Several(Sled):
     def reset(self, key):
         return jax.vmap(super().reset)(jax.random.split(key, 4))
@@ -295,6 +302,7 @@ class Silent(Sled):
         ({"model": Sled().mj_model}, "model: got MjModel, expected mjx.Model"),
         ({"env": Elsewhere()}, "with_model: got none, and the default does not reach the model of Elsewhere"),
         ({"env": Wrapped()}, "env: got Wrapped around Sled, expected an environment without wrappers"),
+        ({"env": Captured()}, "parameter 'mass': got an environment whose step does not depend on it"),
         ({"env": Several()}, r"an observation of shape \(4, 3\), .*, expected those of one robot"),
         ({"env": Silent()}, "env: got a reset that returns dict without 'obs'"),
         ({"parameters": {"m": mass("sledge", bounds=(0.5, 2.0))}}, "parameter 'm', targets: got body 'sledge'"),
