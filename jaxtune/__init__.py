@@ -11,7 +11,8 @@ Which module to import for what:
 - `jaxtune.mjx`: simulates anyone's MJX environment with other masses, frictions, strengths or delays, from a table that
   says which may be wrong; needs MuJoCo.
 - `jaxtune.discovery`: find the effect that a model lacks when the tuner's verdict is `unexplained`.
-- `jaxtune.rules`, `jaxtune.spm`, `jaxtune.dvm`, `jaxtune.windows`: what the tuner is made of, to replace or to read.
+- `jaxtune.gate`, `jaxtune.update`, `jaxtune.spm`, `jaxtune.dvm`, `jaxtune.windows`: what the tuner is made of, to
+  replace or to read.
 
 `jaxtune.tuner` and the modules that it imports know no simulator; the functions that you hand in know yours.
 """

@@ -14,9 +14,12 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 
-from jaxtune.rules import Collected, GateInfo, Knobs, TunerConfig, no_gate_log, no_update, vote_update
+from jaxtune.gate import GateInfo, no_gate_log
+from jaxtune.readings import Collected
+from jaxtune.settings import Knobs, TunerConfig
 from jaxtune.tuner import Info, Policy, Tuner, TunerState
 from jaxtune.types import ParamDist, Trajectory
+from jaxtune.update import no_update, vote_update
 
 
 def open_gate(
@@ -24,7 +27,7 @@ def open_gate(
 ) -> GateInfo:
     """Accepts every measured set that holds at least one living step, without comparing it with anything.
 
-    It takes the place of `rules.calibrated_gate` in the ungated baseline. Its `GateInfo` has novelty 0 at threshold 0,
+    It takes the place of `gate.calibrated_gate` in the ungated baseline. Its `GateInfo` has novelty 0 at threshold 0,
     or novelty nan for an empty set, which the tuner reports as `not_finite`. No verification model is trained.
 
     Args:

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 import jax
 import numpy as np
 
-from jaxtune.rules import TunerConfig
+from jaxtune.settings import TunerConfig
 from jaxtune.types import Trajectory
 
 

@@ -24,10 +24,13 @@ import jax
 import numpy as np
 
 from jaxtune.checks import check_measured, check_set
+from jaxtune.gate import Verify, calibrated_gate
 from jaxtune.misfits import Misfits, Phase, misfits, share_of_episode
-from jaxtune.rules import TunerConfig, Update, Verify, calibrated_gate, examine, posterior_update
+from jaxtune.readings import examine
+from jaxtune.settings import TunerConfig
 from jaxtune.tuner import Info, Measure, TrainPolicy, Tuner, TunerState, counted, keep, make_info
 from jaxtune.types import Trajectory, Verdict
+from jaxtune.update import Update, posterior_update
 
 HostSimulate = Callable[[jax.Array, Any, dict[str, np.ndarray]], Trajectory]
 """`(key, policy, coords [episodes] by name) -> Trajectory [episodes, time]`, in NumPy or JAX; any Python."""

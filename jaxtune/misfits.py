@@ -12,7 +12,8 @@ import jax
 import jax.numpy as jnp
 
 from jaxtune import devices, regression, surface, windows
-from jaxtune.rules import LEAST_ERROR, Collected, TunerConfig, fit, of_all_sets
+from jaxtune.readings import LEAST_ERROR, Collected, fit, of_all_sets
+from jaxtune.settings import TunerConfig
 from jaxtune.types import Trajectory
 
 PHASES = 8

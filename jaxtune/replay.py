@@ -15,7 +15,7 @@ Pieces have t distributions, since contacts make some jump, and s^2 is the typic
 has a standard deviation of one radius.
 
 Simulated sets of known coordinates are fitted in the same way. They tell how far estimates err, and how large the
-misfit is where nothing is missing, both conformal as in `jaxtune.rules`.
+misfit is where nothing is missing, both conformal as in `jaxtune.update`.
 """
 
 from collections.abc import Callable

@@ -198,7 +198,7 @@ def vote(config: SPMConfig, spm: SPM, trajectory: Trajectory) -> Float[Array, " 
 
         vote = 2 sigmoid(logit at the centre) - 1 = 2 p(truth > centre) - 1
 
-    It is the signed form of the paper's q, zero where the set says nothing. `rules.vote_update` turns it into a step.
+    It is the signed form of the paper's q, zero where the set says nothing. `update.vote_update` turns it into a step.
     """
     centre = jnp.zeros((1, len(spm.dist.centre)))
     return 2.0 * jax.nn.sigmoid(logits(config, spm, trajectory, centre)[0]) - 1.0

@@ -28,7 +28,7 @@ novelty that still counts as covered. The verdict is the first of these that hol
 <= threshold; `unexplained` if the distribution fills its bounds and p <= 0.01; `radius_exhausted` if it fills them or
 was widened `max_widenings` times; else `widen`. A radius that was widened stays so, unless the update narrows it.
 
-Departures from the paper, besides those of gate and update (`jaxtune.rules`):
+Departures from the paper, besides those of `jaxtune.gate` and `jaxtune.update`:
 
 - An accepted set is read up to `refinements` times more, with episodes simulated in the distribution that the update
   narrowed. In a narrower distribution estimates are more exact, and the robot need not walk for it. If the set does
@@ -85,25 +85,13 @@ from jaxtune import dist as dists
 from jaxtune import replay as replays
 from jaxtune.checks import check_measured, check_simulated, check_states
 from jaxtune.explain import explain
+from jaxtune.gate import GateInfo, Verify, calibrated_gate, no_gate_log
 from jaxtune.misfits import Misfits, Phase, misfits, share_of_episode
+from jaxtune.readings import Collected, examine
 from jaxtune.replay import Replay
-from jaxtune.rules import (
-    Collected,
-    GateInfo,
-    Knobs,
-    TunerConfig,
-    Update,
-    UpdateInfo,
-    Verify,
-    calibrated_gate,
-    examine,
-    knobs,
-    no_gate_log,
-    no_update,
-    posterior_update,
-    vote_update,
-)
+from jaxtune.settings import Knobs, TunerConfig, knobs
 from jaxtune.types import Coords, ParamDist, Trajectory, Verdict
+from jaxtune.update import Update, UpdateInfo, no_update, posterior_update, vote_update
 
 __all__ = [
     "Collected",
@@ -208,8 +196,8 @@ class Tuner:
       simulate: simulates episodes of robots with given coordinates (`Simulate`).
       measure: measures episodes of the target (`Measure`). None where the target is not JAX; hand the measured set to
         `tune` then.
-      verify: scores a measured set against simulated ones (`rules.Verify`).
-      update: moves the distribution after an accepted set (`rules.Update`).
+      verify: scores a measured set against simulated ones (`gate.Verify`).
+      update: moves the distribution after an accepted set (`update.Update`).
       replay: simulates pieces of episodes from measured states (`jaxtune.replay`), for a last, more exact estimate.
         Simulated and measured episodes must hold states then (`Trajectory.state`).
       phase: where in its cycle a step is, such as a gait's clock says; the share of its episode if not given. Only

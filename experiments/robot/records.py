@@ -100,7 +100,7 @@ class Tuning:
     comparable: tuple[bool, ...]
     """Whether there was enough to compare, at every call."""
     cover: tuple[float | None, ...]
-    """The four excesses of `jaxtune.rules.calibrated_gate` at every call; the largest is the novelty."""
+    """The four excesses of `jaxtune.gate.calibrated_gate` at every call; the largest is the novelty."""
     lost: tuple[float | None, ...]
     misfit: tuple[float | None, ...]
     beyond: tuple[float | None, ...]
@@ -119,7 +119,7 @@ class Tuning:
     together: tuple[Combination, ...]
     """Sums of such parameters that are known better, in coordinates."""
     update_loss: float | None
-    """How badly the update's model fits (`jaxtune.rules.UpdateInfo.loss`)."""
+    """How badly the update's model fits (`jaxtune.update.UpdateInfo.loss`)."""
     fit_p_value: float | None
     """Conformal p-value of misfit and reach in the distribution that was read last."""
     misfit_p_value: float | None

@@ -23,7 +23,7 @@ from experiments.common.config import Preset
 from experiments.walking.learner import Learner, Policy
 from experiments.walking.policies import starting_policy
 from experiments.walking.robots import BITENO
-from jaxtune import devices, dvm, regression, rules, spm, tuner
+from jaxtune import devices, dvm, readings, regression, spm, tuner
 from jaxtune import dist as dists
 from jaxtune.mjx import parameters
 
@@ -58,7 +58,7 @@ def profile(sizes: Preset, policy: str) -> dict[str, dict]:
     def sets(score):
         """Scores all held-out sets, and the measured one."""
         return lambda model, collected, measured: (
-            devices.in_chunks(score, (collected.held_out,), rules.SETS, shared=(model,)),
+            devices.in_chunks(score, (collected.held_out,), readings.SETS, shared=(model,)),
             score(model, measured),
         )
 
@@ -193,7 +193,7 @@ def estimates(sizes: Preset, policy: str, radius: float, seeds: Sequence[int]) -
         for name, (train, answer) in methods.items():
             model, seconds = _timed(train, (key_fit, data))
             every = _compiled(
-                lambda model, sets, answer=answer: devices.in_chunks(answer, (sets,), rules.SETS, shared=(model,))
+                lambda model, sets, answer=answer: devices.in_chunks(answer, (sets,), readings.SETS, shared=(model,))
             )
             errors, times = found[name]
             errors.append(np.abs(np.asarray(every(model, data.held_out)) - truth))

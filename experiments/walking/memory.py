@@ -11,7 +11,7 @@ from pathlib import Path
 import jax
 
 from experiments.walking.learner import Learner
-from jaxtune.rules import SETS
+from jaxtune.readings import SETS
 
 _TRAINING = 14.0  # of a PPO update's rollout: its batches, their gradients, the physics of a step
 _TUNING = 2.0  # of a tuning's episodes: windows, and batches of them

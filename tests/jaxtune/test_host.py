@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 import toys
 
+from jaxtune.gate import calibrated_gate
 from jaxtune.host import HostTuner, one_by_one
-from jaxtune.rules import calibrated_gate, posterior_update
 from jaxtune.tuner import Tuner, TunerState, explain, keep, knobs
 from jaxtune.types import Trajectory, Verdict
+from jaxtune.update import posterior_update
 
 TWO = {"friction": 0.0, "mass": 0.0}
 # Enough episodes that rounding does not choose another regression.

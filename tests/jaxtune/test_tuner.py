@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 import toys
 
-from jaxtune import baselines, dvm, explain, rules, spm
+from jaxtune import baselines, dvm, explain, readings, spm
 from jaxtune import dist as dists
+from jaxtune import gate as gates
 from jaxtune import tuner as tuners
 from jaxtune.misfits import PHASES
 from jaxtune.tuner import GateInfo, Tuner, UpdateInfo, knobs, posterior_update
@@ -68,7 +69,7 @@ def test_products_of_a_reading_are_not_shortened():
     """Distances and sums of large weights cancel; a GPU would round what goes into them to ten bits."""
     collected = toys.collect(jax.random.key(0), toys.uniform(TWO), toys.TINY)
     measured = SLIDER.measure(TWO, toys.TINY.set_episodes)(jax.random.key(1), toys.policy())
-    text = jax.jit(lambda: rules.examine(toys.TINY, collected, measured)).lower().as_text()
+    text = jax.jit(lambda: readings.examine(toys.TINY, collected, measured)).lower().as_text()
     products = [line for line in text.splitlines() if "dot_general" in line]
     assert products
     assert all("HIGHEST, HIGHEST" in line for line in products)
@@ -541,11 +542,11 @@ def test_windows_are_ranked_among_those_of_all_sets_and_every_set_weighs_the_sam
     # The last windows of the first two sets are not valid, and the last set's last one has no neighbour.
     novelty = jnp.array([[1.0, 2.0, 99.0], [3.0, 4.0, 99.0], [5.0, 6.0, 7.0], [2.5, 5.5, jnp.inf]])
     valid = jnp.array([[True, True, False], [True, True, False], [True, True, True], [True, True, True]])
-    ranks = rules._mean_ranks(novelty, valid)
+    ranks = gates._mean_ranks(novelty, valid)
     # Two windows weigh a half each, three a third. Of four sets, 1 + 1/3 lie at or below 2.5, and 3 below 5.5.
     np.testing.assert_allclose(ranks[3], (1 / 3 + 3 / 4 + 1) / 3, rtol=1e-6)
     np.testing.assert_allclose(ranks[0], (0.5 / 4 + 1 / 4) / 2, rtol=1e-6)
-    assert np.isnan(rules._mean_ranks(novelty, valid.at[0].set(False))[0])
+    assert np.isnan(gates._mean_ranks(novelty, valid.at[0].set(False))[0])
 
 
 def test_a_living_step_that_is_not_finite_leaves_no_score(gate):
@@ -1029,23 +1030,23 @@ def test_many_measured_sets_are_scored_beside_the_held_out_ones_once():
         jax.debug.callback(lambda _: counted.append(1), episodes.obs[0, 0, 0])
         return scale * episodes.obs.mean(), episodes.alive.sum()
 
-    several = jax.jit(jax.vmap(lambda measured: rules.of_all_sets(one, (2.0,), collected, measured)))
+    several = jax.jit(jax.vmap(lambda measured: readings.of_all_sets(one, (2.0,), collected, measured)))
     found = jax.block_until_ready(several(sets))
     jax.effects_barrier()
     assert len(counted) == toys.TINY.held_out_sets + 3
     for number in range(3):
-        alone = rules.of_all_sets(one, (2.0,), collected, jax.tree.map(lambda leaf, n=number: leaf[n], sets))
+        alone = readings.of_all_sets(one, (2.0,), collected, jax.tree.map(lambda leaf, n=number: leaf[n], sets))
         jax.tree.map(lambda many, single, n=number: close(many[n], single, rtol=1e-6), found, alone)
     # Lanes of a sweep have held-out sets of their own.
     both = jax.tree.map(lambda leaf: jnp.stack([leaf, 3 * leaf if leaf.dtype == jnp.float32 else leaf]), collected)
     pair = jax.tree.map(lambda leaf: leaf[:2], sets)
-    lanes, _ = jax.vmap(lambda own, measured: rules.of_all_sets(one, (2.0,), own, measured))(both, pair)
+    lanes, _ = jax.vmap(lambda own, measured: readings.of_all_sets(one, (2.0,), own, measured))(both, pair)
     close(lanes[1, :-1], 3 * lanes[0, :-1], rtol=1e-5)
     close(lanes[:, -1], found[0][:2, -1], rtol=1e-6)
-    of_model = lambda scale: rules.of_all_sets(one, (scale,), collected, jax.tree.map(lambda leaf: leaf[0], sets))  # noqa: E731
+    of_model = lambda scale: readings.of_all_sets(one, (scale,), collected, jax.tree.map(lambda leaf: leaf[0], sets))  # noqa: E731
     models, _ = jax.vmap(of_model)(jnp.array([2.0, 4.0]))
     close(models[1], 2 * models[0], rtol=1e-6)
-    inner = lambda own: jax.vmap(lambda measured: rules.of_all_sets(one, (2.0,), own, measured))(pair)  # noqa: E731
+    inner = lambda own: jax.vmap(lambda measured: readings.of_all_sets(one, (2.0,), own, measured))(pair)  # noqa: E731
     nested, _ = jax.vmap(inner)(both)
     close(nested[1, :, :-1], 3 * nested[0, :, :-1], rtol=1e-5)
     close(nested[1, :, -1], nested[0, :, -1], rtol=1e-6)
