@@ -44,6 +44,8 @@ class Args:
     """True values of another robot's parameters, name=value; those that are left out are nominal."""
     idle_s: float = 3600.0
     """The program ends after this many seconds without a request."""
+    parent: int | None = None
+    """Id of the process that started it, with which it ends."""
     seed: int = 0
     """Random seed of its noise and, together with the request's own seed, of its commands."""
 
@@ -148,7 +150,7 @@ def main(args: Args) -> None:
     """Answers requests until none has come for `idle_s`; the reason of a refusal goes into `refused.txt`."""
     standing, suspended = stand_in(args)
     last = time.monotonic()
-    while time.monotonic() - last < args.idle_s:
+    while time.monotonic() - last < args.idle_s and args.parent in (None, os.getppid()):
         jobs = [(path.parent, answer, standing) for path in args.folder.glob("**/round_*/request.json")]
         hung = args.folder.glob("**/hung/targets/meta.yaml") if suspended else ()
         jobs += [(path.parent.parent, play_targets, suspended) for path in hung]

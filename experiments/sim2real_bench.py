@@ -6,6 +6,7 @@ motor lag, noise, drift, another friction. Falls in the walks of the rounds are 
 policy is evaluated in further walks, from which nothing is learnt.
 """
 
+import os
 import subprocess
 import sys
 from contextlib import contextmanager
@@ -168,7 +169,7 @@ def stand_in(folder: Path):
       folder: where it looks for requests; its output goes into `robot_NAME.log` beside the folder.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    options = ["--folder", str(folder.resolve()), "--idle-s", str(_DAY_S)]
+    options = ["--folder", str(folder.resolve()), "--idle-s", str(_DAY_S), "--parent", str(os.getpid())]
     command = [sys.executable, "-m", "experiments.robot_stub", *options]
     with (folder.parent / f"robot_{folder.name}.log").open("a") as output:
         process = subprocess.Popen(command, stdout=output, stderr=output, cwd=Path(__file__).parent.parent)

@@ -1,5 +1,6 @@
 """The stand-in robot while it is suspended; its walks are in test_export.py."""
 
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -137,3 +138,13 @@ def test_what_it_cannot_walk_with_it_refuses(tmp_path, request_text, policy, nam
     (place / "request.json").write_text(request_text)
     robot_stub.main(robot_stub.Args(folder=tmp_path, idle_s=1.0))
     assert named in (place / "refused.txt").read_text()
+
+
+def test_it_ends_with_the_process_that_started_it(tmp_path):
+    place = tmp_path / "round_000"
+    place.mkdir()
+    (place / "request.json").write_text("[]")
+    robot_stub.main(robot_stub.Args(folder=tmp_path, idle_s=1.0, parent=os.getpid()))
+    assert not (place / "refused.txt").exists()
+    robot_stub.main(robot_stub.Args(folder=tmp_path, idle_s=1.0, parent=os.getppid()))
+    assert (place / "refused.txt").exists()
