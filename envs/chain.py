@@ -41,7 +41,7 @@ class Now:
     rotor: jax.Array  # [joints] kg m^2, the rotor's part of the joint's inertia
     link: jax.Array  # [joints] share of the joint's inertia that is not the rotor's
     mobility: jax.Array  # [joints] 1/(kg m^2), the inverse of the link's part of the joint's inertia
-    alone: jax.Array  # [joints] rad/s^2, acceleration of the link without the torque of its gears and its dry friction
+    alone: jax.Array  # [joints] rad/s^2, acceleration of the link without its gears and dry friction, but with bristles
     stopped: jax.Array  # [joints] rad/s^2, acceleration of a joint that dry friction can stop
     rigid: jax.Array  # [joints] share of dry friction that is not of bristles
     body_velocity: jax.Array  # [bodies, 3] m/s of the centres of mass
@@ -64,8 +64,8 @@ class Chain:
 
     - `values` holds [places] by effect and parameter, in the form that effects read. Zero means no effect.
     - `memory` is a dictionary: what each effect remembers, by its name, `held`, the controller's last torque, `passed`,
-      the torque of motors and of dry friction on the joints in the last step, less what bristles rub at links (in a
-      history: the motors' torque), and `within`, the share of its gains with which the controller acted within it.
+      the torque of motors and of dry friction on the joints in the last step, less what bristles rub at links (after
+      `remember`: the motors' torque), and `within`, the share of its gains with which the controller acted within it.
     - `x` holds the controller's inputs of one step, [joints] each: `target` rad, `feed` Nm (torque sent directly),
       `stiffness` Nm/rad, `damping` Nm s/rad, `limit` Nm, `emf` Nm s/rad (back electromotive force, not limited), and
       `sample`, a scalar that is true where the controller reads the joint anew.
@@ -193,7 +193,7 @@ class Chain:
         friction, _ = self.stage("friction", values, model.dof_frictionloss[self.dof], now, memory)
         none = jnp.zeros_like(torque)
         (left, _), _ = self.stage("bristle", values, jnp.stack([friction, none]), now, memory)
-        now = now.replace(rigid=left / jnp.maximum(friction, MIN_FRICTION_NM))
+        now = now.replace(rigid=jnp.where(friction > 0, left / jnp.maximum(friction, MIN_FRICTION_NM), 1.0))
         signal = jnp.stack([torque, friction, model.dof_damping[self.dof], none, none])
         (passed, friction, damping, rubs, slows), memory = self.stage("transmission", values, signal, now, memory)
         share, friction, damping = rubs / jnp.maximum(friction + rubs, 1e-9), friction + rubs, damping + slows

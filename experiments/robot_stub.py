@@ -147,7 +147,7 @@ _STAND_INS = {BITENO.name: _embodied}
 
 
 def main(args: Args) -> None:
-    """Answers requests until none has come for `idle_s`; the reason of a refusal goes into `refused.txt`."""
+    """Answers requests until none has come for `idle_s`, or until its parent is gone; why it refuses: `refused.txt`."""
     standing, suspended = stand_in(args)
     last = time.monotonic()
     while time.monotonic() - last < args.idle_s and args.parent in (None, os.getppid()):
@@ -155,7 +155,7 @@ def main(args: Args) -> None:
         hung = args.folder.glob("**/hung/targets/meta.yaml") if suspended else ()
         jobs += [(path.parent.parent, play_targets, suspended) for path in hung]
         for place, does, robot in sorted(jobs, key=lambda job: job[0]):
-            if (place / "log").exists() or (place / "refused.txt").exists():
+            if (place / "log").exists() or (place / "refused.txt").exists() or args.parent not in (None, os.getppid()):
                 continue
             try:
                 does(place, robot, args.seed)

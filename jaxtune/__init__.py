@@ -2,7 +2,7 @@
 
 Which module to import for what:
 
-- `jaxtune.tuner`: the tuner (Algorithm 1), its settings and its default rules. Start here.
+- `jaxtune.tuner`: the tuner (Algorithm 1), its settings, and its default gate and update. Start here.
 - `jaxtune.host`: the same tuner for a simulator that is not JAX, such as a Gymnasium environment.
 - `jaxtune.types`: the records that you hand in and get back (`Trajectory`, `ParamDist`, `Verdict`, `Coords`).
 - `jaxtune.dist`: make, sample, move and widen the distribution that is tuned.

@@ -1,7 +1,8 @@
 """The first decision of a tuning: is the measured set covered by simulated ones?
 
 A `Tuner` is given a function for it, `verify`. Its default, `calibrated_gate`, trains a verification model
-(`jaxtune.dvm`) and scores the measured set. To change it, write a function of the type `Verify`.
+(`jaxtune.dvm`) and scores the measured set. To change it, write a function of the type `Verify`
+and hand it to the tuner; `jaxtune.tuner` draws where it is called.
 
 Departures from the paper:
 

@@ -36,7 +36,7 @@ from jaxtune import dist as dists
 from jaxtune.descent import descend
 from jaxtune.types import Coords, ParamDist, Trajectory
 
-_SCALED = 2048  # windows from which mean and standard deviation of the moments are computed
+_SCALED = 2048  # windows from which mean and standard deviation of the inputs are computed
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,6 +69,10 @@ class SPMConfig:
     sweep: int = 33
     """Guesses in the sweep over the box that `estimate` makes."""
 
+    def __post_init__(self):
+        if self.reads not in ("moments", "steps"):
+            raise ValueError(f"reads: got '{self.reads}', expected moments or steps")
+
 
 class _Network(nn.Module):
     """Encoders of window and guess, and the heads of all coordinates.
@@ -86,7 +90,7 @@ class _Network(nn.Module):
         self.head_out = self.param("head_out", nn.initializers.lecun_normal(), (self.config.head, self.num_coords))
 
     def __call__(self, features, guesses):
-        """Logits [batch, guesses, coords] for moments [batch, moments] and guesses [batch, guesses, coords]."""
+        """Logits [batch, guesses, coords] for inputs [batch, inputs] and guesses [batch, guesses, coords]."""
         for layer in self.window_layers:
             features = nn.elu(layer(features))
         for layer in self.guess_layers:
@@ -124,7 +128,7 @@ def train(
     """Trains a search-parameter model on simulated episodes of known coordinates.
 
     Each gradient step draws windows, and for each window the centre and `guesses - 1` uniform guesses from the query
-    box. Steps, moments and coordinates are standardised first. An update calls this once per tuning.
+    box. Steps, inputs and coordinates are standardised first. An update calls this once per tuning.
 
     Args:
       key: random key.

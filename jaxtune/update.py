@@ -2,7 +2,7 @@
 
 A `Tuner` is given a function for it, `update`, which estimates the coordinates of an accepted set. Its default is
 `posterior_update`, by regression (`jaxtune.regression`). `vote_update` is the paper's, by a search-parameter model
-(`jaxtune.spm`). To change it, write a function of the type `Update`.
+(`jaxtune.spm`). To change it, write a function of the type `Update` and hand it to the tuner.
 
 Departures from the paper:
 

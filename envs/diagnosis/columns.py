@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from envs.diagnosis.finding import Finding
 from envs.logs import Run
-from envs.logs.format import JOINT_SIGNALS, SCALAR_SIGNALS, VECTOR_SIGNALS, column_names
+from envs.logs.format import JOINT_SIGNALS, SCALAR_SIGNALS, VECTOR_SIGNALS, alike, column_names
 
 
 def misspelt(run: Run, joints: Sequence[str]) -> list[Finding]:
@@ -18,15 +18,8 @@ def misspelt(run: Run, joints: Sequence[str]) -> list[Finding]:
     known = [column for name in absent for column in column_names(name, joints)]
     found = []
     for name in run.other:
-        meant = [column for column in known if _alike(name.casefold(), column.casefold())]
+        meant = [column for column in known if alike(name.casefold(), column.casefold())]
         if meant:
             text = f"column '{name}' is not known; rename it to '{meant[0]}', or to something less like it"
             found.append(Finding("misspelt column", meant[0], (), 0.0, text))
     return found
-
-
-def _alike(one: str, other: str) -> bool:
-    """Whether two texts are equal, or become so if one letter is added, left out or replaced."""
-    short, long = sorted((one, other), key=len)
-    same = next((i for i, pair in enumerate(zip(short, long, strict=False)) if pair[0] != pair[1]), len(short))
-    return len(long) - len(short) < 2 and long[same + 1 :] in (short[same:], short[same + 1 :])

@@ -69,7 +69,7 @@ def _backlash(values, signal, now, memory):
     half = 0.5 * values["rad"]
     torque, joint, motor = _shared(values, half > 0, signal)
     torque, (bound, slows), resistance = torque + now.rotor * rate / now.dt, motor, _resistance(now, motor[1])
-    alone = now.alone - _stopping(now.alone - now.stopped, now.mobility * now.rigid * joint[0])
+    alone = now.alone - _stopping(now.alone - now.stopped, now.mobility * now.rigid * jnp.maximum(joint[0], 0.0))
     pressing = torque - now.rotor * alone - slows * now.speed
     friction = _stopping(pressing + resistance * now.dt * now.speed, bound)
     following = jnp.clip(offset + (pressing - friction) / resistance, -half, half)

@@ -186,7 +186,7 @@ def _run(path: Path, meta: Meta, needed: str) -> tuple[Run, list[str]]:
     for name in [name for name in columns if not meta.uses(name)]:
         if columns[name] is None or not np.isfinite(columns[name]).all():
             del columns[name]
-            notes.append(f"{path.stem}: column '{name}' was left out: it is not known, and not all finite numbers")
+            notes.append(f"{path.stem}: column '{name}' was left out: it is not known, and not one finite number a row")
     for name, values in columns.items():
         refuse_first(path, name, values, ~np.isfinite(values), "a finite number")
     columns = _rename(path, columns, meta)

@@ -241,3 +241,10 @@ def is_observation(column: Any) -> bool:
     """Tells whether a column is a component of the policy's observation, such as `obs.7`."""
     head, _, number = str(column).partition(".")
     return head == OBSERVATION and number.isdecimal() and number == str(int(number))
+
+
+def alike(one: str, other: str) -> bool:
+    """Says whether two texts are equal, or become so if one letter is added, left out or replaced."""
+    short, long = sorted((one, other), key=len)
+    same = next((i for i, pair in enumerate(zip(short, long, strict=False)) if pair[0] != pair[1]), len(short))
+    return len(long) - len(short) < 2 and long[same + 1 :] in (short[same:], short[same + 1 :])

@@ -24,6 +24,7 @@ from envs.logs.format import (
     SPLITS,
     VECTOR_SIGNALS,
     Convention,
+    alike,
     column_names,
     is_observation,
 )
@@ -136,8 +137,9 @@ class Meta:
     def uses(self, name: str) -> bool:
         """Says whether a column of a run's file is read, or would be if its name were not misspelt."""
         signal = name.partition(".")[0].casefold()
-        ours = ("t", OBSERVATION, *JOINT_SIGNALS, *VECTOR_SIGNALS, *SCALAR_SIGNALS)
-        return signal in ours or name in self.columns.values()
+        ours = ("t", "reward", OBSERVATION, *JOINT_SIGNALS, *VECTOR_SIGNALS, *SCALAR_SIGNALS)
+        misspelt = any(alike(name.casefold(), column.casefold()) for column in self._all_columns())
+        return signal in ours or misspelt or name in self.columns.values()
 
     def _read_convention(self, meta: Mapping[str, Any], movable: Mapping[str, bool] | None) -> Convention:
         sign = self._mapping("sign", meta.get("sign"), dict.fromkeys(self.joints))

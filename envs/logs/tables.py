@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow
+import pyarrow.compute
 import pyarrow.csv
 import pyarrow.parquet
 
@@ -122,7 +123,9 @@ def _parse_csv(path: Path, types: dict[str, pyarrow.DataType]) -> dict[str, pyar
 
 def _numbers(values: pyarrow.ChunkedArray) -> np.ndarray | None:
     try:
-        return values.cast(pyarrow.float64()).to_numpy()
+        texts = pyarrow.types.is_string(values.type)
+        trimmed = pyarrow.compute.utf8_trim_whitespace(values) if texts else values
+        return trimmed.cast(pyarrow.float64()).to_numpy()
     except pyarrow.ArrowInvalid:
         return None
 
@@ -157,11 +160,20 @@ def _cell(path: Path, row: int, name: str, text: str) -> float:
         raise ValueError(f"{path}, row {row}, column '{name}': got '{text}', expected a number") from None
 
 
+def _array(arrays: np.lib.npyio.NpzFile, name: str, used: Callable[[str], bool]) -> np.ndarray | bytes | None:
+    try:
+        return arrays[name]
+    except ValueError:  # an array of objects
+        if used(name):
+            raise
+        return None
+
+
 def _read_npz(path: Path, used: Callable[[str], bool]) -> dict[str, np.ndarray | None]:
     check_archive(path)
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
-            columns = {name: arrays[name] for name in arrays.files}
+            columns = {name: _array(arrays, name, used) for name in arrays.files}
     except Exception as error:  # a damaged archive fails in many ways
         raise ValueError(f"{path}: {type(error).__name__}: {error}") from error
     observation = columns.get("obs")

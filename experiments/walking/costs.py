@@ -165,8 +165,8 @@ def estimates(sizes: Preset, policy: str, radius: float, seeds: Sequence[int]) -
     dist = learner.dist(parameters.nominal(learner.entries), radius)
     start = starting_policy(policy, learner)
 
-    def fit(sizes, key, data):
-        return spm.train(key, sizes, data.trajectory, data.sampled_coords, dist)[0]
+    def fit(settings, key, data):
+        return spm.train(key, settings, data.trajectory, data.sampled_coords, dist)[0]
 
     def fit_several(key, data):
         return jax.lax.map(lambda key: fit(config.spm, key, data), jax.random.split(key, _MODELS))

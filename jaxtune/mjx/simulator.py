@@ -42,9 +42,12 @@ Act = Callable[[Any, Any, jax.Array], jax.Array]
 """A policy: `(policy, observation of one environment, key) -> action [act]`. The policy is a pytree of arrays."""
 _EXPLODED = 1e8  # an observation in whatever unit
 _DATA = ("data", "pipeline_state")
-_AT_RESET = {"qpos0", "key_qpos", "key_qvel"}  # fields that a robot may feel at the start of an episode alone
 WithModel = Callable[[Any, mjx.Model], Any]
 """`(env, model) -> env`: a copy of an environment that simulates this model."""
+
+
+def _is_model(value: Any) -> bool:
+    return isinstance(value, mjx.Model)
 
 
 def _reaching(function: Callable, inputs: Params, *others: Any) -> set[str]:
@@ -197,10 +200,12 @@ class Simulator:
         """Checks that every parameter reaches the step of the environment, which may simulate another model."""
         nominal = parameters.nominal(self.parameters)
         start = jax.eval_shape(self.reset, nominal, jax.random.PRNGKey(0))
+        if any(_is_model(one) for one in jax.tree.leaves(start, is_leaf=_is_model)):
+            return  # its step may simulate the model that its reset has put there
         action = jax.ShapeDtypeStruct((self.action_size,), jnp.float32)
         reach = _reaching(lambda *args: self.move(*args)[0], nominal, start, action)
         for name, entry in self.parameters.items():
-            if name not in reach and not set(entry.field_names) <= _AT_RESET:
+            if name not in reach and entry.kind != "control":
                 raise ValueError(
                     f"parameter '{name}': got an environment whose step does not depend on it; expected with_model= "
                     "that gives another model to what simulates, or other fields"

@@ -409,7 +409,7 @@ def test_a_joint_that_goes_on_without_its_motor_has_no_rotor():
     np.testing.assert_allclose(memory[1], -0.3 / 0.01 * DT, rtol=1e-5)
 
 
-@pytest.mark.parametrize(("bound", "rate"), [(1.0, 0.0), (0.4, -10.0)])
+@pytest.mark.parametrize(("bound", "rate"), [(1.0, 0.0), (0.4, -10.0), (0.0, -30.0), (-0.1, -30.0)])
 def test_a_motor_stays_beside_a_link_that_friction_holds(bound, rate):
     # Gravity would accelerate the link of 0.02 kg m^2 by 30 rad/s^2. It creeps under that load, without acceleration.
     row = LIBRARY["backlash"]

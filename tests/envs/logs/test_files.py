@@ -488,18 +488,25 @@ def test_columns_that_nobody_uses_may_hold_what_they_like(tmp_path, suffix, bad)
     log = logs.read(folder)
     np.testing.assert_array_equal(log.runs[0].other["fault"], np.arange(ROWS))
     assert "state" not in log.runs[0].other
-    assert log.notes == ("run_000: column 'state' was left out: it is not known, and not all finite numbers",)
+    assert log.notes == ("run_000: column 'state' was left out: it is not known, and not one finite number a row",)
     # One of the format's names is no such column, however it is written.
     with pytest.raises(ValueError, match="column 'Enabled'"):
         logs.read(put(folder, table | {"Enabled": values}, name=name))
 
 
+@pytest.mark.parametrize("name", ["reward", " enabled", "enable", "q.left_hip "])
+def test_what_is_used_or_misspelt_is_not_left_out(tmp_path, name):
+    with pytest.raises(ValueError, match=f"column '{name}'"):
+        logs.read(put(tmp_path / "log", columns() | {name: np.array(["1.0"] * (ROWS - 1) + ["nan"])}))
+
+
 def test_arrays_of_another_length_are_left_out_where_nobody_uses_them(tmp_path):
     folder = put(tmp_path / "log", name="run_000.npz")
-    np.savez(folder / "run_000.npz", images=np.zeros((3, 4)), stamps=np.zeros(ROWS + 1), **columns())
+    others = {"images": np.zeros((3, 4)), "stamps": np.zeros(ROWS + 1), "info": np.array([{"robot": 1}] * ROWS)}
+    np.savez(folder / "run_000.npz", **others, **columns())
     log = logs.read(folder)
     assert not log.runs[0].other
-    assert ["images" in note or "stamps" in note for note in log.notes] == [True, True]
+    assert [name in note for name, note in zip(others, log.notes, strict=True)] == [True] * 3
 
 
 def test_a_damaged_npz_is_named(tmp_path):

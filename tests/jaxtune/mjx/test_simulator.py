@@ -11,6 +11,7 @@ import pytest
 import toys
 from brax import envs
 from brax.envs.wrappers.training import DomainRandomizationVmapWrapper
+from mujoco import mjx
 from sled import SUBSTEPS, TABLE, Keyed, Sled
 
 from jaxtune import dist as dists
@@ -272,6 +273,28 @@ class Captured(Sled):
         self.step = jax.jit(super().step)
 
 
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Holding:
+    data: mjx.Data
+    obs: jax.Array
+    reward: jax.Array
+    done: jax.Array
+    model: mjx.Model
+
+
+class Carried(Sled):
+    """Its step simulates the model that its reset has put into the state."""
+
+    def reset(self, key):
+        return Holding(**vars(super().reset(key)), model=self.mjx_model)
+
+    def step(self, state, action):
+        sled = Sled()
+        sled._mjx_model = state.model
+        return Holding(**vars(sled.step(state, action)), model=state.model)
+
+
 class Several(Sled):
     def reset(self, key):
         return jax.vmap(super().reset)(jax.random.split(key, 4))
@@ -314,6 +337,10 @@ class Silent(Sled):
 def test_a_simulator_that_cannot_be_is_refused(arguments, message):
     with pytest.raises(ValueError, match=message):
         Simulator(**{"env": Sled(), "steps": STEPS, "parameters": TABLE, **arguments})
+
+
+def test_a_model_may_be_part_of_the_state():
+    Simulator(Carried(), steps=STEPS, parameters=TABLE)
 
 
 @pytest.mark.parametrize(
