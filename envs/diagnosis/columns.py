@@ -18,7 +18,7 @@ def misspelt(run: Run, joints: Sequence[str]) -> list[Finding]:
     known = [column for name in absent for column in column_names(name, joints)]
     found = []
     for name in run.other:
-        meant = [column for column in known if alike(name.casefold(), column.casefold())]
+        meant = [column for column in known if alike(name, column)]
         if meant:
             text = f"column '{name}' is not known; rename it to '{meant[0]}', or to something less like it"
             found.append(Finding("misspelt column", meant[0], (), 0.0, text))

@@ -60,6 +60,11 @@ def _stopping(torque, bound):
     return jnp.where(bound > 0, jnp.clip(torque, -bound, bound), 0.0)
 
 
+def _most(now, bound):
+    """Largest acceleration that dry friction of this bound [joints] Nm gives a link, [joints] rad/s^2."""
+    return now.mobility * now.rigid * jnp.maximum(bound, 0.0)
+
+
 def _backlash(values, signal, now, memory):
     """o' = clip(o + (pressing - f) / R, -rad / 2, rad / 2): inside the play the motor runs free, at its ends it pushes.
 
@@ -69,7 +74,7 @@ def _backlash(values, signal, now, memory):
     half = 0.5 * values["rad"]
     torque, joint, motor = _shared(values, half > 0, signal)
     torque, (bound, slows), resistance = torque + now.rotor * rate / now.dt, motor, _resistance(now, motor[1])
-    alone = now.alone - _stopping(now.alone - now.stopped, now.mobility * now.rigid * jnp.maximum(joint[0], 0.0))
+    alone = now.alone - _stopping(now.alone - now.stopped, _most(now, joint[0]))
     pressing = torque - now.rotor * alone - slows * now.speed
     friction = _stopping(pressing + resistance * now.dt * now.speed, bound)
     following = jnp.clip(offset + (pressing - friction) / resistance, -half, half)
@@ -106,8 +111,7 @@ def _compliance(values, signal, now, memory):
     following, friction = beside(1.0, now.stopped)
     pressing = torque - now.rotor * now.stopped - resistance * (following - offset) - friction
     # What the link's friction would have to do, and can.
-    needed = now.alone + now.mobility * pressing - now.stopped
-    most = now.mobility * now.rigid * jnp.maximum(joint[0], 0.0)
+    needed, most = now.alone + now.mobility * pressing - now.stopped, _most(now, joint[0])
     sliding = beside(now.link, now.alone - jnp.clip(needed, -most, most))
     following, friction = jnp.where(jnp.abs(needed) < most, jnp.stack([following, friction]), sliding)
     passed = torque - resistance * (following - offset) - friction

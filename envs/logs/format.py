@@ -244,7 +244,7 @@ def is_observation(column: Any) -> bool:
 
 
 def alike(one: str, other: str) -> bool:
-    """Says whether two texts are equal, or become so if one letter is added, left out or replaced."""
-    short, long = sorted((one, other), key=len)
+    """Says whether two texts are equal but for case, or become so if one letter is added, left out or replaced."""
+    short, long = sorted((one.casefold(), other.casefold()), key=len)
     same = next((i for i, pair in enumerate(zip(short, long, strict=False)) if pair[0] != pair[1]), len(short))
     return len(long) - len(short) < 2 and long[same + 1 :] in (short[same:], short[same + 1 :])

@@ -138,7 +138,7 @@ class Meta:
         """Says whether a column of a run's file is read, or would be if its name were not misspelt."""
         signal = name.partition(".")[0].casefold()
         ours = ("t", "reward", OBSERVATION, *JOINT_SIGNALS, *VECTOR_SIGNALS, *SCALAR_SIGNALS)
-        misspelt = any(alike(name.casefold(), column.casefold()) for column in self._all_columns())
+        misspelt = any(alike(name, column) for column in self._all_columns())
         return signal in ours or misspelt or name in self.columns.values()
 
     def _read_convention(self, meta: Mapping[str, Any], movable: Mapping[str, bool] | None) -> Convention:
