@@ -20,6 +20,7 @@ from experiments.common.config import Preset, preset
 from experiments.walking import foreign
 from experiments.walking.cases import check_positive, check_seeds
 from jaxtune import dist as dists
+from jaxtune import pooling
 from jaxtune.mjx import parameters
 from jaxtune.tuner import TunerState, knobs
 from jaxtune.types import Verdict
@@ -78,7 +79,7 @@ def tuned(world: foreign.World, args: Args, policy, seed: int) -> dict:
     """
     truth = draw(world, seed)
     first = parameters.distribution(world.entries, args.radius, {})
-    state = TunerState(policy=policy, dist=first, knobs=knobs())
+    state = TunerState(policy=policy, dist=first, knobs=knobs(), past=pooling.nothing(first))
     before = errors(world, parameters.nominal(world.entries), truth)
     radius = {name: float(value) for name, value in first.radius.items()}
     lines = []

@@ -140,6 +140,11 @@ def explain(info) -> str:
         fit = float(info.update.p_value)
         if fit <= _MISFIT:
             lines.append(f"  fits badly in the distribution that was read last (p {fit:.2f})")
+        past = float(info.update.p_past)
+        if info.update.pooled:
+            lines.append(f"  joined with the sets of earlier tunings, which it does not contradict (p {past:.2f})")
+        elif not np.isnan(past):
+            lines.append(f"  contradicts the sets of earlier tunings (p {past:.2f}), which count no longer")
         replay = float(info.update.p_replay)
         if info.update.replayed:
             lines.append(f"  estimated from measured states, which fit (p {replay:.2f})")

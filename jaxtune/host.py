@@ -28,7 +28,7 @@ from jaxtune.gate import Verify, calibrated_gate
 from jaxtune.misfits import Misfits, Phase, misfits, share_of_episode
 from jaxtune.readings import examine
 from jaxtune.settings import TunerConfig
-from jaxtune.tuner import Info, Measure, TrainPolicy, Tuner, TunerState, counted, keep, make_info
+from jaxtune.tuner import Info, Measure, TrainPolicy, Tuner, TunerState, counted, ended, keep, make_info
 from jaxtune.types import Trajectory, Verdict
 from jaxtune.update import Update, posterior_update
 
@@ -91,13 +91,13 @@ class HostTuner:
           ValueError: episodes, simulated or measured, do not have the shapes that they should.
         """
         check_set(measured, self.config)
-        carry = self._tuner.before(state.dist)
+        carry = self._tuner.before(state)
         while carry["left"] > 0:
             key_collect, key_verify, key_update = jax.random.split(jax.random.fold_in(key, carry["rounds"]), 3)
             collected = self._tuner.collect(key_collect, state.policy, carry["dist"])
             check_measured(measured, collected.trajectory, self.config)
             # Once for gate and update.
-            collected = collected.replace(reading=self._examine(collected, measured))
+            collected = collected.replace(reading=self._examine(collected, measured), past=carry["past"])
             carry = counted(carry, collected)
             if carry["verdict"] == Verdict.WIDEN:
                 gate = self._verify(key_verify, collected, measured, state.knobs)
@@ -105,7 +105,7 @@ class HostTuner:
             if carry["verdict"] == Verdict.ACCEPT:
                 updated = self._update(key_update, collected, measured, carry["dist"], state.knobs)
                 carry = self._refine(carry, *updated, state.knobs)
-        return state.replace(dist=carry["dist"]), make_info(carry, measured)
+        return self._ended(state, carry), make_info(carry, measured)
 
     def misfits(self, key: jax.Array, state: TunerState, measured: Trajectory) -> Misfits:
         """Says which observations and actions no parameters explain, and in which phase, as `Tuner.misfits` does."""
@@ -137,6 +137,10 @@ class HostTuner:
     @cached_property
     def _refine(self):
         return jax.jit(self._tuner.refine)
+
+    @cached_property
+    def _ended(self):
+        return jax.jit(ended)
 
     @cached_property
     def _decide(self):

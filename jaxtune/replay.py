@@ -28,7 +28,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float
 
-from jaxtune import conformal, devices
+from jaxtune import conformal, devices, pooling
 from jaxtune import dist as dists
 from jaxtune.types import Coords, ParamDist, Trajectory
 
@@ -42,6 +42,9 @@ _FURTHEST = 1.0  # radii that one step may move
 _SHORTER = 0.3  # share of a step that is tried after one that did not lower the cost
 _BROKEN = 1e3  # whitened error of a piece whose simulation is not finite
 _SETS = {"cpu": 1, "other": 20}  # fitted side by side on a device
+
+Pool = Callable[[jax.Array, jax.Array, jax.Array], tuple[jax.Array, jax.Array, jax.Array]]
+"""`pooling.joined` of one measured robot: `(estimates [sets + 1, coords], truth [sets, coords], valid [sets])`."""
 
 
 @dataclass(frozen=True)
@@ -87,6 +90,8 @@ class Replayed:
     interval: jax.Array  # [coords] half widths, in which all true coordinates lie together
     errors: jax.Array  # [coords, coords] mean product of the errors of simulated sets
     p_value: jax.Array  # (1 + #{simulated sets that misfit at least as much}) / (sets + 1)
+    pooled: jax.Array  # whether earlier sets count in the estimate (`jaxtune.pooling`)
+    p_past: jax.Array  # of what contradicts them; nan where they said nothing
 
 
 @chex.dataclass(frozen=True)
@@ -124,6 +129,7 @@ def estimate(
     coverage: float,
     others: Trajectory,
     true_others: Coords,
+    pool: Pool = pooling.alone,
 ) -> Replayed:
     """Estimates the coordinates of a measured set, and how far the estimate may be off.
 
@@ -143,6 +149,7 @@ def estimate(
       others: as many simulated sets again, which say how features err. Others than the fitted ones: what was learnt of
         a set fits it better than it fits the measured one.
       true_others: their coordinates.
+      pool: joins estimates with what earlier sets said.
 
     Returns:
       What was found; not finite where the measured set has no whole piece, or hardly any simulated one has.
@@ -158,7 +165,8 @@ def estimate(
     fits = _fit(config, replay, pieces, cut(others), dists.normalise(dist, true_others), dist)
     # A set without a piece says nothing, and counts as one that is fitted badly.
     known = pieces.valid.any(axis=-1)
-    error = jnp.where(known[:-1, None], fits.best[:-1] - truth, jnp.nan)
+    best, pooled, p_past = pool(fits.best, truth, known[:-1])
+    error = jnp.where(known[:-1, None], best[:-1] - truth, jnp.nan)
     deviations = jax.vmap(lambda normal: jnp.sqrt(jnp.diag(jnp.linalg.inv(normal))))(fits.normal)
     # Slopes that jump make some standard errors far too small.
     deviations = jnp.hypot(deviations, jnp.maximum(_medians(jnp.abs(error)), _CLOSEST))
@@ -166,10 +174,12 @@ def estimate(
     logs = jnp.where(pieces.valid, jnp.log1p(fits.energy), 0.0).sum(axis=-1) / jnp.maximum(pieces.valid.sum(axis=-1), 1)
     left = jnp.nan_to_num(error)
     return Replayed(
-        estimate=jnp.where(known[-1], fits.best[-1], jnp.nan),
+        estimate=jnp.where(known[-1], best[-1], jnp.nan),
         interval=deviations[-1] * conformal.quantile(scaled, coverage),
         errors=left.T @ left / known[:-1].sum(),
         p_value=conformal.p_value(jnp.where(known, logs, jnp.inf)),
+        pooled=pooled,
+        p_past=p_past,
     )
 
 

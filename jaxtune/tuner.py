@@ -35,6 +35,8 @@ Departures from the paper, besides those of `jaxtune.gate` and `jaxtune.update`:
   not fit there (`UpdateInfo.p_value` <= 1 - level), the radius before is taken back. If it does not whatever the
   coordinates when it is read again for the first time (`p_misfit` <= 0.01), the verdict becomes `unexplained`: in a
   wide distribution, parameters can absorb what is missing.
+- Physics does not depend on which policy walked, so estimates are joined with what the accepted sets of earlier tunings
+  said (`jaxtune.pooling`). A set that contradicts them, or that the gate rejects, makes them count no longer.
 - Where the robot's states are measured (`Tuner.replay`), the accepted set is read a last time, by simulating short
   pieces of it from measured states (`jaxtune.replay`). That estimate is taken if it errs less on simulated sets than
   the one before, and if the measured set fits it (`UpdateInfo.p_replay` > 1 - level).
@@ -73,6 +75,7 @@ disk, a robot), leave `measure` out, loop over `tuner.train` and `tuner.tune`, a
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import chex
@@ -80,13 +83,14 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from jaxtune import conformal, windows
+from jaxtune import conformal, pooling, windows
 from jaxtune import dist as dists
 from jaxtune import replay as replays
 from jaxtune.checks import check_measured, check_simulated, check_states
 from jaxtune.explain import explain
 from jaxtune.gate import GateInfo, Verify, calibrated_gate, no_gate_log
 from jaxtune.misfits import Misfits, Phase, misfits, share_of_episode
+from jaxtune.pooling import Past
 from jaxtune.readings import Collected, examine
 from jaxtune.replay import Replay
 from jaxtune.settings import Knobs, TunerConfig, knobs
@@ -181,6 +185,18 @@ class TunerState:
     policy: Any
     dist: ParamDist
     knobs: Knobs
+    past: Past  # what the sets of earlier tunings said of the coordinates
+
+
+def ended(state: TunerState, carry: dict) -> TunerState:
+    """Makes the state after a tuning, from the one before and what its loop carried last."""
+    dist, update, unit = carry["dist"], carry["update"], dists.ravel(carry["tested"].radius)
+    # What no set identifies is not estimated, though the update knows errors of guesses.
+    told = jnp.outer(update.identifiable, update.identifiable)
+    errors = jnp.where(told, update.errors * jnp.outer(unit, unit), jnp.nan)
+    learnt = Past(estimate=dists.ravel(dist.centre), errors=errors.astype(jnp.float32))
+    accepted = carry["verdict"] == Verdict.ACCEPT
+    return state.replace(dist=dist, past=optax.tree.where(accepted, learnt, carry["past"]))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -218,7 +234,7 @@ class Tuner:
 
         A tuning measures before it trains, so `policy` should have been trained in `dist` already (`train` does that).
         """
-        return TunerState(policy=policy, dist=dist, knobs=knobs)
+        return TunerState(policy=policy, dist=dist, knobs=knobs, past=pooling.nothing(dist))
 
     def step(self, key: jax.Array, state: TunerState) -> tuple[TunerState, Info]:
         """Does one tuning: measures a set, tunes the distribution with it, and trains the policy in the result.
@@ -279,7 +295,7 @@ class Tuner:
             key_collect, key_verify, key_update = jax.random.split(jax.random.fold_in(key, carry["rounds"]), 3)
             collected = self.collect(key_collect, state.policy, carry["dist"])
             # Once for gate and update; left out of the program where neither reads it.
-            collected = collected.replace(reading=examine(self.config, collected, measured))
+            collected = collected.replace(reading=examine(self.config, collected, measured), past=carry["past"])
             carry, last = counted(carry, collected), carry["left"] <= 0
             # Branches, so that (unless vmapped) no model is trained that is not needed.
             carry = jax.lax.cond(
@@ -300,16 +316,19 @@ class Tuner:
             )
             if self.replay is None:
                 return carry
-            return jax.lax.cond(last, lambda: self.sharpen(carry, collected, measured, state.knobs), lambda: carry)
+            return jax.lax.cond(
+                last, lambda: self.sharpen(key_update, carry, collected, measured, state.knobs), lambda: carry
+            )
 
         def goes_on(carry):
             return (carry["left"] > 0) | ((carry["verdict"] == Verdict.ACCEPT) & ~carry["sharpened"])
 
-        carry = jax.lax.while_loop(goes_on, body, self.before(state.dist))
-        return state.replace(dist=carry["dist"]), make_info(carry, measured)
+        carry = jax.lax.while_loop(goes_on, body, self.before(state))
+        return ended(state, carry), make_info(carry, measured)
 
-    def before(self, dist: ParamDist) -> dict:
+    def before(self, state: TunerState) -> dict:
         """Makes what the loop of a tuning carries before its first round; it ends when no rounds are `left`."""
+        dist = state.dist
         return {
             "rounds": jnp.zeros((), int),
             "left": jnp.asarray(1 + self.config.refinements, int),
@@ -317,6 +336,7 @@ class Tuner:
             "dist": dist,
             "tested": dist,
             "wider": dist.radius,
+            "past": state.past,
             "update": no_update(dist),
             "verdict": jnp.asarray(Verdict.WIDEN, int),
             "not_finite": jnp.zeros((), int),
@@ -339,11 +359,14 @@ class Tuner:
         verdict = jnp.asarray(self._verdict(gate, dist, calls), int)
         goes_on = (verdict == Verdict.WIDEN) | (verdict == Verdict.ACCEPT)
         wider = dists.widen(dist, knobs.widen_factor)
+        # A set outside the distribution that earlier ones led to says that they misled.
+        past = optax.tree.where(verdict == Verdict.WIDEN, pooling.nothing(dist), carry["past"])
         return carry | {
             "left": jnp.where(goes_on, carry["left"], 0),
             "calls": calls + 1,
             "tested": dist,
             "dist": optax.tree.where(verdict == Verdict.WIDEN, wider, dist),
+            "past": past,
             "verdict": verdict,
             "verdicts": carry["verdicts"].at[calls].set(verdict),
             "radius": carry["radius"].at[calls].set(dists.ravel(dist.radius).max()),
@@ -397,10 +420,11 @@ class Tuner:
             "verdicts": carry["verdicts"].at[carry["calls"] - 1].set(verdict),
         }
 
-    def sharpen(self, carry: dict, collected: Collected, measured: Trajectory, knobs: Knobs) -> dict:
+    def sharpen(self, key: jax.Array, carry: dict, collected: Collected, measured: Trajectory, knobs: Knobs) -> dict:
         """Estimates once more, from the states of an accepted set (`replay.estimate`).
 
         Args:
+          key: random key.
           carry: from `refine`.
           collected: of the distribution that it left.
           measured: the measured set, with states.
@@ -414,7 +438,8 @@ class Tuner:
         sizes, held_out = self.config.replay, (collected.held_out, collected.held_out_coords)
         # The last ones are others than the first where there are twice as many.
         first, last = (jax.tree.map(lambda leaf, part=part: leaf[part], held_out) for part in sizes.parts)
-        found = replays.estimate(sizes, self.replay, *first, measured, dist, self.config.coverage, *last)
+        pool = partial(pooling.joined, key, carry["past"], dist)
+        found = replays.estimate(sizes, self.replay, *first, measured, dist, self.config.coverage, *last, pool)
         radius, unit = dists.ravel(dist.radius), dists.ravel(tested.radius)
         errors = found.errors * jnp.outer(radius / unit, radius / unit)
         # An update that gives no errors gives no reason to keep its estimate.
@@ -429,6 +454,8 @@ class Tuner:
             identifiable=before.identifiable | (found.interval < 1.0),
             errors=errors,
             replayed=jnp.asarray(True),
+            pooled=found.pooled,
+            p_past=found.p_past,
         )
         update = optax.tree.where(taken, update, before).replace(p_replay=found.p_value)
         return carry | {

@@ -15,12 +15,13 @@ Departures from the paper:
 
 import math
 from collections.abc import Callable
+from functools import partial
 
 import chex
 import jax
 import jax.numpy as jnp
 
-from jaxtune import conformal, regression, spm
+from jaxtune import conformal, pooling, regression, spm
 from jaxtune import dist as dists
 from jaxtune.readings import LEAST_ERROR, Collected, excess, misses, reading_of
 from jaxtune.settings import Knobs, TunerConfig
@@ -50,6 +51,8 @@ class UpdateInfo:
     errors: jax.Array = math.nan  # [coords, coords] mean product of the errors of held-out estimates, in radii
     p_replay: jax.Array = math.nan  # scalar: of what the simulator misses from measured states at the estimate
     replayed: jax.Array = False  # scalar: whether the estimate is that from measured states (`jaxtune.replay`)
+    pooled: jax.Array = False  # scalar: whether the sets of earlier tunings count in the estimate (`jaxtune.pooling`)
+    p_past: jax.Array = math.nan  # scalar: of what contradicts them; nan where they said nothing
 
 
 Update = Callable[[jax.Array, TunerConfig, Collected, Trajectory, ParamDist, Knobs], tuple[ParamDist, UpdateInfo]]
@@ -61,9 +64,10 @@ def posterior_update(
 ) -> tuple[ParamDist, UpdateInfo]:
     """Moves the centre to the posterior's median and narrows the radius to its interval: the default update.
 
-    A regression on D_q gives each coordinate's estimate (`jaxtune.regression`). Held-out sets, whose coordinates are
-    known, calibrate it. With Q the conformal quantile `coverage` over held-out sets, e the regression's error of an
-    episode that it leaves out, and all values in radii,
+    A regression on D_q gives each coordinate's estimate (`jaxtune.regression`), which is joined with what the sets of
+    earlier tunings said (`jaxtune.pooling`). Held-out sets, whose coordinates are known, calibrate it. With Q the
+    conformal quantile `coverage` over held-out sets, e the regression's error of an episode that it leaves out, and all
+    values in radii,
 
         interval     = e Q(max over coordinates of |estimate - truth| / e)
         wide         = the same with a quantile of 1 - (1 - coverage) / 10
@@ -85,19 +89,21 @@ def posterior_update(
     box, and not merely past a bound, all keep their radii, and centres move.
 
     Args:
-      key: not used.
+      key: random key, for what earlier sets would have said of the held-out ones' robots.
       config: sizes, with `coverage` and `min_radius`.
-      collected: D_q and held-out sets, drawn from `dist`.
+      collected: D_q and held-out sets, drawn from `dist`, and what earlier sets said.
       measured: the accepted measured set, [set_episodes, time].
       dist: the distribution that the episodes were drawn from.
       knobs: not used.
     """
     reading = reading_of(config, collected, measured)
     model, (low, high) = reading.model, dists.normalised_box(dist)
-    estimates = jnp.clip(reading.answers, low, high)
     # The errors on robots with known coordinates stand for the error on the measured one. A set without a window is
     # answered blindly.
     truth, known = dists.normalise(dist, collected.held_out_coords), ~jnp.isnan(reading.misfit[:-1, None])
+    pool = pooling.alone if collected.past is None else partial(pooling.joined, key, collected.past, dist)
+    joined, pooled, p_past = pool(jnp.clip(reading.answers, low, high), truth, known[:, 0])
+    estimates = jnp.clip(joined, low, high)
     off = jnp.where(known, estimates[:-1] - truth, 0.0)
     ignorant = jnp.where(known, jnp.abs((low + high) / 2 - truth), jnp.nan)
     interval, wide, identifiable = _calibrate(config, model, jnp.where(known, jnp.abs(off), jnp.nan), ignorant)
@@ -121,6 +127,8 @@ def posterior_update(
         p_value=conformal.p_value(jnp.fmax(found["misfit"], found["beyond"])),
         p_misfit=conformal.p_value(found["misfit"]),
         errors=off.T @ off / jnp.maximum(known.sum(), 1),
+        pooled=pooled,
+        p_past=p_past,
     )
 
 
@@ -168,6 +176,8 @@ def no_update(dist: ParamDist) -> UpdateInfo:
         errors=jnp.full((len(zeros), len(zeros)), jnp.nan),
         p_replay=nan,
         replayed=jnp.asarray(False),
+        pooled=jnp.asarray(False),
+        p_past=nan,
     )
 
 

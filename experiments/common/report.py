@@ -42,9 +42,9 @@ def tuning(info: Info) -> dict:
     Returns:
       `verdicts`, `radius` and the gate's numbers as lists over its calls; the update's `step` and `interval` by
       parameter, in radii, and whether the parameter was `identifiable`; those that are `weak`, and the
-      combinations that are known `together`; the p-values of the update's fit; whether the estimate was `replayed` from
-      measured states; the number of falls and of episodes with values that are not finite; and means of the training
-      metrics.
+      combinations that are known `together`; the p-values of the update's fit; whether the sets of earlier tunings
+      were `pooled` with this one, and whether the estimate was `replayed` from measured states; the number of falls and
+      of episodes with values that are not finite; and means of the training metrics.
     """
     calls = int(info.calls)
     order = dists.names(info.dist)
@@ -65,6 +65,8 @@ def tuning(info: Info) -> dict:
         "fit_p_value": float(info.update.p_value),
         "misfit_p_value": float(info.update.p_misfit),
         "replay_p_value": float(info.update.p_replay),
+        "past_p_value": float(info.update.p_past),
+        "pooled": bool(info.update.pooled),
         "replayed": bool(info.update.replayed),
         "measured_falls": int(info.measured_falls),
         "not_finite": int(info.not_finite),

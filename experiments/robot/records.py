@@ -126,6 +126,10 @@ class Tuning:
     """That of misfit alone; at most 0.01 where the verdict is `unexplained`."""
     replay_p_value: float | None
     """Conformal p-value of misfit from measured states; None where a log does not hold them."""
+    past_p_value: float | None
+    """That of what contradicts earlier rounds; None where they said nothing."""
+    pooled: bool
+    """Whether earlier rounds count in the estimate."""
     replayed: bool
     """Whether the estimate was found from measured states."""
     measured_falls: int

@@ -138,6 +138,8 @@ def line(verdicts, measured, predicted, explained=0.5, cut_short=0, suspected=()
         "fit_p_value": 0.4,
         "misfit_p_value": 0.5,
         "replay_p_value": None,
+        "past_p_value": None,
+        "pooled": False,
         "replayed": False,
         "measured_falls": 0,
         "not_finite": 0,

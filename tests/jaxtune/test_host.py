@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import toys
 
+from jaxtune import pooling
 from jaxtune.gate import calibrated_gate
 from jaxtune.host import HostTuner, one_by_one
 from jaxtune.tuner import Tuner, TunerState, explain, keep, knobs
@@ -19,7 +20,8 @@ SLIDER = toys.Slider()
 
 
 def state(radius=0.2):
-    return TunerState(policy=toys.policy(), dist=toys.uniform(TWO, radius), knobs=knobs())
+    dist = toys.uniform(TWO, radius)
+    return TunerState(policy=toys.policy(), dist=dist, knobs=knobs(), past=pooling.nothing(dist))
 
 
 @pytest.fixture(scope="module")
