@@ -31,6 +31,7 @@ from jaxtune.selftest import Rate, SelfTest
 
 _NO_ROOM = "bounds leave no room"
 _ENOUGH = 0.8  # power that a parameter should have
+_NONE = "none"
 _OTHER = 0.75  # of a multiplier that is not tuned, or of the way from nominal to an offset's bound
 
 
@@ -62,8 +63,8 @@ class Args:
     """Whole tunings of each of these robots, one after another; the policy stays as it is."""
     others: tuple[str, ...] = ()
     """Differences that the gate should notice, as name=value in physical values: torque_scale=0.75, or '*_mass=2' for
-    all tuned masses at once. Several names are joined by commas. If none, every parameter of the robot that is not
-    tuned, one at a time."""
+    all tuned masses at once. Several names are joined by commas. By default every parameter of the robot that is not
+    tuned, one at a time; with 'none', no difference."""
     level: float = 0.95
     """Share of sets that the gate should let pass."""
     preset: str = "cpu"
@@ -92,6 +93,8 @@ def other_cases(robot: Kind, tuned: Mapping[str, Entry], options: Sequence[str])
     Raises:
       ValueError: an option is not of the form, or names no parameter, or a value is out of bounds.
     """
+    if tuple(options) == (_NONE,):
+        return {}
     if not options:
         return {
             f"{name}={_different(entry):g}": {name: _different(entry)}

@@ -31,7 +31,7 @@ def play():
     params = nominal(sim.parameters)
 
     def play(act, **changes):
-        values = {name: jnp.full(2, value) for name, value in (params | changes).items()}
+        values = {name: jnp.broadcast_to(jnp.asarray(value), 3) for name, value in (params | changes).items()}
         return sim.rollout(jax.random.key(0), lambda policy, obs, key: act(obs), None, values)
 
     return sim, jax.jit(play, static_argnums=0)
@@ -44,7 +44,7 @@ def test_it_stands_and_falls(play):
     assert not still.fell.any()
     assert still.alive.all()
     # Gravity in the body frame, of a robot that stands level.
-    np.testing.assert_allclose(still.obs[:, -1, 3:6], [[0, 0, -1]] * 2, atol=0.1)
+    np.testing.assert_allclose(still.obs[:, -1, 3:6], [[0, 0, -1]] * 3, atol=0.1)
     # Legs that are pulled up let it fall, and the rest of the episode does not count.
     folded = run(lambda obs: jnp.tile(jnp.array([0.0, 8.0, -4.0]), 4))
     assert folded.fell.all()
@@ -56,7 +56,7 @@ def test_its_parameters_are_felt(play):
     sim, run = play
     still = lambda obs: jnp.zeros(12)  # noqa: E731
     # A heavier base bends the rear knees further.
-    knee = [float(run(still, base_mass=mass).obs[0, -1, 17]) for mass in (0.6, 1.0, 1.8)]
+    knee = run(still, base_mass=jnp.array([0.6, 1.0, 1.8])).obs[:, -1, 17]
     assert knee[0] > knee[1] > knee[2]
     centre = from_coords(sim.parameters, sim.dist(0.2).centre)
     assert {name: float(value) for name, value in centre.items()} == pytest.approx(nominal(sim.parameters))

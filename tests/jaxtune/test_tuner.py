@@ -760,6 +760,10 @@ def test_simulated_episodes_of_another_shape_are_refused(refuse, wrong, message)
 # The updates on the slider -----------------------------------------------------------------------------------------
 
 
+# One program for all tests of the same sizes.
+posterior = jax.jit(posterior_update, static_argnums=1)
+
+
 def apply(update, seed, dist, truth):
     key = jax.random.key(seed)
     measured = SLIDER.measure(truth, 3)(jax.random.fold_in(key, 2), toys.policy())
@@ -785,7 +789,7 @@ def test_vote_moves_half_a_radius_towards_the_truth(side):
 def test_posterior_moves_to_the_truth_narrows_and_leaves_the_unseen_alone(side):
     dist = toys.uniform(THREE | {"colour": 0.1}, 0.4)
     truth = {"friction": side * 0.25, "mass": -side * 0.25}
-    moved, info = apply(tuners.posterior_update, 0, dist, truth)
+    moved, info = apply(posterior, 0, dist, truth)
     np.testing.assert_array_equal(info.identifiable, [False, True, True])
     for name, value in truth.items():
         assert abs(moved.centre[name] - value) < 0.08
@@ -864,7 +868,7 @@ def test_coordinates_that_trade_against_each_other_are_known_together():
     )
     collected = machine.collect(key_simulate, toys.policy(), dist)
     measured = SLIDER.measure({"friction": 0.1, "mass": 0.2}, 3)(key_measure, toys.policy())
-    _, update = tuners.posterior_update(key_measure, toys.TUNER, collected, measured, dist, knobs())
+    _, update = posterior(key_measure, toys.TUNER, collected, measured, dist, knobs())
     info = SimpleNamespace(dist=dist, update=update)
     np.testing.assert_array_equal(explain.weak(info), [False, True, True])
     (both,) = explain.combinations(info)
@@ -880,16 +884,13 @@ def test_simulated_sets_that_fall_before_a_window_widen_no_interval():
     fallen = jnp.arange(len(collected.held_out.alive)) < 4
     alive = collected.held_out.alive & ~fallen[:, None, None]
     some = collected.replace(held_out=collected.held_out.replace(alive=alive))
-    intervals = [
-        tuners.posterior_update(key, toys.TUNER, each, measured, dist, knobs())[1].interval
-        for each in (collected, some)
-    ]
+    intervals = [posterior(key, toys.TUNER, each, measured, dist, knobs())[1].interval for each in (collected, some)]
     np.testing.assert_allclose(intervals[1], intervals[0], rtol=0.3)
 
 
 def test_posterior_narrows_no_further_than_it_may():
     dist = toys.uniform(THREE, 0.06)
-    moved, info = apply(tuners.posterior_update, 1, dist, TWO)
+    moved, info = apply(posterior, 1, dist, TWO)
     assert info.identifiable[2]
     for name in TWO:
         assert 0.05 <= moved.radius[name] <= 0.06
@@ -899,7 +900,7 @@ def test_an_interval_that_reaches_past_the_box_does_not_narrow_it():
     # The truth lies two radii out. The held-out sets all lie inside, so their errors say nothing of it, and a narrow
     # box at the edge shuts it out for good where the gate is too weak to reject it.
     dist = toys.uniform(THREE, 0.2)
-    moved, _ = apply(tuners.posterior_update, 2, dist, {"friction": 0.0, "mass": 0.4})
+    moved, _ = apply(posterior, 2, dist, {"friction": 0.0, "mass": 0.4})
     assert moved.centre["mass"] > 0.15
     assert moved.radius["mass"] >= 0.2
 
@@ -1141,9 +1142,7 @@ def test_a_set_that_the_regression_cannot_read_is_not_comparable():
     dist = toys.uniform(TWO, 0.2)
     broken = one.replace(obs=one.obs.at[0, 5, 0].set(jnp.nan))
     for says_nothing in (short, broken):
-        moved, update = jax.jit(posterior_update, static_argnums=1)(
-            jax.random.key(0), config, collected, says_nothing, dist, knobs()
-        )
+        moved, update = posterior(jax.random.key(0), config, collected, says_nothing, dist, knobs())
         assert not update.identifiable.any()
         jax.tree.map(np.testing.assert_array_equal, moved, dist)
     # Simulated sets must be long enough for both models as well.
