@@ -3,7 +3,8 @@
 import jax
 import jax.numpy as jnp
 
-_ROUNDING = 1e-5  # less than the distance of two p-values of as many sets as anybody simulates
+ROUNDING = 1e-5
+"""Less than the distance of two p-values of as many sets as anybody simulates."""
 
 
 def p_value(scores: jax.Array) -> jax.Array:
@@ -15,7 +16,7 @@ def p_value(scores: jax.Array) -> jax.Array:
 
 def rejects(p_value: jax.Array, level: jax.Array | float) -> jax.Array:
     """Whether a p-value is at most `1 - level`. Both are rounded, which must not cost a rank; nan rejects nothing."""
-    return p_value <= 1.0 - level + _ROUNDING
+    return p_value <= 1.0 - level + ROUNDING
 
 
 def quantile(values: jax.Array, level: jax.Array | float) -> jax.Array:

@@ -28,7 +28,7 @@ from jaxtune.gate import Verify, calibrated_gate
 from jaxtune.misfits import Misfits, Phase, misfits, share_of_episode
 from jaxtune.readings import examine
 from jaxtune.settings import TunerConfig
-from jaxtune.tuner import Info, Measure, TrainPolicy, Tuner, TunerState, counted, ended, keep, make_info
+from jaxtune.tuner import Info, Measure, TrainPolicy, Tuner, TunerState, counted, keep, known_after, make_info
 from jaxtune.types import Trajectory, Verdict
 from jaxtune.update import Update, posterior_update
 
@@ -105,7 +105,7 @@ class HostTuner:
             if carry["verdict"] == Verdict.ACCEPT:
                 updated = self._update(key_update, collected, measured, carry["dist"], state.knobs)
                 carry = self._refine(carry, *updated, state.knobs)
-        return self._ended(state, carry), make_info(carry, measured)
+        return state.replace(dist=carry["dist"], past=known_after(carry)), make_info(carry, measured)
 
     def misfits(self, key: jax.Array, state: TunerState, measured: Trajectory) -> Misfits:
         """Says which observations and actions no parameters explain, and in which phase, as `Tuner.misfits` does."""
@@ -137,10 +137,6 @@ class HostTuner:
     @cached_property
     def _refine(self):
         return jax.jit(self._tuner.refine)
-
-    @cached_property
-    def _ended(self):
-        return jax.jit(ended)
 
     @cached_property
     def _decide(self):

@@ -38,7 +38,7 @@ class Collected:
     dist: ParamDist  # what all coordinates were drawn from
     # What `examine` reads of these and the measured set; gate and update read it themselves where it is None.
     reading: Any = None
-    # What earlier sets of the measured robot said (`pooling.Past`), which the update counts in.
+    # What earlier sets of the measured robot said (`pooling.Past`), which the update counts in; None if nothing.
     past: Any = None
 
 

@@ -28,7 +28,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float
 
-from jaxtune import conformal, devices, pooling
+from jaxtune import conformal, devices
 from jaxtune import dist as dists
 from jaxtune.types import Coords, ParamDist, Trajectory
 
@@ -129,7 +129,7 @@ def estimate(
     coverage: float,
     others: Trajectory,
     true_others: Coords,
-    pool: Pool = pooling.alone,
+    pool: Pool | None = None,
 ) -> Replayed:
     """Estimates the coordinates of a measured set, and how far the estimate may be off.
 
@@ -149,7 +149,7 @@ def estimate(
       others: as many simulated sets again, which say how features err. Others than the fitted ones: what was learnt of
         a set fits it better than it fits the measured one.
       true_others: their coordinates.
-      pool: joins estimates with what earlier sets said.
+      pool: joins estimates with what earlier sets said, if any did.
 
     Returns:
       What was found; not finite where the measured set has no whole piece, or hardly any simulated one has.
@@ -165,7 +165,9 @@ def estimate(
     fits = _fit(config, replay, pieces, cut(others), dists.normalise(dist, true_others), dist)
     # A set without a piece says nothing, and counts as one that is fitted badly.
     known = pieces.valid.any(axis=-1)
-    best, pooled, p_past = pool(fits.best, truth, known[:-1])
+    best, pooled, p_past = fits.best, jnp.asarray(False), jnp.asarray(jnp.nan)
+    if pool is not None:
+        best, pooled, p_past = pool(best, truth, known[:-1])
     error = jnp.where(known[:-1, None], best[:-1] - truth, jnp.nan)
     deviations = jax.vmap(lambda normal: jnp.sqrt(jnp.diag(jnp.linalg.inv(normal))))(fits.normal)
     # Slopes that jump make some standard errors far too small.

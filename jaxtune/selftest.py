@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxtune import devices
+from jaxtune import devices, pooling
 from jaxtune import dist as dists
 from jaxtune.tuner import Info, Tuner, TunerState
 from jaxtune.types import Coords, ParamDist, Verdict
@@ -242,7 +242,9 @@ def _tune(
         for robot in range(robots):
             key_robot = jax.random.fold_in(jax.random.fold_in(key, number), robot)
             key_draw, *keys = jax.random.split(key_robot, 1 + 2 * tunings)
-            coords, now = _draw(key_draw, state.dist, 1, replaced, extra), state
+            coords = _draw(key_draw, state.dist, 1, replaced, extra)
+            # What is known of the real robot says nothing of this one.
+            now = state.replace(past=pooling.nothing(state.dist))
             for index, (key_measure, key_tune) in enumerate(zip(keys[::2], keys[1::2], strict=True)):
                 measured = jax.tree.map(lambda leaf: leaf[0], measure(key_measure, now, coords))
                 # The state stays on its devices: from others the programs would be compiled anew.

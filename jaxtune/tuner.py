@@ -188,15 +188,14 @@ class TunerState:
     past: Past  # what the sets of earlier tunings said of the coordinates
 
 
-def ended(state: TunerState, carry: dict) -> TunerState:
-    """Makes the state after a tuning, from the one before and what its loop carried last."""
-    dist, update, unit = carry["dist"], carry["update"], dists.ravel(carry["tested"].radius)
-    # What no set identifies is not estimated, though the update knows errors of guesses.
-    told = jnp.outer(update.identifiable, update.identifiable)
-    errors = jnp.where(told, update.errors * jnp.outer(unit, unit), jnp.nan)
-    learnt = Past(estimate=dists.ravel(dist.centre), errors=errors.astype(jnp.float32))
-    accepted = carry["verdict"] == Verdict.ACCEPT
-    return state.replace(dist=dist, past=optax.tree.where(accepted, learnt, carry["past"]))
+def _contradicts(found: UpdateInfo | replays.Replayed) -> jax.Array:
+    """Tells whether a set contradicts earlier ones."""
+    return ~jnp.asarray(found.pooled) & ~jnp.isnan(found.p_past)
+
+
+def known_after(carry: dict) -> Past:
+    """What all sets so far say after a tuning, from what its loop carried last."""
+    return optax.tree.where(carry["verdict"] == Verdict.ACCEPT, carry["update"].learnt, carry["past"])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -324,7 +323,7 @@ class Tuner:
             return (carry["left"] > 0) | ((carry["verdict"] == Verdict.ACCEPT) & ~carry["sharpened"])
 
         carry = jax.lax.while_loop(goes_on, body, self.before(state))
-        return ended(state, carry), make_info(carry, measured)
+        return state.replace(dist=carry["dist"], past=known_after(carry)), make_info(carry, measured)
 
     def before(self, state: TunerState) -> dict:
         """Makes what the loop of a tuning carries before its first round; it ends when no rounds are `left`."""
@@ -359,14 +358,15 @@ class Tuner:
         verdict = jnp.asarray(self._verdict(gate, dist, calls), int)
         goes_on = (verdict == Verdict.WIDEN) | (verdict == Verdict.ACCEPT)
         wider = dists.widen(dist, knobs.widen_factor)
+        following = optax.tree.where(verdict == Verdict.WIDEN, wider, dist)
         # A set outside the distribution that earlier ones led to says that they misled.
-        past = optax.tree.where(verdict == Verdict.WIDEN, pooling.nothing(dist), carry["past"])
+        misled = gate.novelty > gate.threshold
         return carry | {
             "left": jnp.where(goes_on, carry["left"], 0),
             "calls": calls + 1,
             "tested": dist,
-            "dist": optax.tree.where(verdict == Verdict.WIDEN, wider, dist),
-            "past": past,
+            "dist": following,
+            "past": optax.tree.where(misled, pooling.nothing(following), carry["past"]),
             "verdict": verdict,
             "verdicts": carry["verdicts"].at[calls].set(verdict),
             "radius": carry["radius"].at[calls].set(dists.ravel(dist.radius).max()),
@@ -402,6 +402,9 @@ class Tuner:
             interval=update.interval * radius / unit,
             identifiable=before.identifiable | update.identifiable,
             errors=update.errors * jnp.outer(radius / unit, radius / unit),
+            learnt=pooling.nothing(moved) if update.learnt is None else update.learnt,
+            # One contradiction is enough: the readings after it join nothing.
+            p_past=jnp.where(jnp.isnan(update.p_past), before.p_past, update.p_past),
         )
         # Taken back: what the reading before found remains, within the radius that it was found in.
         back = before.replace(
@@ -415,6 +418,7 @@ class Tuner:
                 unexplained, tested, optax.tree.where(misfits, dist.replace(radius=carry["wider"]), moved)
             ),
             "wider": dist.radius,
+            "past": optax.tree.where(_contradicts(update), pooling.nothing(tested), carry["past"]),
             "update": optax.tree.where(unexplained, nothing, optax.tree.where(misfits, back, update)),
             "verdict": verdict,
             "verdicts": carry["verdicts"].at[carry["calls"] - 1].set(verdict),
@@ -444,6 +448,8 @@ class Tuner:
         errors = found.errors * jnp.outer(radius / unit, radius / unit)
         # An update that gives no errors gives no reason to keep its estimate.
         closer = jnp.isnan(before.errors).any() | (jnp.trace(errors) < jnp.trace(before.errors))
+        # What the estimate before errs by is what earlier sets err by, if it is joined with them; these misled.
+        closer |= _contradicts(found)
         fits = ~conformal.rejects(found.p_value, knobs.level)
         known = (found.estimate, found.interval, errors, found.p_value)
         taken = closer & fits & jnp.stack([jnp.isfinite(values).all() for values in known]).all()
@@ -456,6 +462,7 @@ class Tuner:
             replayed=jnp.asarray(True),
             pooled=found.pooled,
             p_past=found.p_past,
+            learnt=pooling.learnt(carry["past"], found.pooled, dist, found.estimate, found.errors),
         )
         update = optax.tree.where(taken, update, before).replace(p_replay=found.p_value)
         return carry | {

@@ -15,14 +15,15 @@ Departures from the paper:
 
 import math
 from collections.abc import Callable
-from functools import partial
 
 import chex
 import jax
 import jax.numpy as jnp
+import optax
 
-from jaxtune import conformal, pooling, regression, spm
+from jaxtune import conformal, pooling, spm
 from jaxtune import dist as dists
+from jaxtune.pooling import Past
 from jaxtune.readings import LEAST_ERROR, Collected, excess, misses, reading_of
 from jaxtune.settings import Knobs, TunerConfig
 from jaxtune.types import ParamDist, Trajectory
@@ -53,6 +54,7 @@ class UpdateInfo:
     replayed: jax.Array = False  # scalar: whether the estimate is that from measured states (`jaxtune.replay`)
     pooled: jax.Array = False  # scalar: whether the sets of earlier tunings count in the estimate (`jaxtune.pooling`)
     p_past: jax.Array = math.nan  # scalar: of what contradicts them; nan where they said nothing
+    learnt: Past | None = None  # what this set and they say, for the next tuning; None where an update does not tell
 
 
 Update = Callable[[jax.Array, TunerConfig, Collected, Trajectory, ParamDist, Knobs], tuple[ParamDist, UpdateInfo]]
@@ -69,7 +71,7 @@ def posterior_update(
     conformal quantile `coverage` over held-out sets, e the regression's error of an episode that it leaves out, and all
     values in radii,
 
-        interval     = e Q(max over coordinates of |estimate - truth| / e)
+        interval     = e Q(max over coordinates of |estimate - truth| / e), with less of e where earlier sets know more
         wide         = the same with a quantile of 1 - (1 - coverage) / 10
         ignorant     = Q(|middle of the box - truth|)
         identifiable = Q(|estimate - truth|) < 0.9 ignorant
@@ -86,7 +88,8 @@ def posterior_update(
     is not finite, leaves the distribution as it is.
 
     A coordinate that is not identifiable keeps centre and radius. Where the interval of one that is reaches past the
-    box, and not merely past a bound, all keep their radii, and centres move.
+    box, and not merely past a bound, all keep their radii, and centres move. The next set is then read as if it were
+    the first, since held-out sets say nothing of errors beyond the box.
 
     Args:
       key: random key, for what earlier sets would have said of the held-out ones' robots.
@@ -101,14 +104,18 @@ def posterior_update(
     # The errors on robots with known coordinates stand for the error on the measured one. A set without a window is
     # answered blindly.
     truth, known = dists.normalise(dist, collected.held_out_coords), ~jnp.isnan(reading.misfit[:-1, None])
-    pool = pooling.alone if collected.past is None else partial(pooling.joined, key, collected.past, dist)
-    joined, pooled, p_past = pool(jnp.clip(reading.answers, low, high), truth, known[:, 0])
+    past = pooling.nothing(dist) if collected.past is None else collected.past
+    answers = jnp.clip(reading.answers, low, high)
+    joined, pooled, p_past = pooling.joined(key, past, dist, answers, truth, known[:, 0])
     estimates = jnp.clip(joined, low, high)
     off = jnp.where(known, estimates[:-1] - truth, 0.0)
     ignorant = jnp.where(known, jnp.abs((low + high) / 2 - truth), jnp.nan)
-    interval, wide, identifiable = _calibrate(config, model, jnp.where(known, jnp.abs(off), jnp.nan), ignorant)
+    # What scales the errors must not come from the sets that calibrate them.
+    scale = pooling.joined_error(past, pooled, dist, jnp.maximum(model.error, LEAST_ERROR))
+    interval, wide, identifiable = _calibrate(config, scale, jnp.where(known, jnp.abs(off), jnp.nan), ignorant)
     # A measured set without a window, or with a number that is not finite, says nothing.
-    identifiable &= ~jnp.isnan(reading.misfit[-1])
+    unread = jnp.isnan(reading.misfit[-1])
+    identifiable &= ~unread
     step = jnp.where(identifiable, estimates[-1], 0.0)
     # Held-out truths all lie in the box, so their errors say nothing of truths beyond it. One that is outside in one
     # coordinate may bend the estimates of all, and narrowing could exclude it for good.
@@ -119,6 +126,9 @@ def posterior_update(
     inside = (inside | ~identifiable).all()
     moved = dists.narrow(dists.move(dist, step), jnp.where(identifiable & inside, wide, 1.0), config.min_radius)
     found = {name: excess(name, values) for name, values in misses(reading).items()}
+    errors = off.T @ off / jnp.maximum(known.sum(), 1)
+    learnt = pooling.learnt(past, pooled, dist, estimates[-1], errors)
+    learnt = optax.tree.where(inside, learnt, pooling.nothing(moved))
     return moved, UpdateInfo(
         step=step,
         interval=interval,
@@ -126,9 +136,10 @@ def posterior_update(
         loss=model.error.mean(),
         p_value=conformal.p_value(jnp.fmax(found["misfit"], found["beyond"])),
         p_misfit=conformal.p_value(found["misfit"]),
-        errors=off.T @ off / jnp.maximum(known.sum(), 1),
+        errors=errors,
         pooled=pooled,
         p_past=p_past,
+        learnt=optax.tree.where(unread, past, learnt),
     )
 
 
@@ -178,22 +189,21 @@ def no_update(dist: ParamDist) -> UpdateInfo:
         replayed=jnp.asarray(False),
         pooled=jnp.asarray(False),
         p_past=nan,
+        learnt=pooling.nothing(dist),
     )
 
 
 def _calibrate(
-    config: TunerConfig, model: regression.Regression, error: jax.Array, ignorant: jax.Array
+    config: TunerConfig, scale: jax.Array, error: jax.Array, ignorant: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Calibrates the interval, the radius to narrow to and what is identifiable, [coords] each.
 
     Args:
       config: for `coverage` and `refinements`.
-      model: the regression, whose error scales those of all coordinates.
+      scale: [coords] by which the errors of all coordinates are made comparable.
       error: [sets, coords] of held-out sets' estimates, in radii; nan for a set that is left out.
       ignorant: [sets, coords] the same of the middle of the box.
     """
-    # What scales the errors must not come from the sets that calibrate them.
-    scale = jnp.maximum(model.error, LEAST_ERROR)
     missed = 1.0 - config.coverage
     interval, wide = (
         scale * conformal.quantile((error / scale).max(axis=-1), 1.0 - share * missed)

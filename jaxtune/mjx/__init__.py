@@ -17,6 +17,7 @@ This package is the only one in jaxtune that imports MuJoCo; the tuner does with
 
 from jaxtune.mjx.derived_fields import set_const
 from jaxtune.mjx.entry import Entry
+from jaxtune.mjx.environments import model_of, with_model
 from jaxtune.mjx.episodes import Robot, replay, rollout
 from jaxtune.mjx.parameters import (
     Params,
@@ -30,7 +31,7 @@ from jaxtune.mjx.parameters import (
     to_coords,
 )
 from jaxtune.mjx.rows import action_delay, field, friction, mass, parameters_of, strength
-from jaxtune.mjx.simulator import Simulator, model_of, with_model
+from jaxtune.mjx.simulator import Simulator
 from jaxtune.mjx.training import TrainingBatch
 
 __all__ = [

@@ -12,8 +12,6 @@ With `impl="warp"`, where Warp is installed, MuJoCo Warp simulates in MJX's plac
 beforehand how many contacts all robots have room for (Playground's `naconmax`).
 """
 
-import copy
-import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -24,15 +22,14 @@ import chex
 import jax
 import jax.numpy as jnp
 import mujoco
-import numpy as np
-from jax.extend.core import Literal
 from jax.tree_util import Partial
 from mujoco import mjx
 
 from jaxtune import dist as dists
-from jaxtune.mjx import parameters
+from jaxtune.mjx import environments, parameters
 from jaxtune.mjx.derived_fields import DERIVED
 from jaxtune.mjx.entry import Entry
+from jaxtune.mjx.environments import WithModel, data_of, model_of, with_data, with_model
 from jaxtune.mjx.episodes import replay, rollout
 from jaxtune.mjx.parameters import Params
 from jaxtune.replay import Replay
@@ -41,43 +38,6 @@ from jaxtune.types import Coords, ParamDist, Trajectory
 Act = Callable[[Any, Any, jax.Array], jax.Array]
 """A policy: `(policy, observation of one environment, key) -> action [act]`. The policy is a pytree of arrays."""
 _EXPLODED = 1e8  # an observation in whatever unit
-_DATA = ("data", "pipeline_state")
-WithModel = Callable[[Any, mjx.Model], Any]
-"""`(env, model) -> env`: a copy of an environment that simulates this model."""
-
-
-def _is_model(value: Any) -> bool:
-    return isinstance(value, mjx.Model)
-
-
-def _reaching(function: Callable, inputs: Params, *others: Any) -> set[str]:
-    """Names of the inputs that any output of a function may depend on, by its equations; nothing is computed.
-
-    An equation that calls a program counts as one: all that goes in reaches all that comes out.
-    """
-    jaxpr = jax.make_jaxpr(function)(inputs, *others).jaxpr
-    reach = {var: {name} for var, name in zip(jaxpr.invars, sorted(inputs), strict=False)}
-
-    def of(variables) -> set[str]:
-        return set().union(*(reach.get(var, ()) for var in variables if not isinstance(var, Literal)))
-
-    for equation in jaxpr.eqns:
-        if names := of(equation.invars):
-            reach |= dict.fromkeys(equation.outvars, names)
-    return of(jaxpr.outvars)
-
-
-def with_model(env: Any, model: mjx.Model) -> Any:
-    """Copies an environment of MuJoCo Playground or of Brax's MJX backend, and gives the copy another model.
-
-    The copy is shallow, and the environment stays as it was. What an environment computed from its model when it was
-    made (joint limits, a standing height) stays nominal. Where that matters, or for an environment of another make,
-    hand `Simulator` a function of your own.
-    """
-    env = copy.copy(env)
-    # Playground's `mjx_model` is a property that reads `_mjx_model`.
-    setattr(env, next((name for name in ("_mjx_model", "mjx_model") if name in vars(env)), "sys"), model)
-    return env
 
 
 @chex.dataclass(frozen=True)
@@ -130,8 +90,8 @@ class Simulator:
         self._check_warp()
         if not self.parameters:
             raise ValueError("parameters: got none, expected a row for each that may be wrong")
-        self._check_delay()
-        self._check_reach()
+        environments.check_delay(self.env, self.parameters, self.steps)
+        environments.check_reach(self.env, self.model, self.with_model)
         self._check_reset()
         self._check_influence()
 
@@ -146,70 +106,19 @@ class Simulator:
                     "robots; expected another field, or an environment with impl='jax'"
                 )
 
-    def _check_delay(self) -> None:
-        delays = {name: entry for name, entry in self.parameters.items() if entry.kind == "control"}
-        if len(delays) > 1:
-            raise ValueError(f"parameters: got {' and '.join(delays)}, expected one action_delay at most")
-        for name, entry in delays.items():
-            if not hasattr(self.env, "dt"):
-                raise ValueError(f"parameter '{name}': the environment has no dt, the control period in seconds")
-            longest = self.steps * float(self.env.dt)
-            if entry.bounds[1] > longest:
-                raise ValueError(
-                    f"parameter '{name}', bounds: got {entry.bounds} s, expected at most an episode, {longest:g} s"
-                )
-
-    def _check_reach(self) -> None:
-        """Checks that the default `with_model` reaches the model that the environment simulates."""
-        if not callable(self.with_model):
-            raise ValueError(f"with_model: got {self.with_model!r}, expected a function (env, model) -> env")
-        if self.with_model is not with_model:
-            return
-        inner = getattr(self.env, "unwrapped", self.env)
-        if inner is not self.env:
-            raise ValueError(
-                f"env: got {type(self.env).__name__} around {type(inner).__name__}, expected an environment without "
-                "wrappers, or with_model= that gives another model to what it wraps"
-            )
-        model = self.model.replace(body_mass=2.0 * self.model.body_mass)
-        try:
-            reached = model_of(with_model(self.env, model)) is model
-        except (AttributeError, TypeError, ValueError):
-            reached = False
-        if not reached:
-            raise ValueError(
-                f"with_model: got none, and the default does not reach the model of {type(self.env).__name__}; "
-                "expected a function (env, model) -> env"
-            )
-
     def _check_reset(self) -> None:
         """Checks what an environment starts with, by shape: one robot, and the observation that `observe` names."""
         named = (self.observe,) if isinstance(self.observe, str) or callable(self.observe) else self.observe or ()
         if not isinstance(named, Sequence) or not all(isinstance(name, str) or callable(name) for name in named):
             raise ValueError(f"observe: got {self.observe!r}, expected a key, keys, or a function")
-        whole = np.shape(jax.eval_shape(self.observed, self._start.obs))
-        others = [np.shape(getattr(self._start, name)) for name in ("reward", "done")]
-        if any(others) or len(whole) != 1:
-            raise ValueError(
-                f"env: got a reset with an observation of shape {whole}, reward and done of shape "
-                f"{' and '.join(map(str, others))}, expected those of one robot: [obs], () and ()"
-            )
+        environments.check_start(self._start, jax.eval_shape(self.observed, self._start.obs))
         self.layout  # noqa: B018  names what is wrong with `observe`
 
     def _check_influence(self) -> None:
-        """Checks that every parameter reaches the step of the environment, which may simulate another model."""
         nominal = parameters.nominal(self.parameters)
         start = jax.eval_shape(self.reset, nominal, jax.random.PRNGKey(0))
-        if any(_is_model(one) for one in jax.tree.leaves(start, is_leaf=_is_model)):
-            return  # its step may simulate the model that its reset has put there
         action = jax.ShapeDtypeStruct((self.action_size,), jnp.float32)
-        reach = _reaching(lambda *args: self.move(*args)[0], nominal, start, action)
-        for name, entry in self.parameters.items():
-            if name not in reach and entry.kind != "control":
-                raise ValueError(
-                    f"parameter '{name}': got an environment whose step does not depend on it; expected with_model= "
-                    "that gives another model to what simulates, or other fields"
-                )
+        environments.check_influence(lambda *args: self.move(*args)[0], self.parameters, nominal, start, action)
 
     @property
     def entries(self) -> Mapping[str, Entry]:
@@ -295,7 +204,7 @@ class Simulator:
         """Starts an episode of one robot with these parameters; those that are left out are nominal."""
         key_reset, key = jax.random.split(key)
         # Environments of Playground and Brax keep raw keys in their states.
-        start = self._env(params).reset(_raw(key_reset))
+        start = self._env(params).reset(environments.raw(key_reset))
         nothing = jnp.zeros((), jnp.float32)
         return self._as_state(
             start,
@@ -334,7 +243,7 @@ class Simulator:
 
         What else an environment remembers, such as a command, is not among it.
         """
-        data = _data_of(state.env)
+        data = data_of(state.env)
         found = {name: getattr(data, name) for name in ("qpos", "qvel", "act", "qacc_warmstart")}
         return found | {"past": state.past, "steps": state.steps}
 
@@ -346,7 +255,7 @@ class Simulator:
         start = self.reset(params, jax.random.PRNGKey(0))
         own = {name: value for name, value in kept.items() if name not in ("past", "steps")}
         known = {name: kept[name] for name in ("past", "steps") if name in kept}
-        return start.replace(env=_with_data(start.env, _data_of(start.env).replace(**own)), **known)
+        return start.replace(env=with_data(start.env, data_of(start.env).replace(**own)), **known)
 
     @cached_property
     def action_size(self) -> int:
@@ -483,44 +392,9 @@ class Simulator:
         return jnp.ones(1)
 
 
-def model_of(env: Any) -> mjx.Model:
-    """Finds the model of an environment of MuJoCo Playground or of Brax's MJX backend.
-
-    Raises:
-      ValueError: it has none where theirs have it, or is of another engine of Brax.
-    """
-    for name in ("mjx_model", "sys"):
-        model = getattr(env, name, None)
-        if isinstance(model, mjx.Model):
-            # Brax's other engines have a model of the same type, and never read it.
-            if name == "sys" and getattr(env, "backend", "mjx") != "mjx":
-                raise ValueError(f"env: got an environment of Brax's backend '{env.backend}', expected 'mjx'")
-            return model
-    raise ValueError(
-        f"env: got {type(env).__name__}, which has no MJX model in 'mjx_model' (MuJoCo Playground) or 'sys' (Brax with "
-        "backend='mjx'); hand over model= and with_model="
-    )
-
-
-def _data_of(state: Any) -> Any:
-    """Finds MuJoCo's data in the state of an environment of Playground (`data`) or of Brax (`pipeline_state`)."""
-    for name in _DATA:
-        if hasattr(state, name):
-            return getattr(state, name)
-    raise ValueError(f"env: got a state without {' or '.join(_DATA)}, which holds the robot's positions")
-
-
-def _with_data(state: Any, data: Any) -> Any:
-    return dataclasses.replace(state, **{next(name for name in _DATA if hasattr(state, name)): data})
-
-
 def _check_act(act: Any) -> None:
     if not callable(act):
         raise ValueError(f"act: got {type(act).__name__}, expected a function (policy, observation, key) -> action")
-
-
-def _raw(key: jax.Array) -> jax.Array:
-    return key if key.dtype == jnp.uint32 else jax.random.key_data(key)
 
 
 def _get(model: mjx.Model, path: str) -> jax.Array:

@@ -24,6 +24,10 @@ def test_other_cases_are_all_parameters_that_nobody_tunes():
     assert "trunk_mass" in named
 
 
+def test_a_self_test_may_be_of_the_robot_as_it_is():
+    assert selftest.other_cases(BITENO, LEGS, ("none",)) == {}
+
+
 def test_a_row_for_all_overlaps_every_row_of_its_field():
     robot = kind("go2")
     assert robot.entries["strength"].targets is None

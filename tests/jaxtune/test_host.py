@@ -21,7 +21,8 @@ SLIDER = toys.Slider()
 
 def state(radius=0.2):
     dist = toys.uniform(TWO, radius)
-    return TunerState(policy=toys.policy(), dist=dist, knobs=knobs(), past=pooling.nothing(dist))
+    past = pooling.Past(estimate=jnp.array([0.1, -0.1]), errors=0.02 * jnp.eye(2), tunings=jnp.int32(1))
+    return TunerState(policy=toys.policy(), dist=dist, knobs=knobs(), past=past)
 
 
 @pytest.fixture(scope="module")
@@ -55,6 +56,15 @@ def test_the_loop_in_python_gives_what_the_traced_one_gives(tuners, mass):
     for got, expected in zip(jax.tree.leaves((host_moved, host_info)), jax.tree.leaves((moved, info)), strict=True):
         np.testing.assert_allclose(got, expected, rtol=2e-3, atol=2e-3)
     assert explain(host_info).splitlines()[0] == explain(info).splitlines()[0]
+
+
+def test_a_policy_is_whatever_simulate_takes(tuners):
+    _, host, _ = tuners
+    host = dataclasses.replace(host, simulate=lambda key, policy, coords: SLIDER.simulate(key, policy(), coords))
+    measured = SLIDER.measure(TWO, 2)(jax.random.key(0), toys.policy())
+    moved, info = host.tune(jax.random.key(1), state().replace(policy=toys.policy), measured)
+    assert moved.policy is toys.policy
+    assert info.calls >= 1
 
 
 def test_a_distribution_that_changes_compiles_nothing_anew(tuners):

@@ -15,8 +15,8 @@ from jaxtune.tuner import Tuner, TunerConfig
 
 EPISODES, SETS = 3, 19
 NAMES = ("friction", "mass")
-EXACT, NOISY = toys.Slider(noise=0.0), toys.Slider()
-SIZES = {EXACT: ReplayConfig(sets=SETS), NOISY: ReplayConfig(window=20, sets=SETS)}
+EXACT, QUIET, NOISY = toys.Slider(noise=0.0), toys.Slider(noise=0.004), toys.Slider()
+SIZES = {EXACT: ReplayConfig(sets=SETS), **dict.fromkeys((QUIET, NOISY), ReplayConfig(window=20, sets=SETS))}
 
 
 @pytest.fixture(scope="module")
@@ -165,6 +165,24 @@ def test_the_tuner_takes_the_better_estimate(dist, slider, errors, extra, replay
     else:
         jax.tree.map(np.testing.assert_array_equal, after.dist, dist)
         assert "measured states give no better estimate" in tuner.explain(info)
+
+
+@pytest.mark.parametrize("second, agrees", [({"friction": 0.1, "mass": -0.15}, True), ({"friction": -0.1}, False)])
+def test_states_of_several_sets_inform_the_estimate_unless_they_contradict(dist, second, agrees):
+    one = machine(QUIET, verify=accept, update=partial(stay, 0.5))
+    one = dataclasses.replace(one, config=dataclasses.replace(one.config, min_radius=0.2))
+    tune, state = jax.jit(one.tune), one.init(toys.policy(), dist, tuner.knobs())
+    state, info = tune(jax.random.key(0), state, measured(QUIET, friction=0.1, mass=-0.15))
+    assert state.past.tunings == 1
+    assert np.isnan(info.update.p_past)
+    truth = {"mass": -0.15} | second
+    after, info = tune(jax.random.key(1), state, measured(QUIET, seed=4, **truth))
+    assert info.update.replayed
+    assert info.update.pooled == agrees
+    assert after.past.tunings == (2 if agrees else 1)
+    smaller = jnp.trace(after.past.errors) < jnp.trace(state.past.errors)
+    assert smaller or not agrees
+    np.testing.assert_allclose(dists.ravel(after.dist.centre), [truth["friction"], -0.15], atol=0.03)
 
 
 def test_a_held_out_robot_that_falls_at_once_leaves_the_distribution_finite(dist):
