@@ -23,12 +23,14 @@ from typing import Any
 import jax
 import numpy as np
 
+from jaxtune import loop
 from jaxtune.checks import check_measured, check_set
 from jaxtune.gate import Verify, calibrated_gate
+from jaxtune.loop import Info
 from jaxtune.misfits import Misfits, Phase, misfits, share_of_episode
 from jaxtune.readings import examine
 from jaxtune.settings import TunerConfig
-from jaxtune.tuner import Info, Measure, TrainPolicy, Tuner, TunerState, counted, keep, known_after, make_info
+from jaxtune.tuner import Measure, TrainPolicy, Tuner, TunerState, keep
 from jaxtune.types import Trajectory, Verdict
 from jaxtune.update import Update, posterior_update
 
@@ -91,21 +93,21 @@ class HostTuner:
           ValueError: episodes, simulated or measured, do not have the shapes that they should.
         """
         check_set(measured, self.config)
-        carry = self._tuner.before(state)
+        carry = loop.before(self.config, state.dist, state.past, replayed=False)
         while carry["left"] > 0:
             key_collect, key_verify, key_update = jax.random.split(jax.random.fold_in(key, carry["rounds"]), 3)
             collected = self._tuner.collect(key_collect, state.policy, carry["dist"])
             check_measured(measured, collected.trajectory, self.config)
             # Once for gate and update.
             collected = collected.replace(reading=self._examine(collected, measured), past=carry["past"])
-            carry = counted(carry, collected)
+            carry = loop.counted(carry, collected)
             if carry["verdict"] == Verdict.WIDEN:
                 gate = self._verify(key_verify, collected, measured, state.knobs)
                 carry = self._decide(carry, gate, state.knobs)
             if carry["verdict"] == Verdict.ACCEPT:
                 updated = self._update(key_update, collected, measured, carry["dist"], state.knobs)
                 carry = self._refine(carry, *updated, state.knobs)
-        return state.replace(dist=carry["dist"], past=known_after(carry)), make_info(carry, measured)
+        return state.replace(dist=carry["dist"], past=loop.known_after(carry)), loop.make_info(carry, measured)
 
     def misfits(self, key: jax.Array, state: TunerState, measured: Trajectory) -> Misfits:
         """Says which observations and actions no parameters explain, and in which phase, as `Tuner.misfits` does."""
@@ -136,8 +138,8 @@ class HostTuner:
 
     @cached_property
     def _refine(self):
-        return jax.jit(self._tuner.refine)
+        return jax.jit(partial(loop.refine, self.config))
 
     @cached_property
     def _decide(self):
-        return jax.jit(self._tuner.decide)
+        return jax.jit(partial(loop.decide, self.config))

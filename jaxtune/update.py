@@ -45,7 +45,7 @@ class UpdateInfo:
 
     step: jax.Array  # movement of the centre, before it is clipped to the bounds
     interval: jax.Array  # half width of the interval around the new centre; nan where the rule gives none
-    identifiable: jax.Array  # False where the measured set says no more than the distribution did
+    identifiable: jax.Array  # False where the sets so far say no more than the distribution did
     loss: jax.Array  # scalar: `vote_update`'s logistic loss in nats, `posterior_update`'s error of episodes left out
     p_value: jax.Array = math.nan  # scalar: as the gate's, of misfit and beyond alone
     p_misfit: jax.Array = math.nan  # scalar: of misfit alone

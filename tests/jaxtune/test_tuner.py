@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import toys
 
-from jaxtune import baselines, dvm, explain, pooling, readings, spm
+from jaxtune import baselines, dvm, explain, loop, pooling, readings, spm
 from jaxtune import dist as dists
 from jaxtune import gate as gates
 from jaxtune import tuner as tuners
@@ -848,9 +848,9 @@ def test_all_sets_of_a_robot_inform_the_estimate():
 def test_a_set_outside_the_distribution_makes_earlier_ones_count_no_longer(novelty, remembered):
     tuner = Tuner(config=toys.TINY, train_policy=toys.train_policy, simulate=SLIDER.simulate)
     past = pooling.Past(estimate=jnp.zeros(2), errors=0.01 * jnp.eye(2), tunings=jnp.int32(2))
-    carry = tuner.before(start(tuner).replace(past=past))
+    carry = loop.before(tuner.config, start(tuner).dist, past, replayed=False)
     gate = GateInfo(novelty=jnp.asarray(novelty), threshold=jnp.ones(()))
-    carry = tuner.decide(carry, jax.tree.map(jnp.asarray, gate), knobs())
+    carry = loop.decide(tuner.config, carry, jax.tree.map(jnp.asarray, gate), knobs())
     assert carry["past"].tunings == (2 if remembered else 0)
     assert (carry["verdict"] == Verdict.ACCEPT) == remembered
 

@@ -1,0 +1,269 @@
+"""The rounds of one tuning, as pure functions of what its loop carries; `jaxtune.tuner` draws their order.
+
+A round simulates in the distribution as it is, and then calls the gate (`decide`), reads the accepted set (`refine`),
+or reads it a last time from measured states (`sharpen`). `Tuner` loops in JAX and `HostTuner` in Python.
+"""
+
+from functools import partial
+
+import chex
+import jax
+import jax.numpy as jnp
+import optax
+
+from jaxtune import conformal, pooling
+from jaxtune import dist as dists
+from jaxtune import replay as replays
+from jaxtune.gate import GateInfo, no_gate_log
+from jaxtune.pooling import Past
+from jaxtune.readings import Collected
+from jaxtune.replay import Replay
+from jaxtune.settings import Knobs, TunerConfig
+from jaxtune.types import ParamDist, Trajectory, Verdict
+from jaxtune.update import UpdateInfo, no_update
+
+_CHANGED = 0.9  # of a radius: what is narrowed less than that, or moved by less than the rest, is as it was
+_UNEXPLAINED = 0.01  # largest p-value; a conformal one needs 99 simulated sets to be so small
+
+
+@chex.dataclass(frozen=True)
+class Info:
+    """What happened in one tuning: everything that a plot or a report needs and the next tuning does not.
+
+    Arrays marked [calls] have `max_widenings + 1` entries, one per possible gate call. Entries of calls that were not
+    made hold nan, or -1 as a verdict; the tuning's outcome is `verdicts[calls - 1]`. `Tuner.run` stacks all fields to
+    [num_tunings, ...].
+    """
+
+    train: dict  # metrics that `train_policy` reported; empty after `Tuner.tune`
+    calls: jax.Array  # number of gate calls made
+    verdicts: jax.Array  # [calls], see `jaxtune.types.Verdict`
+    radius: jax.Array  # [calls], the largest radius of the distribution that was tested, in coordinates
+    gate: GateInfo  # [calls]
+    update: UpdateInfo  # steps of zero where no update was made
+    dist: ParamDist  # the distribution that the last gate call tested, before the update
+    measured_falls: jax.Array  # number of measured episodes that ended early
+    not_finite: jax.Array  # number of episodes, simulated or measured, whose simulation broke
+
+
+def before(config: TunerConfig, dist: ParamDist, past: Past, replayed: bool) -> dict:
+    """Makes what the loop carries before its first round; it ends when no rounds are `left`.
+
+    Args:
+      config: sizes.
+      dist: the distribution that the tuning begins with.
+      past: what earlier sets said.
+      replayed: whether an accepted set is read a last time, from measured states.
+    """
+    return {
+        "rounds": jnp.zeros((), int),
+        "left": jnp.asarray(1 + config.refinements, int),
+        "calls": jnp.zeros((), int),
+        "dist": dist,
+        "tested": dist,
+        "wider": dist.radius,
+        "past": past,
+        "update": no_update(dist),
+        "verdict": jnp.asarray(Verdict.WIDEN, int),
+        "not_finite": jnp.zeros((), int),
+        "sharpened": jnp.asarray(not replayed),
+        **no_gate_log(config),
+    }
+
+
+def counted(carry: dict, collected: Collected) -> dict:
+    """Counts a round of the loop, and its simulated episodes in which the simulation broke."""
+    broken = collected.trajectory.not_finite.sum() + collected.held_out.not_finite.sum()
+    return carry | {"rounds": carry["rounds"] + 1, "not_finite": carry["not_finite"] + broken}
+
+
+def make_info(carry: dict, measured: Trajectory) -> Info:
+    """Puts together what happened in one tuning, from what its loop carried last; `train` is empty."""
+    return Info(
+        train={},
+        calls=carry["calls"],
+        verdicts=carry["verdicts"],
+        radius=carry["radius"],
+        gate=carry["gate"],
+        update=carry["update"],
+        dist=carry["tested"],
+        measured_falls=measured.fell.sum(),
+        not_finite=carry["not_finite"] + measured.not_finite.sum(),
+    )
+
+
+def decide(config: TunerConfig, carry: dict, gate: GateInfo, knobs: Knobs) -> dict:
+    """Takes the verdict of one gate call, and widens the distribution if that is it.
+
+    Args:
+      config: sizes.
+      carry: from `before`, or from the call before.
+      gate: what it found.
+      knobs: for the widening factor.
+
+    Returns:
+      What the loop carries on; the loop ends where the verdict is neither `widen` nor `accept`.
+    """
+    calls, dist = carry["calls"], carry["dist"]
+    verdict = jnp.asarray(_verdict(config, gate, dist, calls), int)
+    goes_on = (verdict == Verdict.WIDEN) | (verdict == Verdict.ACCEPT)
+    wider = dists.widen(dist, knobs.widen_factor)
+    following = optax.tree.where(verdict == Verdict.WIDEN, wider, dist)
+    # A set outside the distribution that earlier ones led to says that they misled.
+    misled = gate.novelty > gate.threshold
+    return carry | {
+        "left": jnp.where(goes_on, carry["left"], 0),
+        "calls": calls + 1,
+        "tested": dist,
+        "dist": following,
+        "past": optax.tree.where(misled, pooling.nothing(following), carry["past"]),
+        "verdict": verdict,
+        "verdicts": carry["verdicts"].at[calls].set(verdict),
+        "radius": carry["radius"].at[calls].set(dists.ravel(dist.radius).max()),
+        "gate": jax.tree.map(lambda log, value: log.at[calls].set(value), carry["gate"], gate),
+    }
+
+
+def refine(config: TunerConfig, carry: dict, moved: ParamDist, update: UpdateInfo, knobs: Knobs) -> dict:
+    """Takes an update of an accepted set, and decides whether the set is read again, in the narrower distribution.
+
+    That needs no further measured episode. It ends after `TunerConfig.refinements`, where the distribution hardly
+    changed, or where the set does not fit the distribution that the update before had narrowed.
+
+    Args:
+      config: sizes.
+      carry: from `decide`, or from the refinement before.
+      moved: what the update made of the distribution.
+      update: what it did.
+      knobs: for the level.
+
+    Returns:
+      What the loop carries on. All updates of the set count as one, in radii of the distribution that was tested.
+    """
+    dist, tested, before = carry["dist"], carry["tested"], carry["update"]
+    # The gate has just tested the distribution of the first reading.
+    again = carry["left"] < 1 + config.refinements
+    misfits = again & conformal.rejects(update.p_value, knobs.level)
+    # Tested once a tuning, so that its rate of false alarms is that of one test: at filled bounds by the gate.
+    first = (carry["left"] == config.refinements) & ~dists.at_bounds(tested)
+    unexplained = first & (update.p_misfit <= _UNEXPLAINED)
+    radius, unit = dists.ravel(dist.radius), dists.ravel(tested.radius)
+    changed = (dists.ravel(moved.radius) < _CHANGED * radius) | (jnp.abs(update.step) > 1.0 - _CHANGED)
+    update = update.replace(
+        step=(dists.ravel(moved.centre) - dists.ravel(tested.centre)) / unit,
+        interval=update.interval * radius / unit,
+        identifiable=before.identifiable | update.identifiable,
+        errors=update.errors * jnp.outer(radius / unit, radius / unit),
+        learnt=pooling.nothing(moved) if update.learnt is None else update.learnt,
+        # One contradiction is enough: the readings after it join nothing.
+        p_past=jnp.where(jnp.isnan(update.p_past), before.p_past, update.p_past),
+    )
+    # Taken back: what the reading before found remains, within the radius that it was found in.
+    back = before.replace(interval=dists.ravel(carry["wider"]) / unit, p_value=update.p_value, p_misfit=update.p_misfit)
+    nothing = no_update(tested).replace(p_value=update.p_value, p_misfit=update.p_misfit)
+    verdict = jnp.where(unexplained, Verdict.UNEXPLAINED, carry["verdict"])
+    return carry | {
+        "left": jnp.where(changed.any() & ~misfits & ~unexplained, carry["left"] - 1, 0),
+        "dist": optax.tree.where(
+            unexplained, tested, optax.tree.where(misfits, dist.replace(radius=carry["wider"]), moved)
+        ),
+        "wider": dist.radius,
+        "past": optax.tree.where(_contradicts(update), pooling.nothing(tested), carry["past"]),
+        "update": optax.tree.where(unexplained, nothing, optax.tree.where(misfits, back, update)),
+        "verdict": verdict,
+        "verdicts": carry["verdicts"].at[carry["calls"] - 1].set(verdict),
+    }
+
+
+def sharpen(
+    config: TunerConfig,
+    replay: Replay,
+    key: jax.Array,
+    carry: dict,
+    collected: Collected,
+    measured: Trajectory,
+    knobs: Knobs,
+) -> dict:
+    """Estimates once more, from the states of an accepted set (`replay.estimate`).
+
+    Args:
+      config: sizes.
+      replay: simulates pieces.
+      key: random key.
+      carry: from `refine`.
+      collected: of the distribution that it left.
+      measured: the measured set, with states.
+      knobs: for the level that the measured set must fit at.
+
+    Returns:
+      What the loop carries on; it ends. The centre is the new estimate if, on simulated sets, its errors (rms, in
+      radii) are smaller than those of the estimate before, and if the measured set fits it. Radii only narrow.
+    """
+    dist, tested, before = carry["dist"], carry["tested"], carry["update"]
+    sizes, held_out = config.replay, (collected.held_out, collected.held_out_coords)
+    # The last ones are others than the first where there are twice as many.
+    first, last = (jax.tree.map(lambda leaf, part=part: leaf[part], held_out) for part in sizes.parts)
+    pool = partial(pooling.joined, key, carry["past"], dist)
+    found = replays.estimate(sizes, replay, *first, measured, dist, config.coverage, *last, pool)
+    radius, unit = dists.ravel(dist.radius), dists.ravel(tested.radius)
+    errors = found.errors * jnp.outer(radius / unit, radius / unit)
+    # An update that gives no errors gives no reason to keep its estimate.
+    closer = jnp.isnan(before.errors).any() | (jnp.trace(errors) < jnp.trace(before.errors))
+    # What the estimate before errs by is what earlier sets err by, if it is joined with them; these misled.
+    closer |= _contradicts(found)
+    fits = ~conformal.rejects(found.p_value, knobs.level)
+    known = (found.estimate, found.interval, errors, found.p_value)
+    taken = closer & fits & jnp.stack([jnp.isfinite(values).all() for values in known]).all()
+    moved = dists.narrow(dists.move(dist, found.estimate), found.interval, config.min_radius)
+    update = before.replace(
+        step=(dists.ravel(moved.centre) - dists.ravel(tested.centre)) / unit,
+        interval=found.interval * radius / unit,
+        identifiable=before.identifiable | (found.interval < 1.0),
+        errors=errors,
+        replayed=jnp.asarray(True),
+        pooled=found.pooled,
+        p_past=jnp.where(jnp.isnan(found.p_past), before.p_past, found.p_past),
+        learnt=pooling.learnt(carry["past"], found.pooled, dist, found.estimate, found.errors),
+    )
+    update = optax.tree.where(taken, update, before).replace(p_replay=found.p_value)
+    return carry | {
+        "dist": optax.tree.where(taken, moved, dist),
+        "update": update,
+        "sharpened": jnp.asarray(True),
+    }
+
+
+def known_after(carry: dict) -> Past:
+    """What all sets so far say after a tuning, from what its loop carried last."""
+    return optax.tree.where(carry["verdict"] == Verdict.ACCEPT, carry["update"].learnt, carry["past"])
+
+
+def _contradicts(found: UpdateInfo | replays.Replayed) -> jax.Array:
+    """Tells whether a set contradicts earlier ones."""
+    return ~jnp.asarray(found.pooled) & ~jnp.isnan(found.p_past)
+
+
+def _verdict(config: TunerConfig, gate: GateInfo, dist: ParamDist, calls: jax.Array) -> jax.Array:
+    """Chooses the verdict of one gate call; the first condition that holds wins.
+
+    `calls` counts earlier calls of this tuning.
+    """
+    full = dists.at_bounds(dist)
+    return jnp.select(
+        [
+            # First: where nothing lives as long as a window, nothing of it is finite either.
+            ~jnp.asarray(gate.comparable),
+            ~(jnp.isfinite(gate.novelty) & jnp.isfinite(gate.threshold)),
+            gate.novelty <= gate.threshold,
+            full & (gate.p_value <= _UNEXPLAINED),
+            full | (calls >= config.max_widenings),
+        ],
+        [
+            Verdict.NOT_COMPARABLE,
+            Verdict.NOT_FINITE,
+            Verdict.ACCEPT,
+            Verdict.UNEXPLAINED,
+            Verdict.RADIUS_EXHAUSTED,
+        ],
+        Verdict.WIDEN,
+    )
