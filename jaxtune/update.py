@@ -88,8 +88,8 @@ def posterior_update(
     is not finite, leaves the distribution as it is.
 
     A coordinate that is not identifiable keeps centre and radius. Where the interval of one that is reaches past the
-    box, and not merely past a bound, all keep their radii, and centres move. The next set is then read as if it were
-    the first, since held-out sets say nothing of errors beyond the box.
+    box, and not merely past a bound, all keep their radii, and centres move. What the next set is joined with then says
+    of such a coordinate no more than the box, since held-out sets say nothing of errors beyond it.
 
     Args:
       key: random key, for what earlier sets would have said of the held-out ones' robots.
@@ -123,12 +123,14 @@ def posterior_update(
     ends = (dists.normalise(dist, end) for end in (dist.lower, dist.upper))
     below, above = (jnp.isclose(*pair, atol=1e-4) for pair in zip((low, high), ends, strict=True))
     inside = ((step - interval >= low) | below) & ((step + interval <= high) | above)
-    inside = (inside | ~identifiable).all()
-    moved = dists.narrow(dists.move(dist, step), jnp.where(identifiable & inside, wide, 1.0), config.min_radius)
+    inside |= ~identifiable
+    narrower = jnp.where(identifiable & inside.all(), wide, 1.0)
+    moved = dists.narrow(dists.move(dist, step), narrower, config.min_radius)
     found = {name: excess(name, values) for name, values in misses(reading).items()}
     errors = off.T @ off / jnp.maximum(known.sum(), 1)
-    learnt = pooling.learnt(past, pooled, dist, estimates[-1], errors)
-    learnt = optax.tree.where(inside, learnt, pooling.nothing(moved))
+    # Of what may lie beyond the box no more is known than the box is wide.
+    reliable = jnp.where(jnp.outer(inside, inside), errors, jnp.diag((high - low) ** 2 / 12.0))
+    learnt = pooling.learnt(past, pooled, dist, estimates[-1], reliable)
     return moved, UpdateInfo(
         step=step,
         interval=interval,
