@@ -37,9 +37,7 @@ from jaxtune.types import ParamDist
 
 _LEAST = 1e-6  # of the box's variance: least one of an estimate's errors
 _MOST = 0.95  # of it: largest one, which says little and not nothing
-_FADES = (
-    0.9  # factor on what earlier sets count, from tuning to tuning: robots wear, and all sets share errors of models
-)
+_FADES = 0.9  # factor on what is known, from tuning to tuning: robots wear, and all sets share errors of the simulator
 _CONTRADICTS = 0.01  # largest p-value; fewer than 99 sets give none so small, and the smallest one counts
 
 

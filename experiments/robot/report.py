@@ -59,6 +59,7 @@ def write(path: Path, history: Sequence[Round], terms: Terms, robot: str = "bite
         advice=ADVICE[last.tuning.verdict],
         quantities=_QUANTITIES,
         unidentified=last.tuning.unidentified,
+        earlier=_earlier(last),
         together=last.tuning.together if last.tuning.verdict == "accept" else (),
         surprise=surprise(last.measured, last.tuning.explained),
         safe=last.expected_falls <= terms.max_fall_rate,
@@ -70,6 +71,18 @@ def write(path: Path, history: Sequence[Round], terms: Terms, robot: str = "bite
         picture=plots.embedded(plots.rounds(as_json(list(history)))),
     )
     path.write_text(page)
+
+
+def _earlier(last: Round) -> str:
+    """Says whether the logs of earlier rounds count; nothing where they said nothing."""
+    if last.tuning.verdict != "accept" or last.tuning.past_p_value is None:
+        return ""
+    found = f"p {last.tuning.past_p_value:.2f}"
+    if last.tuning.pooled:
+        return f"Estimates are joined with those of earlier rounds, which this log does not contradict ({found})."
+    return (
+        f"This log contradicts earlier rounds ({found}), which count no longer: they misled, or the robot has changed."
+    )
 
 
 def show(console: Console, last: Round) -> None:
@@ -94,6 +107,8 @@ def show(console: Console, last: Round) -> None:
         note = note or (" (weakly identified)" if name in last.tuning.weak else "")
         table.add_row(name + note, f"{ends.before:.3f}", f"{ends.after:.3f}", interval)
     console.print(table)
+    if earlier := _earlier(last):
+        console.print(earlier, highlight=False)
     for one in last.measured.suspected:
         console.print(f"doctor: {one.sentence} ({', '.join(one.runs)})", highlight=False, markup=False)
     console.print(f"{last.expected_falls:.0%} of the next walks are expected to end in a fall")

@@ -259,6 +259,20 @@ def test_the_page_says_what_matters_and_runs_nothing_of_the_log(tmp_path):
     assert "This method does not check" in page.read_text()
 
 
+@pytest.mark.parametrize(("pooled", "said"), [(True, "joined with those of earlier rounds"), (False, "contradicts")])
+def test_the_page_says_whether_earlier_rounds_count(pooled, said, tmp_path):
+    one = line(["accept"], measured=0.1, predicted=0.1)
+    page, output = tmp_path / "report.html", io.StringIO()
+    report.write(page, [one], TERMS)
+    assert "earlier rounds" not in page.read_text()
+    one = replace(one, tuning=replace(one.tuning, pooled=pooled, past_p_value=0.01))
+    report.write(page, [one], TERMS)
+    report.show(Console(file=output, width=200), one)
+    for text in (page.read_text(), output.getvalue()):
+        assert said in text
+        assert "(p 0.01)" in text
+
+
 @pytest.fixture(scope="module")
 def programs():
     programs = transfer.compile_programs(ARGS)
