@@ -110,7 +110,8 @@ def decide(config: TunerConfig, carry: dict, gate: GateInfo, knobs: Knobs) -> di
     wider = dists.widen(dist, knobs.widen_factor)
     following = optax.tree.where(verdict == Verdict.WIDEN, wider, dist)
     # A set outside the distribution that earlier ones led to says that they misled.
-    misled = gate.novelty > gate.threshold
+    outside = (Verdict.WIDEN, Verdict.UNEXPLAINED, Verdict.RADIUS_EXHAUSTED)
+    misled = jnp.isin(verdict, jnp.array(outside))
     return carry | {
         "left": jnp.where(goes_on, carry["left"], 0),
         "calls": calls + 1,
@@ -149,26 +150,31 @@ def refine(config: TunerConfig, carry: dict, moved: ParamDist, update: UpdateInf
     unexplained = first & (update.p_misfit <= _UNEXPLAINED)
     radius, unit = dists.ravel(dist.radius), dists.ravel(tested.radius)
     changed = (dists.ravel(moved.radius) < _CHANGED * radius) | (jnp.abs(update.step) > 1.0 - _CHANGED)
+    contradicts = _contradicts(update)
     update = update.replace(
         step=(dists.ravel(moved.centre) - dists.ravel(tested.centre)) / unit,
         interval=update.interval * radius / unit,
         identifiable=before.identifiable | update.identifiable,
         errors=update.errors * jnp.outer(radius / unit, radius / unit),
-        learnt=pooling.nothing(moved) if update.learnt is None else update.learnt,
+        learnt=carry["past"] if update.learnt is None else update.learnt,
         # One contradiction is enough: the readings after it join nothing.
         p_past=jnp.where(jnp.isnan(update.p_past), before.p_past, update.p_past),
     )
     # Taken back: what the reading before found remains, within the radius that it was found in.
-    back = before.replace(interval=dists.ravel(carry["wider"]) / unit, p_value=update.p_value, p_misfit=update.p_misfit)
+    wider = dist.replace(radius=carry["wider"])
+    back = before.replace(
+        interval=dists.ravel(carry["wider"]) / unit,
+        p_value=update.p_value,
+        p_misfit=update.p_misfit,
+        learnt=pooling.nothing(wider),
+    )
     nothing = no_update(tested).replace(p_value=update.p_value, p_misfit=update.p_misfit)
     verdict = jnp.where(unexplained, Verdict.UNEXPLAINED, carry["verdict"])
     return carry | {
         "left": jnp.where(changed.any() & ~misfits & ~unexplained, carry["left"] - 1, 0),
-        "dist": optax.tree.where(
-            unexplained, tested, optax.tree.where(misfits, dist.replace(radius=carry["wider"]), moved)
-        ),
+        "dist": optax.tree.where(unexplained, tested, optax.tree.where(misfits, wider, moved)),
         "wider": dist.radius,
-        "past": optax.tree.where(_contradicts(update), pooling.nothing(tested), carry["past"]),
+        "past": optax.tree.where((contradicts & ~misfits) | unexplained, pooling.nothing(tested), carry["past"]),
         "update": optax.tree.where(unexplained, nothing, optax.tree.where(misfits, back, update)),
         "verdict": verdict,
         "verdicts": carry["verdicts"].at[carry["calls"] - 1].set(verdict),
@@ -223,7 +229,7 @@ def sharpen(
         replayed=jnp.asarray(True),
         pooled=found.pooled,
         p_past=jnp.where(jnp.isnan(found.p_past), before.p_past, found.p_past),
-        learnt=pooling.learnt(carry["past"], found.pooled, dist, found.estimate, found.errors),
+        learnt=pooling.learnt(carry["past"], found.pooled, dist, found.estimate, found.errors, sizes.sets),
     )
     update = optax.tree.where(taken, update, before).replace(p_replay=found.p_value)
     return carry | {

@@ -15,15 +15,16 @@ undo it. In standard deviations of the box from its middle, with a factor a for 
     a = <truth estimate> / <estimate^2>,    S = <(truth - a estimate) (truth - a estimate)'>,
     unshrunk = (1 - S)^-1 a estimate,       R = S (1 - S)^-1.
 
-Each set's a is that of all others, so S is of sets that a does not know. S is shrunk towards its diagonal by the number
-of coordinates over that of sets, or some combination of coordinates would seem exact by chance.
+Each set's a is that of all others, so S is of sets that a does not know. S and C are shrunk towards their diagonals by
+the number of coordinates over that of sets, or some combination of coordinates would seem exact by chance.
 
 The errors of joined estimates are those of simulated sets. Each is joined with what earlier sets would have said of its
-robot, if they err as `past` does: past + (1 - C) (truth - past) + a draw of C (1 - C). Where earlier sets said nothing
-that is the middle of the box, and where they said all it is the truth.
+robot, if they err as `past` does: past + (1 - C) (truth - past) + a draw of C (1 - C). Where earlier sets said less
+than the box does, that is its middle with its errors, and where they said all it is the truth.
 
 A set may contradict the earlier ones: the robot was repaired, or an early set misled. Then they count no longer. The
-conformal p-value of (unshrunk - past)' (C + R)^-1 (unshrunk - past) tells, at 1 % where there are 99 simulated sets.
+conformal p-value of (unshrunk - past)' (C + R)^-1 (unshrunk - past) tells, at 1 %; of fewer than 99 simulated sets, the
+smallest p-value where it is also beyond the 0.99-quantile of chi-square.
 """
 
 import chex
@@ -60,7 +61,9 @@ def nothing(dist: ParamDist) -> Past:
     )
 
 
-def learnt(past: Past, pooled: jax.Array, dist: ParamDist, estimate: jax.Array, errors: jax.Array) -> Past:
+def learnt(
+    past: Past, pooled: jax.Array, dist: ParamDist, estimate: jax.Array, errors: jax.Array, sets: jax.Array
+) -> Past:
     """Makes what is known after a set.
 
     Args:
@@ -69,8 +72,10 @@ def learnt(past: Past, pooled: jax.Array, dist: ParamDist, estimate: jax.Array, 
       dist: whose radii are meant.
       estimate: [coords] in radii.
       errors: [coords, coords] mean products of its errors, in radii.
+      sets: number of simulated sets that these are of.
     """
     centre, radius = dists.ravel(dist.centre), dists.ravel(dist.radius)
+    errors = _steady(errors, sets)
     return Past(
         estimate=(centre + radius * estimate).astype(jnp.float32),
         errors=(errors * jnp.outer(radius, radius)).astype(jnp.float32),
@@ -83,9 +88,10 @@ def joined_error(
 ) -> Float[Array, " coords"]:
     """The size of errors of an estimate that errs by `error` and is joined with `past`, or not; both in radii."""
     low, high = dists.normalised_box(dist)
-    variance = jnp.diag(past.errors) / (_FADES * dists.ravel(dist.radius) ** 2)
+    box = (high - low) ** 2 / 12.0
+    variance = jnp.maximum(jnp.diag(past.errors) / (_FADES * dists.ravel(dist.radius) ** 2), _LEAST * box)
     # What is known of the box is in the estimate already.
-    more = jnp.maximum(1.0 / variance - 12.0 / (high - low) ** 2, 0.0)
+    more = jnp.maximum(1.0 / variance - 1.0 / box, 0.0)
     return jnp.where(pooled, 1.0 / jnp.sqrt(1.0 / error**2 + more), error)
 
 
@@ -121,21 +127,34 @@ def joined(
     unshrunk, noise = _unshrunk(factors * read, true, valid)
 
     before = (past.estimate - dists.ravel(dist.centre)) / scale - middle / unit
-    errors = past.errors / (_FADES * jnp.outer(scale, scale))
-    errors = errors + _LEAST * jnp.maximum(jnp.diag(errors).max(), 1.0) * jnp.eye(len(unit))
-    values, axes = jnp.linalg.eigh(errors)
-    knows = jnp.clip(1.0 - values, 0.0, 1.0)
-    drawn = jax.random.normal(key, true.shape) * jnp.sqrt(knows * jnp.maximum(values, 0.0))
-    drawn = before + (((true - before) @ axes) * knows + drawn) @ axes.T
+    values, axes = jnp.linalg.eigh(past.errors / (_FADES * jnp.outer(scale, scale)))
+    # Where earlier sets know less than the box, it is the box that is known.
+    before = (before @ axes / jnp.maximum(values, 1.0)) @ axes.T
+    values = jnp.clip(values, _LEAST, 1.0)
+    errors = (axes * values) @ axes.T
+    drawn = jax.random.normal(key, true.shape) * jnp.sqrt(values * (1.0 - values))
+    drawn = before + (((true - before) @ axes) * (1.0 - values) + drawn) @ axes.T
     before = jnp.concatenate([drawn, before[None]])
 
     weighed = jnp.linalg.solve(errors + noise, (unshrunk - before).T).T
     contradiction = ((unshrunk - before) * weighed).sum(axis=-1)
     known = (past.tunings > 0) & valid.any()
     p_value = conformal.p_value(jnp.where(jnp.append(valid, known), contradiction, jnp.nan))
-    # A p-value that is nan contradicts nothing, but says that there is nothing to join.
-    pooled = p_value > jnp.maximum(_CONTRADICTS, 1.0 / (1 + valid.sum())) + conformal.ROUNDING
+    usual = p_value > jnp.maximum(_CONTRADICTS, 1.0 / (1 + valid.sum())) + conformal.ROUNDING
+    # The smallest p-value of few sets is not small: then it must be far off for a Gaussian, too.
+    pooled = known & (usual | (contradiction[-1] <= _far(len(unit))))
     return jnp.where(pooled, middle + unit * (before + weighed @ errors), estimates), pooled, p_value
+
+
+def _far(size: int) -> float:
+    """The 0.99-quantile of chi-square with so many degrees of freedom (Wilson and Hilferty, 1931)."""
+    return size * (1.0 - 2.0 / (9.0 * size) + 2.326 * (2.0 / (9.0 * size)) ** 0.5) ** 3
+
+
+def _steady(errors: Float[Array, "coords coords"], sets: jax.Array) -> Float[Array, "coords coords"]:
+    """Shrinks mean products over so many sets towards their diagonal."""
+    share = jnp.minimum(len(errors) / jnp.maximum(sets, 1), 1.0)
+    return (1.0 - share) * errors + share * jnp.diag(jnp.diag(errors))
 
 
 def _factors(read: Float[Array, "sets coords"], true: Float[Array, "sets coords"]) -> Float[Array, "sets+1 coords"]:
@@ -149,10 +168,7 @@ def _unshrunk(
     estimates: Float[Array, "sets+1 coords"], true: Float[Array, "sets coords"], valid: Bool[Array, " sets"]
 ) -> tuple[Float[Array, "sets+1 coords"], Float[Array, "coords coords"]]:
     """What sets say without the box, and the mean products of the errors of that."""
-    count, size = jnp.maximum(valid.sum(), 1), true.shape[1]
     off = jnp.where(valid[:, None], estimates[:-1] - true, 0.0)
-    errors = off.T @ off / count
-    alone = jnp.minimum(size / count, 1.0)
-    values, axes = jnp.linalg.eigh((1.0 - alone) * errors + alone * jnp.diag(jnp.diag(errors)))
+    values, axes = jnp.linalg.eigh(_steady(off.T @ off / jnp.maximum(valid.sum(), 1), valid.sum()))
     share = jnp.clip(values, _LEAST, _MOST)
     return (estimates @ axes / (1.0 - share)) @ axes.T, (axes * (share / (1.0 - share))) @ axes.T

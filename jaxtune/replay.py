@@ -168,6 +168,7 @@ def estimate(
     best, pooled, p_past = fits.best, jnp.asarray(False), jnp.asarray(jnp.nan)
     if pool is not None:
         best, pooled, p_past = pool(best, truth, known[:-1])
+        best = jnp.clip(best, *(dists.normalise(dist, end) for end in (dist.lower, dist.upper)))
     error = jnp.where(known[:-1, None], best[:-1] - truth, jnp.nan)
     deviations = jax.vmap(lambda normal: jnp.sqrt(jnp.diag(jnp.linalg.inv(normal))))(fits.normal)
     # Slopes that jump make some standard errors far too small.

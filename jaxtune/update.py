@@ -130,7 +130,7 @@ def posterior_update(
     errors = off.T @ off / jnp.maximum(known.sum(), 1)
     # Of what may lie beyond the box no more is known than the box is wide.
     reliable = jnp.where(jnp.outer(inside, inside), errors, jnp.diag((high - low) ** 2 / 12.0))
-    learnt = pooling.learnt(past, pooled, dist, estimates[-1], reliable)
+    learnt = pooling.learnt(past, pooled, dist, estimates[-1], reliable, known.sum())
     return moved, UpdateInfo(
         step=step,
         interval=interval,
@@ -141,7 +141,7 @@ def posterior_update(
         errors=errors,
         pooled=pooled,
         p_past=p_past,
-        learnt=optax.tree.where(unread, past, learnt),
+        learnt=optax.tree.where(unread | ~known.any(), past, learnt),
     )
 
 

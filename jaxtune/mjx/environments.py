@@ -126,9 +126,9 @@ def check_start(start: Any, observed: jax.ShapeDtypeStruct) -> None:
       ValueError: it is that of several.
     """
     others = [np.shape(getattr(start, name)) for name in ("reward", "done")]
-    if any(others) or len(observed.shape) != 1:
+    if any(others) or len(np.shape(observed)) != 1:
         raise ValueError(
-            f"env: got a reset with an observation of shape {observed.shape}, reward and done of shape "
+            f"env: got a reset with an observation of shape {np.shape(observed)}, reward and done of shape "
             f"{' and '.join(map(str, others))}, expected those of one robot: [obs], () and ()"
         )
 

@@ -29,7 +29,7 @@ def read(key, truth, noise=NOISE, episodes=1):
 
 def past_of(dist, estimate, errors):
     """What earlier sets said, in radii."""
-    return pooling.learnt(pooling.nothing(dist), False, dist, estimate, jnp.asarray(errors))
+    return pooling.learnt(pooling.nothing(dist), False, dist, estimate, jnp.asarray(errors), 10**6)
 
 
 def robots(key, noise=NOISE, dist=DIST, sets=SETS):
@@ -153,3 +153,21 @@ def test_errors_are_joined_as_estimates_are():
     found = pooling.joined_error(past, True, DIST, error)
     np.testing.assert_allclose(found, [(25.0 + 25.0 - 3.0) ** -0.5, 0.3], rtol=1e-5)
     np.testing.assert_array_equal(pooling.joined_error(past, False, DIST, error), error)
+
+
+@pytest.mark.parametrize("vague, off", [(1.0, 0.0), (400.0, 0.5)])
+def test_earlier_sets_that_know_less_than_the_box_cost_nothing(vague, off):
+    """Re-readings narrow the box, while what earlier sets said stays."""
+    truth, estimates = robots(jax.random.key(22), 0.5 * jnp.eye(2))
+    past = past_of(DIST, off * jnp.ones(2), vague / 3.0 * jnp.eye(2))
+    found, pooled, _ = join(jax.random.key(23), past, DIST, estimates, truth[:-1], ALL)
+    assert pooled
+    assert rms(found[:-1] - truth[:-1]) < 1.05 * rms(estimates[:-1] - truth[:-1])
+
+
+def test_no_combination_is_known_exactly_by_chance():
+    """With as many sets as coordinates, mean products of errors are of lower rank than that."""
+    off = jax.random.normal(jax.random.key(24), (9, 9))
+    dist = toys.uniform({str(number): 0.0 for number in range(9)})
+    past = pooling.learnt(pooling.nothing(dist), False, dist, jnp.zeros(9), off.T @ off / 9, 9)
+    assert jnp.linalg.eigvalsh(past.errors / 0.16).min() > 0.2

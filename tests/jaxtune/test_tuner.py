@@ -844,15 +844,54 @@ def test_all_sets_of_a_robot_inform_the_estimate():
     assert covered.mean(axis=0).min() > 0.78
 
 
-@pytest.mark.parametrize("novelty, remembered", [(0.5, True), (1.5, False)])
-def test_a_set_outside_the_distribution_makes_earlier_ones_count_no_longer(novelty, remembered):
+@pytest.mark.parametrize(
+    "novelty, comparable, remembered",
+    [(0.5, True, True), (1.5, True, False), (1.5, False, True), (np.inf, True, True)],
+)
+def test_a_set_outside_the_distribution_makes_earlier_ones_count_no_longer(novelty, comparable, remembered):
     tuner = Tuner(config=toys.TINY, train_policy=toys.train_policy, simulate=SLIDER.simulate)
     past = pooling.Past(estimate=jnp.zeros(2), errors=0.01 * jnp.eye(2), tunings=jnp.int32(2))
     carry = loop.before(tuner.config, start(tuner).dist, past, replayed=False)
-    gate = GateInfo(novelty=jnp.asarray(novelty), threshold=jnp.ones(()))
+    gate = GateInfo(novelty=jnp.asarray(novelty), threshold=jnp.ones(()), comparable=comparable)
     carry = loop.decide(tuner.config, carry, jax.tree.map(jnp.asarray, gate), knobs())
     assert carry["past"].tunings == (2 if remembered else 0)
-    assert (carry["verdict"] == Verdict.ACCEPT) == remembered
+
+
+def test_a_reading_that_contradicts_forgets_and_one_that_is_taken_back_says_nothing():
+    first = toys.uniform(TWO, 0.2)
+    past = pooling.Past(estimate=jnp.zeros(2), errors=0.01 * jnp.eye(2), tunings=jnp.int32(2))
+    carry = loop.before(toys.TINY, first, past, replayed=False) | {"verdict": jnp.asarray(Verdict.ACCEPT, int)}
+    said = pooling.learnt(past, True, first, jnp.ones(2), 0.1 * jnp.eye(2), 19)
+    update = {
+        "step": jnp.ones(2),
+        "interval": jnp.ones(2),
+        "identifiable": jnp.ones(2, bool),
+        "loss": jnp.zeros(()),
+        "p_value": jnp.ones(()),
+        "p_misfit": jnp.ones(()),
+        "errors": 0.1 * jnp.eye(2),
+    }
+    agrees = UpdateInfo(**update, pooled=jnp.asarray(True), p_past=jnp.asarray(0.4), learnt=said)
+    refine = functools.partial(loop.refine, toys.TINY)
+    after = refine(carry, first, agrees, knobs())
+    assert after["past"].tunings == 2
+    assert loop.known_after(after).tunings == 3
+    # What was said of earlier sets stays said.
+    alone = UpdateInfo(**update, pooled=jnp.asarray(False), p_past=jnp.asarray(0.01), learnt=said)
+    after = refine(carry, first, alone, knobs())
+    assert after["past"].tunings == 0
+    silent = UpdateInfo(**update, learnt=said)
+    again = refine(after, first, silent, knobs())
+    assert again["update"].p_past == pytest.approx(0.01)
+    assert not again["update"].pooled
+    # A p-value that a reading before gave is no contradiction of this one.
+    again = refine(refine(carry, first, agrees, knobs()), first, silent, knobs())
+    assert again["past"].tunings == 2
+    misfit = agrees.replace(p_value=jnp.asarray(0.01))
+    back = refine(refine(carry, first, agrees, knobs()), first, misfit, knobs())
+    assert loop.known_after(back).tunings == 0
+    untold = refine(carry, first, agrees.replace(learnt=None), knobs())
+    assert loop.known_after(untold).tunings == 2
 
 
 def test_coordinates_that_trade_against_each_other_are_known_together():
