@@ -76,6 +76,7 @@ class Biteno:
         joints = [model.joint(name) for name in constants.JOINTS]
         self.joint_qpos = np.array([joint.qposadr[0] for joint in joints])
         self.joint_dof = np.array([joint.dofadr[0] for joint in joints])
+        self._joint_range = np.array([joint.range for joint in joints]).T
         self._shanks = np.array([model.body(f"{side}_shank").id for side in constants.SIDES])
         self._home = jnp.array(model.keyframe("home").qpos, jnp.float32)
         self._prepare(model)
@@ -175,7 +176,8 @@ class Biteno:
 
             target = base + action_scale clip(action, -10, 10)
 
-        With an `action_delay_s` among the parameters the previous target acts until the delay is over.
+        The policy observes this target. What acts on the joints is clipped to their ranges, as on the robot. With an
+        `action_delay_s` among the parameters the previous target acts until the delay is over.
         """
         action = jnp.clip(action, -ACTION_LIMIT, ACTION_LIMIT)
         reference = gait.joint_reference(state.phase, state.command)
@@ -183,10 +185,11 @@ class Biteno:
         target = base + self.config.action_scale * action
         # The error is the last target less the reading, so the sum is the last target.
         held = state.joint_error + self.perceive(state)["joint"]
+        sent, held = (jnp.clip(one, *self._joint_range) for one in (target, held))
         delay = params.get("action_delay_s", 0.0) / self.mj_model.opt.timestep
         # In the sub-step in which the delay ends, the two targets are averaged by their shares of time.
         arrived = jnp.clip(jnp.arange(1, self.substeps + 1) - delay, 0.0, 1.0)
-        targets = target + (1.0 - arrived[:, None]) * (held - target)
+        targets = sent + (1.0 - arrived[:, None]) * (held - sent)
         return Drive(action=action, target=target, targets=targets, reference=reference)
 
     def simulate(self, params: parameters.Params, state: State, drive: Drive) -> Motion:

@@ -76,8 +76,8 @@ class Drive:
     """
 
     action: jax.Array  # [6] clipped
-    target: jax.Array  # [6] rad
-    targets: jax.Array  # [substeps, 6] rad, that act at each sub-step, after the delay
+    target: jax.Array  # [6] rad, as the policy means it
+    targets: jax.Array  # [substeps, 6] rad, that act at each sub-step: within the joints' ranges, after the delay
     reference: jax.Array  # [6] rad, Raibert's q*
 
 

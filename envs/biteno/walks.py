@@ -120,7 +120,7 @@ def _wanted_torque(run: Run, seen: dict[str, np.ndarray], order: list[int]) -> n
 def _meant(policy: Mapping[str, Any], seen: dict[str, np.ndarray]) -> np.ndarray:
     """The targets that the policy meant and observed, [ticks, joints] rad.
 
-    A robot's player clips what it sends to the joints' ranges, where a simulator does not.
+    What is sent, and logged, is clipped to the joints' ranges.
     """
     target = seen["target"]
     if "action_scale" not in policy:

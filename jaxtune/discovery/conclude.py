@@ -86,10 +86,8 @@ def conclude(settings: Settings, problem: Problem, floor: NoiseFloor, state: Sta
     compared = (state.null, best, learned)
     costs = [total_cost(at, one, 0.0) for one in compared]
     usual, typical = ([_open_gaps(problem, at, one, measure) for one in compared] for measure in measures(at))
-    # A few segments may be far off with the right effect, as those that begin while gears are out of touch: typical
-    # ones may speak for it, where they show the gap.
-    spoken = [usual, typical] if typical[0].max() > settings.at_floor else [usual]
-    share, whole = max(_explained_shares([_energy(one) for one in gaps], costs) for gaps in spoken)
+    speaking = speak(usual, typical, settings.at_floor)
+    share, whole = max(_explained_shares([_energy(one) for one in gaps], costs) for gaps in speaking)
     explains = usual[1].max() <= settings.at_floor or (
         bool(terms) and share >= settings.share and whole >= settings.least
     )
@@ -203,6 +201,22 @@ def explained(null: float, after: float, bound: float) -> float:
     """
     room = null - bound
     return float(np.clip((null - after) / room, 0.0, 1.0)) if room > 1e-6 else 1.0
+
+
+def speak(usual: Sequence[np.ndarray], typical: Sequence[np.ndarray], at_floor: float) -> list[Sequence[np.ndarray]]:
+    """Chooses the gaps that may speak for a model's effects.
+
+    A few segments may be far off with the right effect, as those that begin while gears are out of touch. So typical
+    ones may speak for it, where they show the gap and the effects do not pay for them with the others.
+
+    Args:
+      usual: gaps [positions] of nearly all segments in floor units: of the null, of the model, and with a learned
+        torque.
+      typical: of typical segments, likewise.
+      at_floor: `Settings.at_floor`.
+    """
+    shown, paid = typical[0].max() > at_floor, _energy(usual[1]) > _energy(usual[0])
+    return [usual, typical] if shown and not paid else [usual]
 
 
 def _explained_shares(energies: Sequence[float], costs: Sequence[float]) -> tuple[float, float]:

@@ -8,7 +8,7 @@ import pytest
 import reference
 
 from envs import sensing, stepping
-from envs.biteno import Biteno, Motion, TaskConfig, constants
+from envs.biteno import Biteno, Motion, TaskConfig, constants, onboard
 from jaxtune.mjx import TrainingBatch
 from jaxtune.mjx.episodes import rollout
 
@@ -77,12 +77,12 @@ def engines(robot, start, step):
         model.opt.timestep, model.opt.iterations, model.opt.ls_iterations = 0.001, 6, 10
         data = mujoco.MjData(model)
         data.qpos[:], data.qvel[:] = qpos, qvel
-        # A new robot's joints are held where they are.
-        held = data.qpos[7:].copy()
+        # A new robot's joints are held where they are, as far as a target may be there.
+        held = np.clip(data.qpos[7:], *onboard.joint_ranges())
         # The second step starts where the first one left the solver.
         for moved in (action, -action):
             state = step(values, state, moved)
-            target = constants.STAND_RAD + 0.25 * moved.astype(float)
+            target = np.clip(constants.STAND_RAD + 0.25 * moved.astype(float), *onboard.joint_ranges())
             contacts = 0
             for substep in range(10):
                 late = np.clip(values["action_delay_s"] / 0.001 - substep, 0.0, 1.0)
@@ -131,6 +131,18 @@ def test_an_action_that_is_a_step_late_is_the_one_before(start, step):
     held = (start.qpos[7:] - constants.STAND_RAD) / 0.25
     np.testing.assert_allclose(once.qpos, step(NOMINAL, start, held).qpos, atol=1e-6)
     assert np.abs(twice.qpos - step(NOMINAL, once, second).qpos).max() > 1e-3
+
+
+def test_what_acts_on_the_joints_stays_within_their_ranges(start):
+    robot = Biteno(TaskConfig(base="stand"), {})
+    low, high = onboard.joint_ranges()
+    for action, ends in ((10.0, high), (-10.0, low)):
+        drive = robot.drive({}, start, jnp.full(6, action))
+        beyond = (constants.STAND_RAD + 0.25 * action < low) | (constants.STAND_RAD + 0.25 * action > high)
+        assert beyond.all()
+        np.testing.assert_allclose(drive.targets, np.tile(ends, (robot.substeps, 1)), rtol=1e-6)
+        # The policy observes what it meant.
+        np.testing.assert_allclose(drive.target, constants.STAND_RAD + 0.25 * action, rtol=1e-6)
 
 
 def still(robot, start):

@@ -8,7 +8,7 @@ import pytest
 from slider import AXES, DIRECTION, HYPOTHESES, LEARNED, WARPED, WILD, problem
 
 from jaxtune.discovery import noise_floor, state, step, workflow
-from jaxtune.discovery.conclude import explained, renamed, with_refinements
+from jaxtune.discovery.conclude import explained, renamed, speak, with_refinements
 from jaxtune.discovery.decide import Candidate, Evidence
 from jaxtune.discovery.fit import begin
 from jaxtune.discovery.prove import is_worse
@@ -292,6 +292,20 @@ def test_the_explained_share_is_of_what_a_learned_torque_explains():
     # A model can cost more than the null, and nothing may be left to explain.
     assert explained(300.0, 310.0, 100.0) == 0.0
     assert explained(300.0, 300.0, 300.0) == 1.0
+
+
+@pytest.mark.parametrize(
+    ("typical", "usual", "speaks"),
+    [
+        ([4.1, 2.0, 1.5], [9.5, 8.0, 7.0], True),  # play: where the gears are out of touch it stays far off
+        ([4.1, 2.0, 1.5], [9.5, 10.5, 7.0], False),  # typical segments got better at the cost of others
+        ([1.4, 1.0, 1.0], [9.5, 8.0, 7.0], False),  # typical ones show nothing
+    ],
+)
+def test_typical_segments_speak_where_others_do_not_pay_for_them(typical, usual, speaks):
+    of_usual, of_typical = ([np.array([value]) for value in gaps] for gaps in (usual, typical))
+    heard = speak(of_usual, of_typical, Settings().at_floor)
+    assert [gaps is of_typical for gaps in heard] == ([False, True] if speaks else [False])
 
 
 def test_an_effect_costs_what_chance_gains_on_null_logs():
