@@ -25,7 +25,7 @@ from envs.biteno import constants
 from envs.logs import Controller, Log, Run, read, write
 from envs.logs.tables import WRITERS
 from envs.rig import Rig
-from experiments.common import checkpoint
+from experiments.common import checkpoint, compiler
 from experiments.common.cli import console, run
 from experiments.common.config import Preset, preset
 from experiments.walking import costs, foreign, memory
@@ -266,9 +266,9 @@ MEASURES = {
 def main(args: Args) -> None:
     """Measures one thing, prints a table, and writes it as JSON with the time and the memory that it took."""
     if args.what == "rig":
-        checkpoint.set_up_compiler(checkpoint.for_simulation(), most=1)
+        compiler.set_up(compiler.for_simulation(), most=1)
     else:
-        checkpoint.set_up_compiler(preset(args.preset).xla_flags)
+        compiler.set_up(preset(args.preset).xla_flags)
     begin = time.monotonic()
     rows = MEASURES[args.what](args)
     table = Table(title=args.what)

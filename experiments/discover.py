@@ -8,7 +8,7 @@ answer that nothing is missing, or that something is missing that it cannot name
 from dataclasses import dataclass
 from pathlib import Path
 
-from experiments.common import checkpoint
+from experiments.common import checkpoint, compiler
 from experiments.common.cli import bars, console, run
 from experiments.discovery import gate, report
 from experiments.discovery.investigate import investigate
@@ -52,7 +52,7 @@ def main(args: Args) -> None:
       ValueError: an option is wrong, a log cannot be used, or the folder holds another run or belongs to a process that
         still works there.
     """
-    checkpoint.set_up_compiler(checkpoint.for_simulation())
+    compiler.set_up(compiler.for_simulation())
     _check(args)
     # Says what is wrong with the logs before the folder is made and anything is compiled.
     log, spec = read_logs(args.logs, args.clear_flags, args.swap_halves, args.robot)

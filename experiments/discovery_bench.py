@@ -12,7 +12,7 @@ from pathlib import Path
 import jax
 from rich.table import Table
 
-from experiments.common import checkpoint
+from experiments.common import checkpoint, compiler
 from experiments.common.cli import bars, console, run
 from experiments.discovery.blind_bench import Bench
 from experiments.discovery.blind_cases import SIZES
@@ -53,7 +53,7 @@ def main(args: Args) -> None:
     Raises:
       ValueError: an option is wrong, or the folder holds another benchmark.
     """
-    checkpoint.set_up_compiler(checkpoint.for_simulation())
+    compiler.set_up(compiler.for_simulation())
     if args.size not in (*SIZES, *FIELD_SIZES):
         raise ValueError(f"size: got '{args.size}', expected one of {', '.join((*SIZES, *FIELD_SIZES))}")
     number, _, pieces = args.piece.partition("/")

@@ -15,7 +15,7 @@ from rich.table import Table
 
 from envs.biteno import constants
 from envs.targets.protocol import Commands
-from experiments.common import checkpoint, film, plots
+from experiments.common import checkpoint, compiler, film, plots
 from experiments.common.checkpoint import write_json
 from experiments.common.cli import console, run
 from experiments.common.config import PRESETS, named_values, preset
@@ -80,7 +80,7 @@ def main(args: Args) -> None:
     Raises:
       ValueError: an option is wrong, the policy cannot be loaded, or the engine is not installed.
     """
-    checkpoint.set_up_compiler(preset(args.preset).xla_flags)
+    compiler.set_up(preset(args.preset).xla_flags)
     params = check(args)
     sizes = preset(args.preset)
     # A learner needs a parameter; foot friction at its nominal value changes nothing.

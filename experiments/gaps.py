@@ -13,7 +13,7 @@ from rich.table import Table
 
 from envs.biteno import constants
 from envs.targets.mjx import MjxTarget
-from experiments.common import checkpoint, plots
+from experiments.common import checkpoint, compiler, plots
 from experiments.common.cli import bars, console, run
 from experiments.common.config import preset
 from experiments.walking.learner import Learner
@@ -77,7 +77,7 @@ def main(args: Args) -> None:
     Raises:
       ValueError: an option is wrong, or the policy cannot be loaded.
     """
-    checkpoint.set_up_compiler(preset(args.preset).xla_flags)
+    compiler.set_up(preset(args.preset).xla_flags)
     if args.episodes < 1:
         raise ValueError(f"episodes: got {args.episodes}, expected 1 or more")
     sizes = preset(args.preset)

@@ -13,7 +13,7 @@ import jax
 import numpy as np
 from rich.table import Table
 
-from experiments.common import checkpoint, plots
+from experiments.common import checkpoint, compiler, plots
 from experiments.common.checkpoint import read_json, write_json
 from experiments.common.cli import bars, console, run
 from experiments.common.config import Preset, preset
@@ -194,7 +194,7 @@ def main(args: Args) -> None:
     check_positive(tunings=args.tunings, radius=args.radius)
     sizes = preset(args.preset)
     sizes = replace(sizes, scratch_updates=min(sizes.scratch_updates, _UPDATES))
-    checkpoint.set_up_compiler(sizes.xla_flags)
+    compiler.set_up(sizes.xla_flags)
     checkpoint.open_run(args.out, {"radius": args.radius, "tunings": args.tunings, "preset": args.preset})
     with checkpoint.lock(args.out / "summary.json"):
         results = {name: results_of(args, sizes, name) for name in args.robots}

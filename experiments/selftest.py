@@ -16,7 +16,7 @@ import jax
 from rich.progress import Progress
 from rich.table import Table
 
-from experiments.common import checkpoint, plots
+from experiments.common import checkpoint, compiler, plots
 from experiments.common.cli import bars, console, run
 from experiments.common.config import preset
 from experiments.common.rates import interval
@@ -61,6 +61,8 @@ class Args:
     """Robots of every case with which whole tunings are run as well."""
     tunings: int = 1
     """Whole tunings of each of these robots, one after another; the policy stays as it is."""
+    states: bool = False
+    """Whether whole tunings estimate last from measured states, and are `unexplained` where these fit no parameters."""
     others: tuple[str, ...] = ()
     """Differences that the gate should notice, as name=value in physical values: torque_scale=0.75, or '*_mass=2' for
     all tuned masses at once. Several names are joined by commas. By default every parameter of the robot that is not
@@ -142,6 +144,8 @@ def check(args: Args) -> tuple[Kind, dict[str, Entry], dict[str, dict[str, float
     check_positive(radius=args.radius, robots=args.robots, gates=args.gates, tunings=args.tunings)
     if args.whole < 0:
         raise ValueError(f"whole: got {args.whole}, expected 0 or more")
+    if args.states and not args.whole:
+        raise ValueError("states: got true, expected whole robots as well (--whole): no gate reads states")
     numbers = args.episodes or (sizes.tuner.set_episodes,)
     for number in numbers:
         check_positive(episodes=number)
@@ -154,7 +158,7 @@ def tested(args: Args, robot: Kind, entries, others, episodes: int, progress: Pr
     sizes = preset(args.preset)
     sizes = replace(sizes, tuner=replace(sizes.tuner, set_episodes=episodes))
     hidden = {name: robot.entries[name] for values in others.values() for name in values if name not in entries}
-    learner = Learner(sizes, entries, hidden, kind=robot)
+    learner = Learner(sizes, entries, hidden, kind=robot, states=args.states)
     # The robots of every case: inside, outside in a parameter, and the others.
     memory.check(learner, sets=args.robots * (1 + len(entries) + len(others)))
     policy = starting_policy(args.policy or default_policy(robot), learner, args.out)
@@ -228,7 +232,7 @@ def _rate(rate: Rate) -> str:
 
 def main(args: Args) -> None:
     """Runs the self-test, prints tables, and writes `selftest.json` and a plot."""
-    checkpoint.set_up_compiler(preset(args.preset).xla_flags)
+    compiler.set_up(preset(args.preset).xla_flags)
     robot, entries, others, numbers = check(args)
     identity = {name: value for name, value in vars(args).items() if name != "out"}
     # A policy that is trained first is kept in the folder, and is another one for other sizes.

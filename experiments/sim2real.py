@@ -7,7 +7,7 @@ log and the gate verifies it. The tuner moves the distribution, the policy train
 
 from dataclasses import dataclass
 
-from experiments.common import checkpoint
+from experiments.common import compiler
 from experiments.common.cli import run
 from experiments.common.config import preset
 from experiments.robot.transfer import Transfer, compile_programs, play
@@ -24,7 +24,7 @@ def main(args: Args) -> None:
     Raises:
       ValueError: an option is wrong, too many falls are expected, or the robot's log is missing or unusable.
     """
-    checkpoint.set_up_compiler(preset(args.preset).xla_flags)
+    compiler.set_up(preset(args.preset).xla_flags)
     play(args, compile_programs(args))
 
 

@@ -20,7 +20,7 @@ from rich.table import Table
 from envs import corrected, logs
 from envs.biteno import constants, walks
 from envs.targets import recorded
-from experiments.common import checkpoint, plots
+from experiments.common import checkpoint, compiler, plots
 from experiments.common.checkpoint import as_json, from_json, read_json, write_json
 from experiments.common.cli import bars, console, count, run
 from experiments.common.config import preset
@@ -208,7 +208,7 @@ def main(args: Args) -> None:
       ValueError: an option is wrong, the folder holds another benchmark, or the stand-in does not answer.
     """
     check(args)
-    checkpoint.set_up_compiler(preset(args.preset).xla_flags)
+    compiler.set_up(preset(args.preset).xla_flags)
     identity = asdict(args) | {"model_sha256": args.model and corrected.read(args.model).digest}
     # Other processes may play other methods and seeds in the same folder.
     for option in ("out", "methods", "seeds"):

@@ -17,7 +17,7 @@ import jax
 from rich.progress import Progress, TaskID
 
 from envs.targets.protocol import Target
-from experiments.common import checkpoint, hosts, plots, report
+from experiments.common import checkpoint, compiler, hosts, plots, report
 from experiments.common.checkpoint import as_json, read_json, write_json, write_text
 from experiments.common.cli import bars, console, run
 from experiments.common.config import Preset, named_values, preset
@@ -215,7 +215,7 @@ def main(args: Args) -> None:
       ValueError: an option is wrong, the run does not fit into memory, the folder holds another, or no measured episode
         lasts as long as a window.
     """
-    checkpoint.set_up_compiler(preset(args.preset).xla_flags)
+    compiler.set_up(preset(args.preset).xla_flags)
     hosts.join(args)
     sizes, robot, entries, case, knobs = check(args)
     args = dataclasses.replace(args, policy=args.policy or default_policy(robot))

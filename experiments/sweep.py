@@ -19,7 +19,7 @@ import numpy as np
 from rich.table import Table
 
 from envs.targets.mjx import MjxTarget
-from experiments.common import checkpoint, hosts, plots
+from experiments.common import checkpoint, compiler, hosts, plots
 from experiments.common.cli import bars, console, count, run
 from experiments.common.config import Preset, named_values, preset
 from experiments.walking import memory
@@ -182,7 +182,7 @@ def main(args: Args) -> None:
       ValueError: an option is wrong, the lanes do not fit into memory, or the folder holds another run or belongs to a
         process that still works there.
     """
-    checkpoint.set_up_compiler(preset(args.preset).xla_flags)
+    compiler.set_up(preset(args.preset).xla_flags)
     hosts.join(args)
     sizes, robot, entries, case = check(args)
     args = dataclasses.replace(args, policy=args.policy or default_policy(robot))

@@ -6,7 +6,7 @@ from pathlib import Path
 import jax
 
 from envs import corrected
-from experiments.common import checkpoint, hosts, plots
+from experiments.common import compiler, hosts, plots
 from experiments.common.checkpoint import as_json, read_json
 from experiments.common.cli import console, run
 from experiments.common.config import preset
@@ -47,7 +47,7 @@ def main(args: Args) -> None:
       ValueError: an option is wrong, the corrected model cannot be read, the training does not fit into memory, or the
         folder holds another policy or another command's run.
     """
-    checkpoint.set_up_compiler(preset(args.preset).xla_flags)
+    compiler.set_up(preset(args.preset).xla_flags)
     hosts.join(args)
     sizes, robot = preset(args.preset), kind(args.robot)
     entries = robot.chosen(args.parameters)

@@ -133,7 +133,10 @@ def explain(info) -> str:
         f"  novelty {float(info.gate.novelty[last]):.3f}, threshold {float(info.gate.threshold[last]):.3f}",
     ]
     excess = {what: float(info.gate[name][last]) for name, what in _EXCESS.items()}
-    if verdict != Verdict.ACCEPT and np.isfinite([*excess.values()]).any():
+    replay = float(info.update.p_replay)
+    if verdict == Verdict.UNEXPLAINED and not np.isnan(replay):
+        lines.append(f"  its measured states fit worse than those of all simulated sets (p {replay:.2f})")
+    elif verdict != Verdict.ACCEPT and np.isfinite([*excess.values()]).any():
         most = max((what for what in excess if np.isfinite(excess[what])), key=excess.__getitem__)
         lines.append(f"  most unlike the simulated sets: {most} ({excess[most]:.1f}; 1 is usual for one set in ten)")
     if verdict == Verdict.ACCEPT:
@@ -145,7 +148,6 @@ def explain(info) -> str:
             lines.append(f"  joined with the sets of earlier tunings, which it does not contradict (p {past:.2f})")
         elif not np.isnan(past):
             lines.append(f"  contradicts the sets of earlier tunings (p {past:.2f}), which count no longer")
-        replay = float(info.update.p_replay)
         if info.update.replayed:
             lines.append(f"  estimated from measured states, which fit (p {replay:.2f})")
         elif not np.isnan(replay):

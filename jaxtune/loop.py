@@ -145,8 +145,9 @@ def refine(config: TunerConfig, carry: dict, moved: ParamDist, update: UpdateInf
     # The gate has just tested the distribution of the first reading.
     again = carry["left"] < 1 + config.refinements
     misfits = again & conformal.rejects(update.p_value, knobs.level)
-    # Tested once a tuning, so that its rate of false alarms is that of one test: at filled bounds by the gate.
-    first = (carry["left"] == config.refinements) & ~dists.at_bounds(tested)
+    # Tested once a tuning, so that its rate of false alarms is that of one test: at filled bounds by the gate, and from
+    # states, where they are measured, by `sharpen`.
+    first = (carry["left"] == config.refinements) & ~dists.at_bounds(tested) & carry["sharpened"]
     unexplained = first & (update.p_misfit <= _UNEXPLAINED)
     radius, unit = dists.ravel(dist.radius), dists.ravel(tested.radius)
     changed = (dists.ravel(moved.radius) < _CHANGED * radius) | (jnp.abs(update.step) > 1.0 - _CHANGED)
@@ -168,17 +169,14 @@ def refine(config: TunerConfig, carry: dict, moved: ParamDist, update: UpdateInf
         p_misfit=update.p_misfit,
         learnt=pooling.nothing(wider),
     )
-    nothing = no_update(tested).replace(p_value=update.p_value, p_misfit=update.p_misfit)
-    verdict = jnp.where(unexplained, Verdict.UNEXPLAINED, carry["verdict"])
-    return carry | {
-        "left": jnp.where(changed.any() & ~misfits & ~unexplained, carry["left"] - 1, 0),
-        "dist": optax.tree.where(unexplained, tested, optax.tree.where(misfits, wider, moved)),
+    read = carry | {
+        "left": jnp.where(changed.any() & ~misfits, carry["left"] - 1, 0),
+        "dist": optax.tree.where(misfits, wider, moved),
         "wider": dist.radius,
-        "past": optax.tree.where((contradicts & ~misfits) | unexplained, pooling.nothing(tested), carry["past"]),
-        "update": optax.tree.where(unexplained, nothing, optax.tree.where(misfits, back, update)),
-        "verdict": verdict,
-        "verdicts": carry["verdicts"].at[carry["calls"] - 1].set(verdict),
+        "past": optax.tree.where(contradicts & ~misfits, pooling.nothing(tested), carry["past"]),
+        "update": optax.tree.where(misfits, back, update),
     }
+    return optax.tree.where(unexplained, _given_up(read), read)
 
 
 def sharpen(
@@ -203,14 +201,14 @@ def sharpen(
 
     Returns:
       What the loop carries on; it ends. The centre is the new estimate if, on simulated sets, its errors (rms, in
-      radii) are smaller than those of the estimate before, and if the measured set fits it. Radii only narrow.
+      radii) are smaller than those of the estimate before, and if the measured set fits it. Radii only narrow. The
+      verdict is `unexplained` where the set fits worse than 99 simulated ones, each fitted within the bounds.
     """
     dist, tested, before = carry["dist"], carry["tested"], carry["update"]
-    sizes, held_out = config.replay, (collected.held_out, collected.held_out_coords)
-    # The last ones are others than the first where there are twice as many.
-    first, last = (jax.tree.map(lambda leaf, part=part: leaf[part], held_out) for part in sizes.parts)
+    held_out = collected.held_out, collected.held_out_coords
+    last = jax.tree.map(lambda leaf: leaf[-config.replay.sets :], held_out)
     pool = partial(pooling.joined, key, carry["past"], dist)
-    found = replays.estimate(sizes, replay, *first, measured, dist, config.coverage, *last, pool)
+    found = replays.estimate(config.replay, replay, *held_out, measured, dist, config.coverage, *last, pool)
     radius, unit = dists.ravel(dist.radius), dists.ravel(tested.radius)
     errors = found.errors * jnp.outer(radius / unit, radius / unit)
     # An update that gives no errors gives no reason to keep its estimate.
@@ -229,19 +227,34 @@ def sharpen(
         replayed=jnp.asarray(True),
         pooled=found.pooled,
         p_past=jnp.where(jnp.isnan(found.p_past), before.p_past, found.p_past),
-        learnt=pooling.learnt(carry["past"], found.pooled, dist, found.estimate, found.errors, sizes.sets),
+        learnt=pooling.learnt(carry["past"], found.pooled, dist, found.estimate, found.errors, found.sets),
     )
     update = optax.tree.where(taken, update, before).replace(p_replay=found.p_value)
-    return carry | {
+    read = carry | {
         "dist": optax.tree.where(taken, moved, dist),
         "update": update,
         "sharpened": jnp.asarray(True),
     }
+    return optax.tree.where(found.p_value <= _UNEXPLAINED, _given_up(read), read)
 
 
 def known_after(carry: dict) -> Past:
     """What all sets so far say after a tuning, from what its loop carried last."""
     return optax.tree.where(carry["verdict"] == Verdict.ACCEPT, carry["update"].learnt, carry["past"])
+
+
+def _given_up(carry: dict) -> dict:
+    """What the loop carries on where no parameters explain the set: as before its first reading, and nothing learnt."""
+    tested, update, verdict = carry["tested"], carry["update"], jnp.asarray(Verdict.UNEXPLAINED, int)
+    told = {name: getattr(update, name) for name in ("p_value", "p_misfit", "p_replay")}
+    return carry | {
+        "left": jnp.zeros_like(carry["left"]),
+        "dist": tested,
+        "past": pooling.nothing(tested),
+        "update": no_update(tested).replace(**told),
+        "verdict": verdict,
+        "verdicts": carry["verdicts"].at[carry["calls"] - 1].set(verdict),
+    }
 
 
 def _contradicts(found: UpdateInfo | replays.Replayed) -> jax.Array:

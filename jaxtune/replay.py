@@ -73,13 +73,9 @@ class ReplayConfig:
     iterations: int = 6
     """Gauss-Newton steps."""
     sets: int = 19
-    """Simulated sets that are fitted beside the measured one. A level of 0.95 needs 19. As many again say how features
-    err; with fewer than twice as many held-out sets, these are partly the same, and p-values too small."""
-
-    @property
-    def parts(self) -> tuple[slice, slice]:
-        """Of the held-out sets: those that are fitted, and those that say how features err."""
-        return slice(self.sets), slice(-self.sets, None)
+    """Simulated sets that are fitted beside the measured one; a level of 0.95 needs 19. If it fits worse than all of
+    them, all other held-out sets are fitted too. The last ones, as many, say how features err: these fit a little
+    better than a measured set can."""
 
 
 @chex.dataclass(frozen=True)
@@ -92,6 +88,7 @@ class Replayed:
     p_value: jax.Array  # (1 + #{simulated sets that misfit at least as much}) / (sets + 1)
     pooled: jax.Array  # whether earlier sets count in the estimate (`jaxtune.pooling`)
     p_past: jax.Array  # of what contradicts them; nan where they said nothing
+    sets: jax.Array  # number of simulated sets that were fitted, and tell the errors
 
 
 @chex.dataclass(frozen=True)
@@ -118,6 +115,11 @@ class _Fit:
     normal: jax.Array  # [coords, coords] there, of Gauss-Newton
 
 
+def alone(estimates: jax.Array, truth: jax.Array, valid: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Joins estimates with nothing: a `Pool` of a robot that was never measured before."""
+    return estimates, jnp.asarray(False), jnp.asarray(jnp.nan)
+
+
 @devices.precisely
 def estimate(
     config: ReplayConfig,
@@ -129,7 +131,7 @@ def estimate(
     coverage: float,
     others: Trajectory,
     true_others: Coords,
-    pool: Pool | None = None,
+    pool: Pool = alone,
 ) -> Replayed:
     """Estimates the coordinates of a measured set, and how far the estimate may be off.
 
@@ -138,18 +140,20 @@ def estimate(
 
         interval = e(measured) Q(max over coordinates of |estimate - truth| / e).
 
+    Simulated sets are fitted until one fits as badly as the measured one, `ReplayConfig.sets` or one more at a time.
+
     Args:
       config: sizes.
       replay: simulates pieces.
-      simulated: sets with states, measured as the robot's are, [sets, episodes, time].
+      simulated: sets with states, measured as the robot's are, [sets, episodes, time]; `ReplayConfig.sets` or more.
       truth: their coordinates, [sets] by name, drawn from `dist`.
       measured: the set with states, [episodes, time].
       dist: a distribution near the truth; estimates may leave it, but not its bounds.
       coverage: share of sets of which all true coordinates shall lie in their intervals.
-      others: as many simulated sets again, which say how features err. Others than the fitted ones: what was learnt of
-        a set fits it better than it fits the measured one.
+      others: `ReplayConfig.sets` simulated sets, which say how features err. Others than the fitted ones: what was
+        learnt of a set fits it better than it fits the measured one.
       true_others: their coordinates.
-      pool: joins estimates with what earlier sets said, if any did.
+      pool: joins estimates with what earlier sets said.
 
     Returns:
       What was found; not finite where the measured set has no whole piece, or hardly any simulated one has.
@@ -162,28 +166,57 @@ def estimate(
         return jax.vmap(lambda episodes: _cut(config, replay, episodes))(every)
 
     pieces, truth = cut(simulated), dists.normalise(dist, truth)
-    fits = _fit(config, replay, pieces, cut(others), dists.normalise(dist, true_others), dist)
-    # A set without a piece says nothing, and counts as one that is fitted badly.
-    known = pieces.valid.any(axis=-1)
-    best, pooled, p_past = fits.best, jnp.asarray(False), jnp.asarray(jnp.nan)
-    if pool is not None:
-        best, pooled, p_past = pool(best, truth, known[:-1])
-        best = jnp.clip(best, *(dists.normalise(dist, end) for end in (dist.lower, dist.upper)))
+    others, true_others = cut(others), dists.normalise(dist, true_others)
+    parts = _parts(len(truth), len(true_others))
+
+    def fit_more(carry):
+        number, best, normal, left = carry
+        rows = parts[number]
+        mine = jax.tree.map(lambda leaf: leaf[rows], pieces)
+        fits = _fit(config, replay, mine, others, true_others, dist)
+        logs = jnp.where(mine.valid, jnp.log1p(fits.energy), 0.0).sum(axis=-1) / jnp.maximum(mine.valid.sum(axis=-1), 1)
+        # A set without a piece says nothing, and counts as one that is fitted badly.
+        logs = jnp.where(mine.valid.any(axis=-1), logs, jnp.inf)
+        found = zip((best, normal, left), (fits.best, fits.normal, logs), strict=True)
+        return number + 1, *(every.at[rows].set(some) for every, some in found)
+
+    def goes_on(carry):
+        number, _, _, left = carry
+        worst = jnp.isfinite(left[-1]) & ~(left[:-1] >= left[-1]).any()
+        return (number == 0) | ((number < len(parts)) & worst)
+
+    count, coords = len(pieces.valid), truth.shape[1]
+    start = jnp.zeros((count, coords)), jnp.broadcast_to(jnp.eye(coords), (count, coords, coords))
+    start = jnp.asarray(0), *start, jnp.full(count, jnp.nan)
+    _, best, normal, left = jax.lax.while_loop(goes_on, fit_more, start)
+    known = jnp.isfinite(left)
+    joined, pooled, p_past = pool(best, truth, known[:-1])
+    best = jnp.clip(joined, *(dists.normalise(dist, end) for end in (dist.lower, dist.upper)))
     error = jnp.where(known[:-1, None], best[:-1] - truth, jnp.nan)
-    deviations = jax.vmap(lambda normal: jnp.sqrt(jnp.diag(jnp.linalg.inv(normal))))(fits.normal)
+    deviations = jax.vmap(lambda normal: jnp.sqrt(jnp.diag(jnp.linalg.inv(normal))))(normal)
     # Slopes that jump make some standard errors far too small.
     deviations = jnp.hypot(deviations, jnp.maximum(_medians(jnp.abs(error)), _CLOSEST))
     scaled = (jnp.abs(error) / deviations[:-1]).max(axis=-1)
-    logs = jnp.where(pieces.valid, jnp.log1p(fits.energy), 0.0).sum(axis=-1) / jnp.maximum(pieces.valid.sum(axis=-1), 1)
-    left = jnp.nan_to_num(error)
+    off = jnp.nan_to_num(error)
     return Replayed(
         estimate=jnp.where(known[-1], best[-1], jnp.nan),
         interval=deviations[-1] * conformal.quantile(scaled, coverage),
-        errors=left.T @ left / known[:-1].sum(),
-        p_value=conformal.p_value(jnp.where(known, logs, jnp.inf)),
+        errors=off.T @ off / known[:-1].sum(),
+        p_value=conformal.p_value(left),
         pooled=pooled,
         p_past=p_past,
+        sets=known[:-1].sum(),
     )
+
+
+def _parts(sets: int, first: int) -> jax.Array:
+    """Which of all sets and the measured one, the last, are fitted side by side, [parts, first + 1] indices.
+
+    The measured one is beside the first sets. Of the last part some are fitted again, so that all are alike.
+    """
+    size = first + 1
+    rows = [[min(index, sets - 1) for index in range(low, low + size)] for low in range(first, sets, size)]
+    return jnp.array([[*range(first), sets], *rows])
 
 
 def _medians(values: Float[Array, "sets coords"]) -> Float[Array, "sets+1 coords"]:

@@ -13,7 +13,7 @@ that this walk does not show: walk differently, or for more episodes.
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from types import MappingProxyType
 
@@ -198,7 +198,9 @@ def _call(
       `rejected` and `noticed` [gates, cases, robots]: 1, 0, or nan where the set is unusable; of the robots inside,
       `identifiable`, and `errors` and `intervals` in radii, [gates, robots, coords].
     """
-    programs = (_scorer(tuner, robots), tuner.collect, partial(_measured, tuner))
+    # No gate reads states, which are large.
+    seen = replace(tuner, simulate=lambda *args: tuner.simulate(*args).replace(state=None))
+    programs = (_scorer(seen, robots), seen.collect, partial(_measured, seen))
     score, collect, measure = (devices.on_all(jax.jit(program)) for program in programs)
     calls = []
     for gate in range(gates):

@@ -39,7 +39,8 @@ Departures from the paper, besides those of `jaxtune.gate` and `jaxtune.update`:
   said (`jaxtune.pooling`). A set that contradicts them, or that the gate rejects, makes them count no longer.
 - Where the robot's states are measured (`Tuner.replay`), the accepted set is read a last time, by simulating short
   pieces of it from measured states (`jaxtune.replay`). That estimate is taken if it errs less on simulated sets than
-  the one before, and if the measured set fits it (`UpdateInfo.p_replay` > 1 - level).
+  the one before, and if the measured set fits it (`UpdateInfo.p_replay` > 1 - level). If no coordinates within the
+  bounds fit (`p_replay` <= 0.01), the verdict becomes `unexplained`; `p_misfit` does not count then.
 - A tuning ends with training the policy, where the paper's begins with it. The last tuning therefore leaves a policy
   that was trained in the last distribution.
 - The radius grows only after a failed check (in print it grows before each), is capped by the bounds, and the loop ends

@@ -46,7 +46,7 @@ def pytest_configure(config):
         from experiments.common.config import QUICK_COMPILATION
     # Every process of pytest has a core, so none splits a program to compile it on several.
     os.environ.setdefault("XLA_FLAGS", f"{QUICK_COMPILATION} --xla_cpu_parallel_codegen_split_count=1")
-    # As `experiments.common.checkpoint.set_up_compiler` does.
+    # As `experiments.common.compiler.set_up` does.
     os.environ.setdefault("NPROC", "8")
 
 

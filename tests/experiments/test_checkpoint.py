@@ -15,7 +15,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from faults import Killed, killed_at
-from jax._src import compilation_cache
 
 from experiments.common import checkpoint
 from experiments.common.config import PRESETS
@@ -52,16 +51,6 @@ def test_a_state_of_other_shapes_is_refused(tmp_path):
     wider = state(0.0) | {"kernel": jnp.zeros((4, 2))}
     with pytest.raises(ValueError, match=r"\['kernel'\] has shape \(3, 2\) there, expected \(4, 2\)"):
         checkpoint.load(tmp_path, wider, CONFIG)
-
-
-def test_a_program_that_a_killed_process_left_unfinished_is_compiled_again(tmp_path, monkeypatch):
-    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path))
-    monkeypatch.setenv("XLA_FLAGS", "")
-    whole, torn = tmp_path / "whole-cache", tmp_path / "torn-cache"
-    whole.write_bytes(compilation_cache.compress_executable(bytes(1000)))
-    torn.write_bytes(whole.read_bytes()[:-5])
-    checkpoint.set_up_compiler("")
-    assert whole.exists() and not torn.exists()
 
 
 def test_json_is_the_old_or_the_new_one_whenever_it_is_killed(monkeypatch, tmp_path):
@@ -235,15 +224,3 @@ def test_a_training_that_was_killed_ends_as_if_it_had_not_been(learner, monkeypa
     assert drop(longer) == drop(curve)
     assert not (out / "training").exists()
     assert json.loads((out / "config.json").read_text())["state"] == "state_1"
-
-
-def test_the_first_run_says_that_programs_are_compiled(tmp_path, monkeypatch, capsys):
-    kept = tmp_path / "programs"
-    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(kept))
-    monkeypatch.setenv("XLA_FLAGS", "")
-    checkpoint.set_up_compiler("")
-    assert f"later runs find them in {kept}" in capsys.readouterr().out.replace("\n", "")
-    kept.mkdir()
-    (kept / "one").touch()
-    checkpoint.set_up_compiler("")
-    assert not capsys.readouterr().out

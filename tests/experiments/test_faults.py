@@ -8,7 +8,7 @@ import pytest
 from faults import check_every_kill
 
 from experiments import discovery_bench, gpu_bench, robots_bench, sim2sim, sweep
-from experiments.common import checkpoint, plots
+from experiments.common import checkpoint, compiler, plots
 from experiments.common.config import PRESETS
 from experiments.discovery import benchmark, investigate
 from experiments.discovery.field.bench import FieldBench
@@ -19,7 +19,7 @@ from experiments.walking.robots import BITENO
 @pytest.fixture(autouse=True)
 def quick(monkeypatch):
     """Nothing is compiled, drawn or looked up."""
-    monkeypatch.setattr(checkpoint, "set_up_compiler", lambda *_: None)
+    monkeypatch.setattr(compiler, "set_up", lambda *_: None)
     monkeypatch.setattr(checkpoint, "versions", dict)
     for name in ("sim2sim", "sweep", "recovery", "confusion"):
         monkeypatch.setattr(plots, name, lambda *_: None)

@@ -9,7 +9,7 @@ import pytest
 
 import experiments
 from experiments import sim2real_bench
-from experiments.common import checkpoint
+from experiments.common import compiler
 from experiments.robot import transfer
 from experiments.sim2real_bench import Args, evaluate, stand_in, transfer_of
 
@@ -32,7 +32,7 @@ def test_every_method_learns_in_the_model_that_was_found_from_a_policy_of_the_no
         raise Enough
 
     # Flags are for a process of its own.
-    monkeypatch.setattr(checkpoint, "set_up_compiler", lambda flags: None)
+    monkeypatch.setattr(compiler, "set_up", lambda flags: None)
     monkeypatch.setattr(transfer, "compile_programs", lambda args: args.model)
     monkeypatch.setattr(sim2real_bench, "prepare", prepare)
     for model in (FOUND, None):

@@ -12,6 +12,7 @@ from jaxtune import dist as dists
 from jaxtune import mjx, pooling, replay, tuner
 from jaxtune.replay import ReplayConfig
 from jaxtune.tuner import Tuner, TunerConfig
+from jaxtune.types import Verdict
 
 EPISODES, SETS = 3, 19
 NAMES = ("friction", "mass")
@@ -24,13 +25,13 @@ def dist():
     return toys.uniform(dict.fromkeys(NAMES, 0.0), radius=0.2)
 
 
-@partial(jax.jit, static_argnums=0)
-def calibration(slider, dist, seed):
+@partial(jax.jit, static_argnums=(0, 3))
+def calibration(slider, dist, seed, count=SETS):
     """Simulated sets, and their coordinates."""
-    truth = dists.sample(jax.random.key(seed), dist, SETS)
+    truth = dists.sample(jax.random.key(seed), dist, count)
     each = {name: jnp.repeat(values, EPISODES) for name, values in truth.items()}
     sets = slider.simulate(jax.random.key(seed + 1), toys.policy(), each)
-    return jax.tree.map(lambda leaf: leaf.reshape(SETS, EPISODES, *leaf.shape[1:]), sets), truth
+    return jax.tree.map(lambda leaf: leaf.reshape(count, EPISODES, *leaf.shape[1:]), sets), truth
 
 
 @partial(jax.jit, static_argnums=0)
@@ -84,6 +85,25 @@ def test_intervals_of_noisy_states_hold_together_as_often_as_they_say(dist):
 def test_what_no_coordinates_explain_does_not_fit(dist):
     found = estimate(EXACT, dist, measured(EXACT, friction=0.0, mass=0.0, wind=0.5))
     assert found.p_value == pytest.approx(1 / (SETS + 1))
+
+
+def test_further_sets_are_fitted_where_none_fits_as_badly(dist):
+    sets = calibration(EXACT, dist, 5, 50)
+    usual = fitted(EXACT, dist, measured(EXACT, friction=0.13, mass=-0.18), sets)
+    assert usual.sets == SETS
+    assert usual.p_value * (SETS + 1) == pytest.approx(round(float(usual.p_value) * (SETS + 1)))
+    # Three parts, the last of which is filled up.
+    strange = measured(EXACT, friction=0.0, mass=0.0, wind=0.5)
+    found = fitted(EXACT, dist, strange, sets)
+    assert found.sets == 50
+    assert found.p_value == pytest.approx(1 / 51)
+    few = estimate(EXACT, dist, strange)
+    np.testing.assert_allclose(found.estimate, few.estimate, atol=1e-5)
+    # What errs as much lies in the middle of it, however many sets say so.
+    np.testing.assert_allclose(found.interval, few.interval, rtol=1.0)
+    # Nothing to fit, nothing to compare with further sets.
+    fallen = strange.replace(alive=strange.alive.at[:, 1:].set(False))
+    assert fitted(EXACT, dist, fallen, sets).sets == SETS
 
 
 def test_pieces_after_a_fall_do_not_count(dist):
@@ -165,6 +185,24 @@ def test_the_tuner_takes_the_better_estimate(dist, slider, errors, extra, replay
     else:
         jax.tree.map(np.testing.assert_array_equal, after.dist, dist)
         assert "measured states give no better estimate" in tuner.explain(info)
+
+
+@pytest.mark.parametrize(
+    "held_out, wind, verdict", [(99, 0.5, "UNEXPLAINED"), (99, 0.0, "ACCEPT"), (59, 0.5, "ACCEPT")]
+)
+def test_states_that_no_coordinates_explain_are_unexplained_at_one_percent(dist, held_out, wind, verdict):
+    one = machine(EXACT, verify=accept, update=partial(stay, 0.1))
+    one = dataclasses.replace(one, config=dataclasses.replace(one.config, held_out_sets=held_out))
+    state = one.init(toys.policy(), dist, tuner.knobs())
+    set_ = measured(EXACT, friction=0.1, mass=-0.15, wind=wind)
+    after, info = jax.jit(one.tune)(jax.random.key(0), state, set_)
+    assert Verdict(int(info.verdicts[0])).name == verdict
+    if wind:
+        assert info.update.p_replay == pytest.approx(1 / (held_out + 1))
+        jax.tree.map(np.testing.assert_array_equal, after.dist, dist)
+        assert ("no parameters explain" in tuner.explain(info).lower()) == (verdict == "UNEXPLAINED")
+        assert ("measured states fit worse than" in tuner.explain(info)) == (verdict == "UNEXPLAINED")
+        assert after.past.tunings == (0 if verdict == "UNEXPLAINED" else state.past.tunings)
 
 
 @pytest.mark.parametrize("second, agrees", [({"friction": 0.1, "mass": -0.15}, True), ({"friction": -0.1}, False)])

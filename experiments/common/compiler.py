@@ -1,0 +1,76 @@
+"""XLA, JAX's compiler: its flags, its devices on a CPU, and where compiled programs are kept."""
+
+import contextlib
+import os
+from pathlib import Path
+
+import jax
+
+from experiments.common.cli import console
+
+_LEAST_THREADS = 8  # of XLA's pool on a CPU
+_LATEST = 4  # programs that may be unfinished
+_DEVICES = "--xla_force_host_platform_device_count"
+
+
+def set_up(xla_flags: str, most: int = 8) -> None:
+    """Sets up XLA, JAX's compiler: its flags, its devices on a CPU, and where compiled programs are kept.
+
+    Call it before JAX makes its first array, because JAX reads the flags then and never again.
+
+    - On a CPU every core of this process is a device, so that all cores share the work (`jaxtune.devices`). XLA has a
+      single CPU device unless it is told otherwise.
+    - XLA gets more threads than a small machine has cores (environment variable `NPROC`, unless it is set): with one
+      thread a core, programs on two cores were seen to hang.
+    - Programs are kept on disk, in the user's cache folder or where `JAX_COMPILATION_CACHE_DIR` says, so that a second
+      run starts sooner.
+
+    Args:
+      xla_flags: added to `XLA_FLAGS`. A number of CPU devices that is set there already stays.
+      most: largest number of CPU devices.
+    """
+    flags = f"{os.environ.get('XLA_FLAGS', '')} {xla_flags}".strip()
+    if _DEVICES not in flags:
+        flags = f"{flags} {_DEVICES}={min(cores(), most)}"
+    os.environ["XLA_FLAGS"] = flags
+    os.environ.setdefault("NPROC", str(max(_LEAST_THREADS, cores())))
+    chosen = os.environ.get("JAX_COMPILATION_CACHE_DIR")
+    base = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
+    kept = Path(chosen) if chosen else base / "jaxtune" / "xla"
+    if not kept.is_dir() or not any(kept.iterdir()):
+        text = f"first run: programs are compiled, which takes minutes; later runs find them in {kept}"
+        console.print(text, highlight=False, markup=False, soft_wrap=True)
+    _drop_torn_programs(kept)
+    if not chosen:
+        jax.config.update("jax_compilation_cache_dir", str(kept))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
+
+
+def _drop_torn_programs(kept: Path) -> None:
+    """Deletes compiled programs that a killed process left unfinished: JAX would neither read nor replace them."""
+    # Others may use the same folder, delete what is found here, or be its owner. JAX may move what is private.
+    with contextlib.suppress(OSError, ImportError):
+        from jax._src import compilation_cache
+
+        for file in sorted(kept.glob("*-cache"), key=lambda file: file.stat().st_mtime)[-_LATEST:]:
+            stored = file.read_bytes()
+            try:
+                compilation_cache.decompress_executable(stored)
+            except Exception:  # of whichever library has compressed it
+                file.unlink(missing_ok=True)
+
+
+def cores() -> int:
+    """Number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def for_simulation() -> str:
+    """Returns XLA flags for programs that simulate any robot on CPU; pass them to `set_up`.
+
+    The fusion emitters of JAX 0.10 are off. They compute each body's pose again for every body that hangs on it: a step
+    of MJX took 84 times as long for a chain of six joints, and 6 times for five (github.com/jax-ml/jax, issue 33761).
+    JAX 0.11 has no such flag, and does not need it.
+    """
+    # XLA ends the process at a flag that it does not know.
+    return "" if jax.__version_info__ >= (0, 11) else "--xla_cpu_use_fusion_emitters=false"
