@@ -266,7 +266,8 @@ def _proved(
     (fit,) = polish([state.best.fit], at.residuals["train"], 0)
     best = renamed(problem, replace(state.best, fit=fit))
     of_effect = Thresholds(state.price)
-    of_form = Thresholds(0.5 * state.price, floors=0.0, of_left=0.0, horizons=1)
+    # Much of what forms are about ends at its bounds: friction can be all at the motor, a limit as soft as it gets.
+    of_form = Thresholds(0.5 * state.price, floors=0.0, of_left=0.0, inside=False, horizons=1)
     fitted = {one.key: one for one in state.candidates}
     while True:
         weighed = {h.key: (h, *weigh_evidence(problem, floor, best, h, fitted)) for h in best.hypotheses}

@@ -96,6 +96,8 @@ class Thresholds:
     that is there already."""
     relief: float = 9.0
     """In the place of `floors`: a parameter that need not be three deviations off."""
+    inside: bool = True
+    """Whether the fit may not stand at a bound."""
     horizons: int = 2
 
 
@@ -204,7 +206,7 @@ def passes(evidence: Evidence, thresholds: Thresholds) -> dict[str, bool]:
         "matters": evidence.floors >= max(thresholds.floors, thresholds.of_left * evidence.left)
         or evidence.relief >= thresholds.relief,
         # A fit that ran into a bound stands in for another effect.
-        "inside_bounds": evidence.inside,
+        "inside_bounds": evidence.inside or not thresholds.inside,
         "clear_of_zero": low > 0 or high < 0,
         # Long segments let a wrong effect compensate, short ones are blind to slow bias: two must agree.
         "horizons": evidence.horizons >= thresholds.horizons,

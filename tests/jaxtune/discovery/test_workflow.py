@@ -119,6 +119,14 @@ def test_an_effect_may_have_several_forms():
     assert result.gap["after"] < 1.3
 
 
+def test_a_form_that_ends_at_its_bound_is_one():
+    most = replace(WARPED, bounds=np.array([[0.0, 6.0]]), probes=np.array([[1.0], [6.0]]))
+    result = discover({"coulomb": 1.2, "cubic": 6.1}, forms=(most,))
+    (term,) = result.terms
+    assert [form.form for form in term.forms] == ["warped"]
+    assert result.fit.vector[AXES.index("cubic")] == pytest.approx(6.0)
+
+
 def test_an_effect_in_its_first_form_gets_no_other():
     result = discover({"coulomb": 1.2}, forms=(DIRECTION,))
     assert [(term.hypothesis.name, term.forms) for term in result.terms] == [("coulomb", ())]
