@@ -359,7 +359,7 @@ def _measured(tuner: Tuner, key: jax.Array, state: TunerState, coords: Coords):
     """A measured set of every robot, [robots, set_episodes, time]."""
     each = tuner.config.set_episodes
     episodes = tuner.simulate(key, state.policy, {name: jnp.repeat(value, each) for name, value in coords.items()})
-    return jax.tree.map(lambda leaf: leaf.reshape(-1, each, *leaf.shape[1:]), episodes)
+    return jax.tree.map(lambda leaf: leaf.reshape(len(leaf) // each, each, *leaf.shape[1:]), episodes)
 
 
 def _scorer(tuner: Tuner, robots: int) -> Callable:
