@@ -67,6 +67,7 @@ def test_a_case_that_cannot_be_is_named(option, message):
         ({"gates": -1}, "gates: got -1"),
         ({"whole": -1}, "whole: got -1, expected 0 or more"),
         ({"tunings": 0}, "tunings: got 0"),
+        ({"states": True}, "states: got true, expected whole robots"),
         ({"episodes": (5, 0)}, "episodes: got 0"),
         ({"level": 1.5}, "level: got 1.5"),
         ({"radius": 0.0}, "radius: got 0.0"),

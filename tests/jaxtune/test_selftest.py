@@ -7,6 +7,7 @@ import pytest
 import toys
 
 from jaxtune import selftest
+from jaxtune.gate import GateInfo
 from jaxtune.host import HostTuner
 from jaxtune.selftest import INSIDE, Rate
 from jaxtune.tuner import Tuner, keep, knobs
@@ -74,6 +75,25 @@ def test_whole_tunings_say_how_they_end(report):
         assert "accept" not in one.verdicts
         assert one.held == Rate(0, 0)
     assert "tuning 2, heavy: 1 accept, truth in the distribution: 1 of 1" in selftest.summary(report)
+
+
+def test_whole_tunings_may_end_with_measured_states():
+    slider = toys.Slider(noise=0.0)
+    covered = lambda *args: GateInfo(novelty=jnp.zeros(()), threshold=jnp.ones(()))  # noqa: E731
+    tuner = Tuner(
+        config=dataclasses.replace(toys.TINY, held_out_sets=99, min_radius=0.01),
+        train_policy=keep,
+        simulate=slider.simulate,
+        verify=covered,
+        replay=slider.replay(),
+    )
+    state = tuner.init(toys.policy(), toys.uniform({"friction": 0.0, "mass": 0.0}, 0.2), knobs())
+    found = selftest.run(jax.random.key(0), tuner, state, robots=2, whole=1, others={"push": {"wind": 0.6}})
+    assert {name: tunings[0].verdicts for name, tunings in found.tuned.items()} == {
+        INSIDE: {"accept": 1},
+        "push": {"unexplained": 1},
+    }
+    assert max(found.tuned[INSIDE][0].error.values()) < 1e-3
 
 
 def test_a_tuning_is_counted_by_its_verdict_box_and_intervals():
