@@ -204,7 +204,9 @@ class Simulator:
         """Starts an episode of one robot with these parameters; those that are left out are nominal."""
         key_reset, key = jax.random.split(key)
         # Environments of Playground and Brax keep raw keys in their states.
-        start = self._env(params).reset(environments.raw(key_reset))
+        return self._begun(params, self._env(params).reset(environments.raw(key_reset)), key)
+
+    def _begun(self, params: Params, start: Any, key: jax.Array) -> State:
         nothing = jnp.zeros((), jnp.float32)
         return self._as_state(
             start,
@@ -252,10 +254,19 @@ class Simulator:
 
         Without `past`, an action that the robot's delay had not let through yet is taken to be the next one.
         """
-        start = self.reset(params, jax.random.PRNGKey(0))
+        start = self._begun(params, jax.tree.map(jnp.asarray, self._reset_once), jax.random.PRNGKey(0))
         own = {name: value for name, value in kept.items() if name not in ("past", "steps")}
         known = {name: kept[name] for name in ("past", "steps") if name in kept}
         return start.replace(env=with_data(start.env, data_of(start.env).replace(**own)), **known)
+
+    @cached_property
+    def _reset_once(self) -> Any:
+        """The environment's state after a reset of the nominal robot, in numbers.
+
+        Some settle the robot for hundreds of steps, which no piece of an episode should hold.
+        """
+        with jax.ensure_compile_time_eval():
+            return jax.device_get(jax.jit(self._env({}).reset)(environments.raw(jax.random.PRNGKey(0))))
 
     @cached_property
     def action_size(self) -> int:
