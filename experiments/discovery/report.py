@@ -32,6 +32,7 @@ ADVICE = {
 """What to do next, by verdict."""
 
 _SHOWN = 4  # suspects on the console
+_SUSPECT = 0.01  # least probability of one there
 _TEMPLATE = Path(__file__).with_suffix(".html")
 
 
@@ -85,7 +86,8 @@ def show(console: Console, question: Question, summary: dict, free: dict) -> Non
     """
     console.print(f"[bold]{summary['verdict']}[/bold]: {VERDICTS[summary['verdict']]}")
     console.print(ADVICE[summary["verdict"]])
-    table = Table("effect", "place", "value (95 % interval)", "not distinguishable from", "experiment to decide")
+    table = Table("effect", "place", "size (95 % interval)", "not distinguishable from", "experiment to decide")
+    table.caption = "sizes come on top of what the model has"
     for effect in _presented(summary, question):
         values = ", ".join(
             f"{name} {value['value']:.4g} ({value['low']:.4g} to {value['high']:.4g})"
@@ -109,7 +111,9 @@ def show(console: Console, question: Question, summary: dict, free: dict) -> Non
     if summary["effects"] or summary["not_named"]:
         console.print(f"explained: {summary['explained_share']:.0%} of what can be explained")
     suspects = [
-        f"{one['name']} at {place_in_words(question, one)} {one['probability']:.2f}" for one in summary["suspects"]
+        f"{one['name']} at {place_in_words(question, one)} {one['probability']:.2f}"
+        for one in summary["suspects"]
+        if one["probability"] >= _SUSPECT
     ]
     if suspects:
         console.print(f"suspects: {'; '.join(suspects[:_SHOWN])}")

@@ -99,9 +99,11 @@ def _effect(rig: Rig, term: AcceptedTerm, fit: Fit, errors: np.ndarray) -> dict:
         parameter = next(one for one in known if one.name == axis.parameter)
         # Standard errors of the directions through this coordinate add up in quadrature; 1.96 makes it a 95 % interval.
         error = 1.96 * float(np.sqrt(sum((errors[i] * fit.free.directions[i][number]) ** 2 for i in mine)))
+        low, high = parameter.bounds
         # A limit or a stiffness that may as well not be there has no upper end.
-        least = max(value - error, 1e-12) if parameter.form == "reciprocal" else value - error
-        ends = sorted(float(parameter.value(end, scale)) for end in (least, value + error))
+        low = max(low, 1e-12) if parameter.form == "reciprocal" else low
+        ends = np.clip([value - error, value + error], low, high)
+        ends = sorted(float(parameter.value(float(end), scale)) for end in ends)
         # A delay that is filtered has two times.
         name = f"{form}.{parameter.name}" if parameter.name in parameters else parameter.name
         parameters[name] = {"value": float(parameter.value(value, scale)), "low": ends[0], "high": ends[1]}

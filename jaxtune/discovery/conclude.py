@@ -157,7 +157,8 @@ def with_refinements(terms: Sequence[AcceptedTerm], own: float) -> list[Accepted
     """Marks effects that may only refine a stronger one at the same joints, because no form of the library is exact.
 
     What is left of a large effect in another form than the robot's can be several floor units, and other effects of
-    the same joint fit that well. So a weaker effect there stays in the model, but says nothing about the robot.
+    the same joint fit that well. So a weaker effect there stays in the model, but says nothing about the robot. Of one
+    at several joints, such as a delay, counts what it gains at as many of them.
 
     Args:
       terms: the strongest first.
@@ -170,10 +171,14 @@ def with_refinements(terms: Sequence[AcceptedTerm], own: float) -> list[Accepted
             for one in marked
             if one.refines is None
             and acts_within(term.hypothesis, one.hypothesis)
-            and term.evidence.gain < own * one.evidence.gain
+            and term.evidence.gain < own * one.evidence.gain * _share_of_joints(term.hypothesis, one.hypothesis)
         ]
         marked.append(replace(term, refines=over[0] if over else None))
     return marked
+
+
+def _share_of_joints(few: Hypothesis, many: Hypothesis) -> float:
+    return len(set(few.joints)) / len(set(many.joints))
 
 
 def _moved(problem: Problem, fit: Fit, errors: np.ndarray, effect: Hypothesis) -> list[Hypothesis]:

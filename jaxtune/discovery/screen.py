@@ -92,21 +92,26 @@ def seen(at: Floor, nominal: Fit, groups: Sequence[Group], library: Library) -> 
         answer = np.linalg.solve(normal[free][:, free], pull)
         length = np.sqrt(np.maximum(share * (changed**2).sum(axis=1) - (pull * answer).sum(axis=0), 0.0))
         # A form may change what friction the nominal model has, which says nothing about more of it.
-        if len(group) == 1 and length[_smallest(hypothesis.probes)].max() >= _VISIBLE:
+        if len(group) == 1 and length[_smallest(hypothesis.probes, length > 0)].max() >= _VISIBLE:
             names.add(hypothesis.name)
         falls = (share * changed @ null_residuals - answer.T @ of_slopes[free]) / np.maximum(length, 1e-3)[:, None]
         chance = np.maximum(chance, (np.minimum(falls, 0.0) ** 2).max(axis=0))
     return frozenset(names), chance
 
 
-def _smallest(probes: np.ndarray) -> list[int]:
+def _smallest(probes: np.ndarray, moving: np.ndarray) -> list[int]:
     """Finds the probes [probes, parameters] of the smallest size of interest, one for every parameter that has some.
 
-    What can be subtracted may be less: a joint loses no more damping than the model gives it.
+    What can be subtracted may be less: a joint loses no more damping than the model gives it. A size that changes
+    nothing, as a torque limit beyond the declared one, is none of interest.
+
+    Args:
+      probes: sizes.
+      moving: [probes] True where the simulation changes.
     """
     found = []
     for column in probes.T:
-        added = np.flatnonzero(column > 0)
+        added = np.flatnonzero((column > 0) & moving)
         if added.size:
             found.append(int(added[column[added].argmin()]))
     return found or [int(np.abs(probes).max(axis=1).argmin())]

@@ -146,7 +146,10 @@ def test_axes_are_named_as_the_toy_names_them():
 
 def test_an_effect_is_looked_for_at_its_smallest_size_of_interest():
     # A tiny loss, which is all that the model can lose, is no size of interest; of x, y and z any may show.
-    assert _smallest(np.array([[-0.002], [0.03], [0.3]])) == [1]
-    assert _smallest(0.1 * np.concatenate([np.eye(3), -np.eye(3), 2 * np.eye(3)])) == [0, 1, 2]
+    assert _smallest(np.array([[-0.002], [0.03], [0.3]]), np.ones(3, bool)) == [1]
+    assert _smallest(0.1 * np.concatenate([np.eye(3), -np.eye(3), 2 * np.eye(3)]), np.ones(9, bool)) == [0, 1, 2]
     # What can only be lost.
-    assert _smallest(np.array([[-0.3], [-0.1]])) == [1]
+    assert _smallest(np.array([[-0.3], [-0.1]]), np.ones(2, bool)) == [1]
+    # A torque limit beyond the declared one changes nothing.
+    assert _smallest(np.array([[0.15], [0.5], [1.0]]), np.array([False, True, True])) == [1]
+    assert _smallest(np.array([[0.15], [0.5]]), np.zeros(2, bool)) == [0]

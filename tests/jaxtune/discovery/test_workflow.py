@@ -86,7 +86,16 @@ def test_a_weak_effect_beside_a_strong_one_at_the_same_joint_stays_in_the_model_
 
 @pytest.mark.parametrize(
     ("joints", "gain", "refines"),
-    [((1,), 49.0, "coulomb@slider"), ((1,), 51.0, None), ((0,), 49.0, None), ((0, 1), 49.0, None), ((), 49.0, None)],
+    [
+        ((1, 2), 49.0, "coulomb@slider"),
+        ((1, 2), 51.0, None),
+        # At one of two joints half as much is as much.
+        ((1,), 24.0, "coulomb@slider"),
+        ((1,), 26.0, None),
+        ((0,), 24.0, None),
+        ((0, 1), 24.0, None),
+        ((), 24.0, None),
+    ],
 )
 def test_an_effect_refines_a_stronger_one_only_where_it_acts_at_no_other_joint(joints, gain, refines):
     coulomb, push = (next(one for one in HYPOTHESES if one.name == name) for name in ("coulomb", "push"))
