@@ -32,6 +32,7 @@ ADVICE = {
 """What to do next, by verdict."""
 
 _SHOWN = 4  # suspects on the console
+_HARDLY = 0.2  # share of the gap
 _SUSPECT = 0.01  # least probability of one there
 _TEMPLATE = Path(__file__).with_suffix(".html")
 
@@ -120,6 +121,11 @@ def show(console: Console, question: Question, summary: dict, free: dict) -> Non
     if summary["next_experiment"]:
         experiment = brief_keys(question, summary["next_experiment"])
         console.print(f"to decide between them: {experiment}", highlight=False, markup=False)
+    if summary["verdict"] == "unnamed" and summary["explainable_share"] < _HARDLY:
+        console.print(
+            f"A learned torque at all joints explains {summary['explainable_share']:.0%} of what is left: the rest may "
+            "differ from run to run. Record a motion several times, as one condition, to see whether it does."
+        )
     if summary["withdrawn"]:
         console.print("the corrected model was withdrawn: on held-out runs it was worse than the one that is saved")
     if summary["not_testable"]:

@@ -70,6 +70,7 @@ def summarise(question: Question, log: Log, folder: Path, result: Result) -> dic
         "next_experiment": deciding_experiment(question, log, folder, result),
         "withdrawn": result.withdrawn,
         "explained_share": result.explained_share,
+        "explainable_share": result.explainable_share,
         "model_is": result.model_is,
     }
 

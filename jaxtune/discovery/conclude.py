@@ -51,6 +51,7 @@ class Conclusion:
     families: Mapping[tuple[str, tuple[str, ...]], float]
     rivals: tuple[tuple[str, np.ndarray], ...]
     explained_share: float
+    explainable_share: float
     models: Mapping[str, np.ndarray]
     """Vectors [axes] that may become the corrected model, by what they are; the chosen one is first."""
     changed: Mapping[int, float]
@@ -117,6 +118,7 @@ def conclude(settings: Settings, problem: Problem, floor: NoiseFloor, state: Sta
         families=dict(list(families(candidates, probabilities).items())[:_SUSPECTS]),
         rivals=_rivals(candidates, probabilities),
         explained_share=share,
+        explainable_share=explained(_energy(usual[0]), _energy(usual[2]), 0.0),
         models=models if verdict == "unnamed" else {"effects" if terms else "null": best.fit.vector} | models,
         changed=changed,
         dropped=tuple(key for key, _ in failed),

@@ -63,6 +63,7 @@ def prove(problem: Problem, floor: NoiseFloor, state: State, conclusion: Conclus
         families=conclusion.families,
         rivals=conclusion.rivals,
         explained_share=conclusion.explained_share,
+        explainable_share=conclusion.explainable_share,
         withdrawn=withdrawn,
         where=state.where,
         needs_torque=state.needs_torque,

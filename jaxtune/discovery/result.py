@@ -123,6 +123,9 @@ class Result:
     """Share that the reported effects explain on `train` and `select`, of what they and a learned torque explain
     together: of the gap or of the cost, whichever is smaller. The gap is that of all segments but a few or of typical
     ones, whichever speaks for the effects."""
+    explainable_share: float
+    """Share of the null's gaps on `train` and `select` that the effects and a learned torque explain together. The rest
+    is no torque of the joints' motion, or differs from run to run."""
     withdrawn: bool
     """True if `proposed` was worse on `sealed` than the better of the nominal model and the null; then `model` is that
     one."""

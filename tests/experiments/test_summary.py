@@ -70,6 +70,7 @@ def found(question, **changes):
         families={("joint_friction", ("elbow",)): 0.97},
         rivals=(),
         explained_share=0.93,
+        explainable_share=0.9,
         withdrawn=False,
         where=(where | {"bins": 9},),
         needs_torque={},

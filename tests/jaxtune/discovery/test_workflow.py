@@ -161,6 +161,7 @@ def test_what_only_a_learned_torque_explains_is_unnamed_and_the_torque_is_saved(
     assert result.model[AXES.index("cubic")] == pytest.approx(12.0, abs=1.0)
     assert result.gap["after"] < 1.3 < result.gap["null"]
     assert result.explained_share < 0.8
+    assert result.explainable_share > 0.8
 
 
 def test_a_model_that_sealed_runs_contradict_is_withdrawn_and_names_nothing():
