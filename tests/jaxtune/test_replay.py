@@ -99,7 +99,7 @@ def test_further_sets_are_fitted_where_none_fits_as_badly(dist):
     assert found.p_value == pytest.approx(1 / 51)
     few = estimate(EXACT, dist, strange)
     np.testing.assert_allclose(found.estimate, few.estimate, atol=1e-5)
-    # What errs as much lies in the middle of it, however many sets say so.
+    # More sets say nearly the same of errors.
     np.testing.assert_allclose(found.interval, few.interval, rtol=1.0)
     # Nothing to fit, nothing to compare with further sets.
     fallen = strange.replace(alive=strange.alive.at[:, 1:].set(False))
