@@ -63,12 +63,11 @@ def main(args: Args) -> None:
     identity |= {"logs": [str(path) for path in args.logs], "read_sha256": digest(log, spec)}
     checkpoint.open_run(args.out, identity)
     with checkpoint.lock(args.out / "summary.json"), bars() as progress:
-        task = progress.add_task("simulating null logs", total=100)
+        task, said = progress.add_task("simulating null logs", total=100), []
 
         def follow(line: str) -> None:
-            now = progress.tasks[task].completed
-            # A second effect repeats stages; the bar waits there.
-            progress.update(task, description=line[:100], completed=max(now, round(100 * (share_done(line) or 0.0))))
+            said.append(line)
+            progress.update(task, description=line[:100], completed=round(100 * share_done(said)))
 
         answer = investigate(
             args.logs,

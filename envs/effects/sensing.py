@@ -44,14 +44,20 @@ def _undo_delay(values, readings, dt):
 
 
 def _sensor_lag(values, readings, now, memory):
-    """seconds d readings' / dt = readings - readings'."""
-    return filtered(memory, readings, values["seconds"], now.dt)
+    """seconds d readings' / dt = readings - readings', with seconds of its own for positions and for velocities."""
+    return filtered(memory, readings, _time_constants(values), now.dt)
+
+
+def _time_constants(values):
+    """Of positions and velocities, [2, joints] s: at a skew of -1 positions alone are filtered, at 1 velocities."""
+    skew = values["skew"]
+    return values["seconds"] * (1.0 - jnp.maximum(jnp.stack([skew, -skew]), 0.0))
 
 
 def _behind(values, readings, dt):
     """Starts a lag one step before the readings of a joint that has always moved at one speed."""
     before = readings.at[0].add(-dt * readings[1])
-    return jnp.stack([before.at[0].add(-values["seconds"] * readings[1]), before])
+    return jnp.stack([before.at[0].add(-_time_constants(values)[0] * readings[1]), before])
 
 
 def _undo_lag(values, readings, dt):
@@ -60,7 +66,7 @@ def _undo_lag(values, readings, dt):
     at = np.arange(count)
     after, before = np.minimum(at + half, count - 1), np.maximum(at - half, 0)
     slope = (readings[after] - readings[before]) / ((after - before) * dt)[:, None, None]
-    return readings + values["seconds"] * slope
+    return readings + _time_constants(values) * slope
 
 
 def _imu_tilt(values, gravity, now, memory):
@@ -104,13 +110,14 @@ ROWS = (
         name="sensor_lag",
         on="joint",
         enters="sensor",
-        parameters=(_SECONDS,),
+        parameters=(_SECONDS, Parameter(name="skew", bounds=(-1.0, 1.0), prior=1.0)),
         sizes=(0.001, 0.008),
         act=_sensor_lag,
         start=_behind,
         undo=_undo_lag,
-        forms=(Form("delayed", "sensor_delay", "seconds"),),
-        sentence="Positions and velocities are read through a low-pass filter.",
+        forms=(Form("delayed", "sensor_delay", "seconds"), Form("skewed", "sensor_lag", "skew")),
+        sentence="Positions and velocities are read through a low-pass filter: positions alone at a skew of -1, "
+        "velocities alone at 1.",
         excited_by="a chirp to 10 Hz at two controller gains",
         **_SENSING,
     ),

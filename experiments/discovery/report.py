@@ -1,6 +1,6 @@
 """Reports a discovery to a person: an HTML page with its plots, and tables on the console. Verdict and advice first."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -30,6 +30,16 @@ ADVICE = {
     "best one on validation runs; it may have a learned torque, which names nothing.",
 }
 """What to do next, by verdict."""
+
+FAILED = {
+    "beyond_chance": "it gains no more than chance does",
+    "confirmed": "validation runs speak against it",
+    "matters": "it closes too little of the gap",
+    "inside_bounds": "its fit went to the end of its range",
+    "clear_of_zero": "its size may be zero",
+    "horizons": "it helps at one length of segments alone",
+}
+"""Why an effect was taken out of the model again, by the test of `jaxtune.discovery.decide.passes` that it failed."""
 
 _SHOWN = 4  # suspects on the console
 _HARDLY = 0.2  # share of the gap
@@ -69,7 +79,8 @@ def write(path: Path, log: Log, question: Question, result: Result, summary: dic
         ],
         proof=result.proof,
         terms=result.terms,
-        rejected=result.rejected,
+        failed=partial(_failed, summary),
+        reasons=_reasons,
         free=free,
         pictures={name: plots.embedded(figure) for name, figure in pictures.items()},
     )
@@ -111,8 +122,12 @@ def show(console: Console, question: Question, summary: dict, free: dict) -> Non
     console.print(table)
     if summary["effects"] or summary["not_named"]:
         console.print(f"explained: {summary['explained_share']:.0%} of what can be explained")
+    for one in summary["dropped"]:
+        name = f"{one['name']} ({one['form'].replace('_', ' ')})" if one["form"] else one["name"]
+        console.print(f"taken out again: {name} at {place_in_words(question, one)}, since {_reasons(one['failed'])}")
     suspects = [
         f"{one['name']} at {place_in_words(question, one)} {one['probability']:.2f}"
+        f"{' (taken out again)' if _failed(summary, one) else ''}"
         for one in summary["suspects"]
         if one["probability"] >= _SUSPECT
     ]
@@ -140,6 +155,16 @@ def _presented(summary: dict, question: Question) -> list[dict]:
         added = {"place": place, "experiment": f"{row.excited_by} on {place}", "sentence": row.sentence}
         found.append(effect | added)
     return found
+
+
+def _failed(summary: dict, suspect: Mapping) -> list[str]:
+    """The tests that a suspect failed when it was taken out of the model again; none where it was not."""
+    same = [one for one in summary["dropped"] if not one["form"] and one["name"] == suspect["name"]]
+    return next((one["failed"] for one in same if one["places"] == suspect["places"]), [])
+
+
+def _reasons(failed: Sequence[str]) -> str:
+    return ", and ".join(FAILED[test] for test in failed)
 
 
 def place_in_words(question: Question, effect: Mapping) -> str:

@@ -30,7 +30,8 @@ def summarise(question: Question, log: Log, folder: Path, result: Result) -> dic
 
     Returns:
       The verdict; effects and parameter changes with values, intervals and confusable names; what was accepted beside
-      them and is not named; what these logs cannot show; the cells with the largest gap; and the gap on sealed runs.
+      them and is not named; what was taken out again; what these logs cannot show; the cells with the largest gap;
+      and the gap on sealed runs.
     """
     effects, changes, not_named = [], [], []
     for term in (*result.terms, *_changed(question, result)):
@@ -47,6 +48,15 @@ def summarise(question: Question, log: Log, folder: Path, result: Result) -> dic
         "effects": effects,
         "parameter_changes": changes,
         "not_named": not_named,
+        "dropped": [
+            {
+                "name": one.hypothesis.name,
+                "places": list(one.hypothesis.places),
+                "form": one.hypothesis.form or None,
+                "failed": list(one.failed),
+            }
+            for one in result.dropped
+        ],
         "not_testable": [*result.not_testable, *not_there],
         "where": [
             {name: cell[name] for name in ("joint", "signal", "regime", "excess_floor_units")}
@@ -188,8 +198,9 @@ def details(question: Question, result: Result, free: dict) -> dict:
             }
             for term in result.terms
         ],
-        "rejected": result.rejected,
-        "dropped": result.dropped,
+        "dropped": [
+            {"hypothesis": one.hypothesis.key, "failed": one.failed, "evidence": one.evidence} for one in result.dropped
+        ],
         "models": result.details,
         "where": result.where,
         "needs_torque": result.needs_torque,

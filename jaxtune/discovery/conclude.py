@@ -28,11 +28,12 @@ from jaxtune.discovery.fit import Fit, begin, polish, refine, taken_over
 from jaxtune.discovery.noise_floor import Floor, NoiseFloor, Say
 from jaxtune.discovery.problem import Hypothesis, Problem, acts_within
 from jaxtune.discovery.resample import standard_errors
-from jaxtune.discovery.result import AcceptedTerm, Settings, Suspect
+from jaxtune.discovery.result import AcceptedTerm, DroppedTerm, Settings, Suspect
 from jaxtune.discovery.state import State
 
 _CLEAR = 2.0  # standard errors
 _SUSPECTS = 8
+_BELIEVED = 0.01  # probability from which on a model is worth an experiment
 _PERFECT = 1.0  # floor units
 _BOUND = 1e-6  # of the width of the bounds: how near to one a coordinate is at it
 
@@ -55,8 +56,7 @@ class Conclusion:
     models: Mapping[str, np.ndarray]
     """Vectors [axes] that may become the corrected model, by what they are; the chosen one is first."""
     changed: Mapping[int, float]
-    dropped: tuple[str, ...]
-    rejected: Mapping[str, Any]
+    dropped: tuple[DroppedTerm, ...]
     details: Mapping[str, Any]
 
 
@@ -72,7 +72,7 @@ def conclude(settings: Settings, problem: Problem, floor: NoiseFloor, state: Sta
     """
     at = floor[problem.main_horizon]
     say("evidence")
-    best, terms, ablated, failed = _proved(settings, problem, floor, state)
+    best, terms, ablated, dropped = _proved(settings, problem, floor, state)
     candidates = sorted(
         {one.key: one for one in (best, *state.candidates)}.values(), key=lambda one: total_cost(at, one, state.price)
     )
@@ -121,8 +121,7 @@ def conclude(settings: Settings, problem: Problem, floor: NoiseFloor, state: Sta
         explainable_share=explained(_energy(usual[0]), _energy(usual[2]), 0.0),
         models=models if verdict == "unnamed" else {"effects" if terms else "null": best.fit.vector} | models,
         changed=changed,
-        dropped=tuple(key for key, _ in failed),
-        rejected=failed[0][1] if failed else {},
+        dropped=dropped,
         details={
             one.key: {"cost": total_cost(at, one, state.price), "probability": float(probability)}
             for one, probability in zip(candidates, probabilities, strict=True)
@@ -190,10 +189,10 @@ def _moved(problem: Problem, fit: Fit, errors: np.ndarray, effect: Hypothesis) -
 
 
 def _rivals(candidates: Sequence[Candidate], probabilities: np.ndarray) -> tuple[tuple[str, np.ndarray], ...]:
-    """The two models that are most believed, of those with effects; best first."""
+    """The two models that are most believed, of those with effects and of those that are at all; best first."""
     found: dict[str, np.ndarray] = {}
     for index in np.argsort(-probabilities, kind="stable"):
-        if candidates[index].effects:
+        if candidates[index].effects and probabilities[index] >= _BELIEVED:
             found.setdefault(key_of(candidates[index].effects), candidates[index].fit.vector)
     return tuple(found.items())[:2]
 
@@ -267,9 +266,9 @@ def learn(settings: Settings, problem: Problem, at: Floor, best: Candidate) -> C
 
 def _proved(
     settings: Settings, problem: Problem, floor: NoiseFloor, state: State
-) -> tuple[Candidate, tuple[AcceptedTerm, ...], dict[str, np.ndarray], list[tuple[str, dict]]]:
+) -> tuple[Candidate, tuple[AcceptedTerm, ...], dict[str, np.ndarray], tuple[DroppedTerm, ...]]:
     """The cheapest model without the effects that do not pass, which are taken out one by one, the weakest first."""
-    at, failed = floor[problem.main_horizon], []
+    at, dropped = floor[problem.main_horizon], []
     (fit,) = polish([state.best.fit], at.residuals["train"], 0)
     best = renamed(problem, replace(state.best, fit=fit))
     of_effect = Thresholds(state.price)
@@ -278,16 +277,16 @@ def _proved(
     fitted = {one.key: one for one in state.candidates}
     while True:
         weighed = {h.key: (h, *weigh_evidence(problem, floor, best, h, fitted)) for h in best.hypotheses}
-        tests = {
-            key: passes(evidence, of_form if hypothesis.form else of_effect)
-            for key, (hypothesis, evidence, _) in weighed.items()
+        failed = {
+            key: tuple(n for n, passed in passes(evidence, of_form if h.form else of_effect).items() if not passed)
+            for key, (h, evidence, _) in weighed.items()
         }
-        wrong = [key for key, passed in tests.items() if not all(passed.values())]
+        wrong = [key for key, tests in failed.items() if tests]
         if not wrong:
             break
         weakest = min(wrong, key=lambda key: weighed[key][1].gain)
-        failed.append((weakest, {"hypothesis": weakest, "tests": tests[weakest], "evidence": weighed[weakest][1]}))
-        best = weighed[weakest][2]
+        hypothesis, evidence, best = weighed[weakest]
+        dropped.append(DroppedTerm(hypothesis, evidence, failed[weakest]))
         (fit,) = polish([best.fit], at.residuals["train"], 1)
         best = replace(best, fit=fit, select=at.residuals["select"](fit.vector[None])[0])
     if not best.hypotheses:
@@ -297,7 +296,7 @@ def _proved(
     # What explains most is named first.
     ranked = sorted((row for row in weighed.values() if not row[0].form), key=lambda row: -row[1].gain)
     terms = tuple(AcceptedTerm(h, evidence, of_effect, forms=best.forms_of(h)) for h, evidence, _ in ranked)
-    return best, terms, {h.key: ablated.fit.vector for h, _, ablated in ranked}, failed
+    return best, terms, {h.key: ablated.fit.vector for h, _, ablated in ranked}, tuple(dropped)
 
 
 def _by_select(at: Floor, state: State, best: Candidate, learned: Candidate) -> dict[str, np.ndarray]:

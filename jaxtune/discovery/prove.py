@@ -71,7 +71,6 @@ def prove(problem: Problem, floor: NoiseFloor, state: State, conclusion: Conclus
         not_testable=tuple(n for n in state.not_testable if n not in {t.hypothesis.name for t in conclusion.terms}),
         not_finite=state.not_finite,
         dropped=conclusion.dropped,
-        rejected=conclusion.rejected,
         changed=conclusion.changed,
         gap=gap,
         proof=proof,

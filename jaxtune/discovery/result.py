@@ -82,6 +82,18 @@ class AcceptedTerm:
 
 
 @dataclass(frozen=True)
+class DroppedTerm:
+    """An effect of the cheapest model that did not pass, and so is not in the model that is reported."""
+
+    hypothesis: Any
+    """A `problem.Hypothesis`."""
+    evidence: Any
+    """A `decide.Evidence`."""
+    failed: tuple[str, ...]
+    """The tests of `decide.passes` that it failed."""
+
+
+@dataclass(frozen=True)
 class Suspect:
     """An effect that may be part of the truth."""
 
@@ -117,8 +129,8 @@ class Result:
     families: Mapping[tuple[str, tuple[str, ...]], float]
     """The probability that an effect of a family is at some places, by family and places, most likely first."""
     rivals: tuple[tuple[str, np.ndarray], ...]
-    """Keys and vectors [axes] of the two models that are most believed, of those with effects; their effects differ in
-    more than form."""
+    """Keys and vectors [axes] of the two models that are most believed, of those with effects and a probability of at
+    least 0.01; their effects differ in more than form. One or none where no other is believed."""
     explained_share: float
     """Share that the reported effects explain on `train` and `select`, of what they and a learned torque explain
     together: of the gap or of the cost, whichever is smaller. The gap is that of all segments but a few or of typical
@@ -137,10 +149,8 @@ class Result:
     """Names of effects that these logs could not show. They are not absent: other motions could show them."""
     not_finite: tuple[str, ...]
     """Keys of models that broke the simulation."""
-    dropped: tuple[str, ...]
-    """Keys of effects of the cheapest model that did not pass, and so are not reported."""
-    rejected: Mapping[str, Any]
-    """The first of these, with its tests and evidence."""
+    dropped: tuple[DroppedTerm, ...]
+    """Effects of the cheapest model that did not pass, in the order in which they were taken out."""
     changed: Mapping[int, float]
     """Nominal axes that went as far as they may, with the distance in prior standard deviations."""
     gap: Mapping[str, float]

@@ -6,7 +6,7 @@ The null is the nominal model with its nominal parameters and other unknowns fit
 `step` draws what a step does. The sealed segments are simulated by `prove` alone, once.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -33,19 +33,31 @@ _STAGES = {
     "learned torque": 0.93,
     "proof": 0.96,
 }
+_REPEATED = ("screen", "answers of", "fit")
 
 
-def share_done(line: str) -> float | None:
-    """Estimates how much of a discovery is over, from what it says; a foretold time that is left needs it.
+def share_done(said: Sequence[str]) -> float:
+    """Estimates how much of a discovery is over, from what it said; a foretold time that is left needs it.
 
     Args:
-      line: what `Say` received.
+      said: all lines that `Say` received so far.
 
     Returns:
-      Share of the whole time, from 0 to 1, where one effect is missing and named; None for a line that begins no stage.
-      Every further effect repeats the stages from `screen` to `fit`.
+      Share of the whole time, from 0 to 1; it never falls. Every further effect repeats the stages from `screen` to
+      `fit`. How often is not known before, so each time takes half of the share that is left for them.
     """
-    return next((share for stage, share in _STAGES.items() if line.startswith(stage)), None)
+    stages = [stage for stage in (_stage(line) for line in said) if stage]
+    if not stages:
+        return 0.0
+    steps = stages[:-1].count("fit")
+    if stages[-1] not in _REPEATED or not steps:
+        return _STAGES[stages[-1]]
+    return _STAGES["evidence"] - (_STAGES["evidence"] - _STAGES["fit"]) * 0.5**steps
+
+
+def _stage(line: str) -> str | None:
+    """The stage that a line begins; None for any other line."""
+    return next((stage for stage in _STAGES if line.startswith(stage)), None)
 
 
 def discover(

@@ -15,9 +15,9 @@ from experiments.discovery.blind_robots import Truth, record
 from experiments.discovery.excitation import excitation
 from experiments.discovery.setup import build_question
 from experiments.discovery.summary import details, free_runs, summarise
-from jaxtune.discovery.decide import Evidence, Thresholds
+from jaxtune.discovery.decide import Evidence, Thresholds, passes
 from jaxtune.discovery.fit import Fit, Free
-from jaxtune.discovery.result import AcceptedTerm, Result, Suspect
+from jaxtune.discovery.result import AcceptedTerm, DroppedTerm, Result, Suspect
 
 JOINTS = ("shoulder", "elbow")
 GAINS = {"kp": np.array([40.0, 20.0]), "kd": np.array([2.0, 0.8]), "torque_limit_nm": np.array([15.0, 15.0])}
@@ -66,7 +66,7 @@ def found(question, **changes):
         proposed=fit.vector,
         model=fit.vector,
         model_is="effects",
-        suspects=(Suspect(coulomb, (), 0.9),),
+        suspects=(Suspect(coulomb, (), 0.9), Suspect(every["viscous@shoulder"], (), 0.7)),
         families={("joint_friction", ("elbow",)): 0.97},
         rivals=(),
         explained_share=0.93,
@@ -76,8 +76,7 @@ def found(question, **changes):
         needs_torque={},
         not_testable=("drag",),
         not_finite=(),
-        dropped=(),
-        rejected={},
+        dropped=(DroppedTerm(every["viscous@shoulder"], EVIDENCE, ("confirmed", "clear_of_zero")),),
         changed={gain: 3.0},
         gap={"before": 3.0, "null": 2.0, "after": 1.0},
         proof={"cells": cells, "no_cell_worse": True, "others": {"without coulomb@elbow": 2.5}},
@@ -155,3 +154,11 @@ def test_page_and_console_say_what_was_found(tmp_path, asked, withdrawn):
     assert ("was withdrawn" in said) is withdrawn
     assert "constant_push at elbow, which may only make up for the form of coulomb@elbow" in said
     assert "93% of what can be explained" in said
+    why = "validation runs speak against it, and its size may be zero"
+    assert f"taken out again: viscous at shoulder, since {why}" in said
+    assert "coulomb at elbow 0.90; viscous at shoulder 0.70 (taken out again)" in said
+    assert page.count(why) == 2
+
+
+def test_every_test_that_an_effect_may_fail_has_words():
+    assert set(report.FAILED) == set(passes(EVIDENCE, Thresholds(10.0)))

@@ -526,12 +526,25 @@ def test_a_lagging_sensor_is_behind_a_ramp_by_its_time_constant():
     np.testing.assert_allclose(got[:, 1], 2.0, rtol=1e-6)
 
 
+def test_a_filter_of_positions_alone_or_of_velocities_alone():
+    truth, both = motion(), series("sensor_lag", motion(), seconds=0.01)
+    for skew, filtered, direct in ((-1.0, 0, 1), (1.0, 1, 0)):
+        got = series("sensor_lag", truth, seconds=0.01, skew=skew)
+        np.testing.assert_array_equal(got[:, filtered], both[:, filtered])
+        np.testing.assert_allclose(got[:, direct], truth[:, direct], rtol=1e-6)
+        assert np.abs(got[100:, filtered] - truth[100:, filtered]).max() > 0.01
+    # Between them velocities have a part of the positions' time constant.
+    got = series("sensor_lag", truth, seconds=0.01, skew=-0.4)
+    np.testing.assert_allclose(got[:, 1], series("sensor_lag", truth, seconds=0.006)[:, 1], rtol=1e-5)
+
+
 @pytest.mark.parametrize(
     ("name", "physical"),
     [
         ("encoder_bias", {"rad": [0.03, -0.05]}),
         ("sensor_delay", {"seconds": [0.0124, 0.031]}),
         ("sensor_lag", {"seconds": [0.008, 0.02]}),
+        ("sensor_lag", {"seconds": [0.008, 0.02], "skew": [-0.6, -1.0]}),
     ],
 )
 def test_what_a_sensor_did_is_undone(name, physical):

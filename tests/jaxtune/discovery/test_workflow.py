@@ -57,13 +57,19 @@ def test_a_parameter_far_from_its_prior_is_a_change_and_not_an_effect():
 def test_every_stage_says_how_much_of_the_whole_is_over():
     lines = []
     discover({"coulomb": 0.5}, say=lines.append)
-    shares = [(line.split()[0], share) for line in lines if (share := workflow.share_done(line)) is not None]
-    assert {name for name, _ in shares} == {stage.split()[0] for stage in workflow._STAGES}
-    # Until the first effect has joined, and from the conclusion on, the bar goes up alone.
-    first = [share for _, share in shares[: [name for name, _ in shares].index("fit") + 1]]
-    last = [share for _, share in shares[-3:]]
-    assert [*first, *last] == sorted([*first, *last])
-    assert workflow.share_done("4602.3 before") is None
+    assert {stage for line in lines if (stage := workflow._stage(line))} == set(workflow._STAGES)
+    shares = [workflow.share_done(lines[: count + 1]) for count in range(len(lines))]
+    assert shares == sorted(shares)
+    assert shares[0] == workflow._STAGES["noise floor"]
+    assert shares[-1] == workflow._STAGES["proof"]
+
+
+def test_the_bar_moves_in_every_further_step():
+    step = ["screen 64/128", "answers of the nominal parameters", "fit 11", "4602.3 before"]
+    shares = [workflow.share_done(["null", *(step * steps)]) for steps in (1, 2, 3, 4)]
+    assert shares == sorted(set(shares))
+    assert shares[-1] < workflow._STAGES["evidence"]
+    assert workflow.share_done(["4602.3 before"]) == 0.0
 
 
 def test_two_effects_are_named_one_after_the_other():
