@@ -167,28 +167,7 @@ def estimate(
 
     pieces, truth = cut(simulated), dists.normalise(dist, truth)
     others, true_others = cut(others), dists.normalise(dist, true_others)
-    parts = _parts(len(truth), len(true_others))
-
-    def fit_more(carry):
-        number, best, normal, left = carry
-        rows = parts[number]
-        mine = jax.tree.map(lambda leaf: leaf[rows], pieces)
-        fits = _fit(config, replay, mine, others, true_others, dist)
-        logs = jnp.where(mine.valid, jnp.log1p(fits.energy), 0.0).sum(axis=-1) / jnp.maximum(mine.valid.sum(axis=-1), 1)
-        # A set without a piece says nothing, and counts as one that is fitted badly.
-        logs = jnp.where(mine.valid.any(axis=-1), logs, jnp.inf)
-        found = zip((best, normal, left), (fits.best, fits.normal, logs), strict=True)
-        return number + 1, *(every.at[rows].set(some) for every, some in found)
-
-    def goes_on(carry):
-        number, _, _, left = carry
-        worst = jnp.isfinite(left[-1]) & ~(left[:-1] >= left[-1]).any()
-        return (number == 0) | ((number < len(parts)) & worst)
-
-    count, coords = len(pieces.valid), truth.shape[1]
-    start = jnp.zeros((count, coords)), jnp.broadcast_to(jnp.eye(coords), (count, coords, coords))
-    start = jnp.asarray(0), *start, jnp.full(count, jnp.nan)
-    _, best, normal, left = jax.lax.while_loop(goes_on, fit_more, start)
+    best, normal, left = _fit_until_exceeded(config, replay, pieces, others, true_others, dist)
     known = jnp.isfinite(left)
     joined, pooled, p_past = pool(best, truth, known[:-1])
     best = jnp.clip(joined, *(dists.normalise(dist, end) for end in (dist.lower, dist.upper)))
@@ -207,6 +186,41 @@ def estimate(
         p_past=p_past,
         sets=known[:-1].sum(),
     )
+
+
+def _fit_until_exceeded(
+    config: ReplayConfig, replay: Replay, pieces: _Pieces, others: _Pieces, truth: jax.Array, dist: ParamDist
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Fits part after part of the simulated sets, until one misfits as badly as the measured one, or all are fitted.
+
+    The arguments are those of `_fit`.
+
+    Returns:
+      Of the simulated sets and, last, the measured one: coordinates [sets + 1, coords] in radii, normal matrices of
+      Gauss-Newton [sets + 1, coords, coords], and misfits [sets + 1], nan where a set was not fitted.
+    """
+    count, coords = len(pieces.valid), truth.shape[1]
+    parts = _parts(count - 1, len(truth))
+
+    def fit_part(carry):
+        number, *found = carry
+        rows = parts[number]
+        mine = jax.tree.map(lambda leaf: leaf[rows], pieces)
+        fits = _fit(config, replay, mine, others, truth, dist)
+        logs = jnp.where(mine.valid, jnp.log1p(fits.energy), 0.0).sum(axis=-1) / jnp.maximum(mine.valid.sum(axis=-1), 1)
+        # A set without a piece says nothing, and counts as one that is fitted badly.
+        logs = jnp.where(mine.valid.any(axis=-1), logs, jnp.inf)
+        some = fits.best, fits.normal, logs
+        return number + 1, *(every.at[rows].set(one) for every, one in zip(found, some, strict=True))
+
+    def goes_on(carry):
+        number, _, _, left = carry
+        worst = jnp.isfinite(left[-1]) & ~(left[:-1] >= left[-1]).any()
+        return (number == 0) | ((number < len(parts)) & worst)
+
+    unknown = jnp.broadcast_to(jnp.eye(coords), (count, coords, coords)), jnp.full(count, jnp.nan)
+    start = jnp.zeros((), int), jnp.zeros((count, coords)), *unknown
+    return jax.lax.while_loop(goes_on, fit_part, start)[1:]
 
 
 def _parts(sets: int, first: int) -> jax.Array:

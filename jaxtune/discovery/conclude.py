@@ -8,11 +8,9 @@ import numpy as np
 
 from jaxtune.discovery.decide import (
     Candidate,
-    Measure,
     Thresholds,
     believed,
     families,
-    finite,
     key_of,
     measures,
     passes,
@@ -24,17 +22,17 @@ from jaxtune.discovery.decide import (
     weigh_evidence,
 )
 from jaxtune.discovery.evaluate import rms
-from jaxtune.discovery.fit import Fit, begin, polish, refine, taken_over
+from jaxtune.discovery.fit import Fit, begin, polish, refine
+from jaxtune.discovery.naming import moved_forms, renamed, with_refinements
 from jaxtune.discovery.noise_floor import Floor, NoiseFloor, Say
-from jaxtune.discovery.problem import Hypothesis, Problem, acts_within
+from jaxtune.discovery.problem import Problem
 from jaxtune.discovery.resample import standard_errors
 from jaxtune.discovery.result import AcceptedTerm, DroppedTerm, Settings, Suspect
+from jaxtune.discovery.shares import energy, explained, explained_shares, open_gaps, speak
 from jaxtune.discovery.state import State
 
-_CLEAR = 2.0  # standard errors
 _SUSPECTS = 8
 _BELIEVED = 0.01  # probability from which on a model is worth an experiment
-_PERFECT = 1.0  # floor units
 _BOUND = 1e-6  # of the width of the bounds: how near to one a coordinate is at it
 
 
@@ -86,9 +84,9 @@ def conclude(settings: Settings, problem: Problem, floor: NoiseFloor, state: Sta
     models = _by_select(at, state, best, learned)
     compared = (state.null, best, learned)
     costs = [total_cost(at, one, 0.0) for one in compared]
-    usual, typical = ([_open_gaps(problem, at, one, measure) for one in compared] for measure in measures(at))
+    usual, typical = ([open_gaps(problem, at, one, measure) for one in compared] for measure in measures(at))
     speaking = speak(usual, typical, settings.at_floor)
-    share, whole = max(_explained_shares([_energy(one) for one in gaps], costs) for gaps in speaking)
+    share, whole = max(explained_shares([energy(one) for one in gaps], costs) for gaps in speaking)
     explains = usual[1].max() <= settings.at_floor or (
         bool(terms) and share >= settings.share and whole >= settings.least
     )
@@ -103,7 +101,7 @@ def conclude(settings: Settings, problem: Problem, floor: NoiseFloor, state: Sta
     unit = units_of(problem, at, squares(at, best))[: len(problem.data["train"][at.horizon].run)]
     errors = standard_errors(best.fit, unit)
     terms = tuple(
-        replace(term, forms=(*term.forms, *_moved(problem, best.fit, errors, term.hypothesis))) for term in terms
+        replace(term, forms=(*term.forms, *moved_forms(problem, best.fit, errors, term.hypothesis))) for term in terms
     )
     for term in terms:
         inexact = settings.inexact * best.fit.coordinates * best.fit.along(term.hypothesis)
@@ -118,7 +116,7 @@ def conclude(settings: Settings, problem: Problem, floor: NoiseFloor, state: Sta
         families=dict(list(families(candidates, probabilities).items())[:_SUSPECTS]),
         rivals=_rivals(candidates, probabilities),
         explained_share=share,
-        explainable_share=explained(_energy(usual[0]), _energy(usual[2]), 0.0),
+        explainable_share=explained(energy(usual[0]), energy(usual[2]), 0.0),
         models=models if verdict == "unnamed" else {"effects" if terms else "null": best.fit.vector} | models,
         changed=changed,
         dropped=dropped,
@@ -129,65 +127,6 @@ def conclude(settings: Settings, problem: Problem, floor: NoiseFloor, state: Sta
     )
 
 
-def renamed(problem: Problem, candidate: Candidate) -> Candidate:
-    """Lets the larger part give the name where two effects may each be a form of the other, such as delay and filter.
-
-    Args:
-      problem: the hypotheses and their forms.
-      candidate: a model.
-
-    Returns:
-      The same model, with another name for some of its parts.
-    """
-    other_names: dict[str, Hypothesis] = {}
-    for effect in candidate.effects:
-        for form in candidate.forms_of(effect):
-            twins = [h for h in problem.hypotheses if np.array_equal(h.directions, form.directions)]
-            shapes = [
-                other
-                for other in problem.forms
-                if np.array_equal(other.directions, effect.directions) and any(other.shapes(twin) for twin in twins)
-            ]
-            sizes = [np.abs(candidate.fit.coordinates[candidate.fit.along(one)]).max() for one in (effect, form)]
-            if shapes and sizes[1] > sizes[0]:
-                other_names |= {effect.key: twins[0], form.key: shapes[0]}
-    return replace(candidate, hypotheses=tuple(other_names.get(one.key, one) for one in candidate.hypotheses))
-
-
-def with_refinements(terms: Sequence[AcceptedTerm], own: float) -> list[AcceptedTerm]:
-    """Marks effects that may only refine a stronger one at the same joints, because no form of the library is exact.
-
-    What is left of a large effect in another form than the robot's can be several floor units, and other effects of
-    the same joint fit that well. So a weaker effect there stays in the model, but says nothing about the robot. Of one
-    at several joints, such as a delay, counts what it gains at as many of them.
-
-    Args:
-      terms: the strongest first.
-      own: `Settings.own`.
-    """
-    marked: list[AcceptedTerm] = []
-    for term in terms:
-        over = [
-            one.hypothesis.key
-            for one in marked
-            if one.refines is None
-            and acts_within(term.hypothesis, one.hypothesis)
-            and term.evidence.gain < own * one.evidence.gain * _share_of_joints(term.hypothesis, one.hypothesis)
-        ]
-        marked.append(replace(term, refines=over[0] if over else None))
-    return marked
-
-
-def _share_of_joints(few: Hypothesis, many: Hypothesis) -> float:
-    return len(set(few.joints)) / len(set(many.joints))
-
-
-def _moved(problem: Problem, fit: Fit, errors: np.ndarray, effect: Hypothesis) -> list[Hypothesis]:
-    """Forms of an effect that are free under every hypothesis, and clear of zero in the fit."""
-    clear = np.abs(fit.coordinates) > _CLEAR * errors
-    return [form for form in problem.forms if form.shapes(effect) and (taken_over(fit.free, form) & clear).any()]
-
-
 def _rivals(candidates: Sequence[Candidate], probabilities: np.ndarray) -> tuple[tuple[str, np.ndarray], ...]:
     """The two models that are most believed, of those with effects and of those that are at all; best first."""
     found: dict[str, np.ndarray] = {}
@@ -195,53 +134,6 @@ def _rivals(candidates: Sequence[Candidate], probabilities: np.ndarray) -> tuple
         if candidates[index].effects and probabilities[index] >= _BELIEVED:
             found.setdefault(key_of(candidates[index].effects), candidates[index].fit.vector)
     return tuple(found.items())[:2]
-
-
-def explained(null: float, after: float, bound: float) -> float:
-    """The share of a misfit that is explained: (null - after) / (null - bound), from 0 to 1; 1 where there is none.
-
-    Args:
-      null: misfit of the model without effects.
-      after: of the model with them.
-      bound: the least that can be reached.
-    """
-    room = null - bound
-    return float(np.clip((null - after) / room, 0.0, 1.0)) if room > 1e-6 else 1.0
-
-
-def speak(usual: Sequence[np.ndarray], typical: Sequence[np.ndarray], at_floor: float) -> list[Sequence[np.ndarray]]:
-    """Chooses the gaps that may speak for a model's effects.
-
-    A few segments may be far off with the right effect, as those that begin while gears are out of touch. So typical
-    ones may speak for it, where they show the gap and the effects do not pay for them with the others.
-
-    Args:
-      usual: gaps [positions] of nearly all segments in floor units: of the null, of the model, and with a learned
-        torque.
-      typical: of typical segments, likewise.
-      at_floor: `Settings.at_floor`.
-    """
-    shown, paid = typical[0].max() > at_floor, _energy(usual[1]) > _energy(usual[0])
-    return [usual, typical] if shown and not paid else [usual]
-
-
-def _explained_shares(energies: Sequence[float], costs: Sequence[float]) -> tuple[float, float]:
-    """The share that effects explain of what they and a learned torque explain together, and of all gaps.
-
-    Of gaps and costs the smaller share counts. In gaps a wrong effect can seem to explain much of an error that it only
-    makes smaller; in the cost, a little of a large one.
-
-    Args:
-      energies: of the gaps of the null, of the model with effects, and with a learned torque too.
-      costs: of the same models.
-    """
-    both = [explained(null, after, min(after, bound)) for null, after, bound in (energies, costs)]
-    return min(both), explained(energies[0], energies[1], 0.0)
-
-
-def _energy(gaps: np.ndarray) -> float:
-    """The energy above the floor of gaps [positions] in floor units: the sum of max(gap^2 - 1, 0)."""
-    return float(np.maximum(gaps**2 - _PERFECT, 0.0).sum())
 
 
 def learn(settings: Settings, problem: Problem, at: Floor, best: Candidate) -> Candidate:
@@ -312,12 +204,6 @@ def _gap_on_select(at: Floor, residual: np.ndarray) -> float:
     """Rms of the worst component on `select`; infinite where the model breaks."""
     found = float(rms(at, residual).max())
     return found if np.isfinite(found) else np.inf
-
-
-def _open_gaps(problem: Problem, at: Floor, candidate: Candidate, measure: Measure) -> np.ndarray:
-    """Gaps of all positions on `train` and `select` in floor units, [positions], by one of `decide.measures`."""
-    found = np.sqrt(measure(finite(squares(at, candidate)) / at.counts.bins))
-    return found[[signal == "q" for signal, _ in problem.cells]]
 
 
 def _at_bounds(problem: Problem, fit: Fit, price: float) -> dict[int, float]:

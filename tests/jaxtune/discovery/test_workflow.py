@@ -8,12 +8,13 @@ import pytest
 from slider import AXES, DIRECTION, HYPOTHESES, LEARNED, WARPED, WILD, problem
 
 from jaxtune.discovery import noise_floor, state, step, workflow
-from jaxtune.discovery.conclude import explained, renamed, speak, with_refinements
 from jaxtune.discovery.decide import Candidate, Evidence
 from jaxtune.discovery.fit import begin
+from jaxtune.discovery.naming import renamed, with_refinements
 from jaxtune.discovery.prove import is_worse
 from jaxtune.discovery.result import AcceptedTerm, Settings
 from jaxtune.discovery.screen import Lead
+from jaxtune.discovery.shares import explained, speak
 
 
 def discover(truth, seed=0, say=lambda line: None, **kwargs):

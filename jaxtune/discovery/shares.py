@@ -1,0 +1,64 @@
+"""How much of what the nominal model leaves is explained: gaps above the floor, and which of them may speak."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from jaxtune.discovery.decide import Candidate, Measure, finite, squares
+from jaxtune.discovery.noise_floor import Floor
+from jaxtune.discovery.problem import Problem
+
+_PERFECT = 1.0  # floor units
+
+
+def speak(usual: Sequence[np.ndarray], typical: Sequence[np.ndarray], at_floor: float) -> list[Sequence[np.ndarray]]:
+    """Chooses the gaps that may speak for a model's effects.
+
+    A few segments may be far off with the right effect, as those that begin while gears are out of touch. So typical
+    ones may speak for it, where they show the gap and the effects do not pay for them with the others.
+
+    Args:
+      usual: gaps [positions] of nearly all segments in floor units: of the null, of the model, and with a learned
+        torque.
+      typical: of typical segments, likewise.
+      at_floor: `Settings.at_floor`.
+    """
+    shown, paid = typical[0].max() > at_floor, energy(usual[1]) > energy(usual[0])
+    return [usual, typical] if shown and not paid else [usual]
+
+
+def explained(null: float, after: float, bound: float) -> float:
+    """The share of a misfit that is explained: (null - after) / (null - bound), from 0 to 1; 1 where there is none.
+
+    Args:
+      null: misfit of the model without effects.
+      after: of the model with them.
+      bound: the least that can be reached.
+    """
+    room = null - bound
+    return float(np.clip((null - after) / room, 0.0, 1.0)) if room > 1e-6 else 1.0
+
+
+def explained_shares(energies: Sequence[float], costs: Sequence[float]) -> tuple[float, float]:
+    """The share that effects explain of what they and a learned torque explain together, and of all gaps.
+
+    Of gaps and costs the smaller share counts. In gaps a wrong effect can seem to explain much of an error that it only
+    makes smaller; in the cost, a little of a large one.
+
+    Args:
+      energies: of the gaps of the null, of the model with effects, and with a learned torque too.
+      costs: of the same models.
+    """
+    both = [explained(null, after, min(after, bound)) for null, after, bound in (energies, costs)]
+    return min(both), explained(energies[0], energies[1], 0.0)
+
+
+def energy(gaps: np.ndarray) -> float:
+    """The energy above the floor of gaps [positions] in floor units: the sum of max(gap^2 - 1, 0)."""
+    return float(np.maximum(gaps**2 - _PERFECT, 0.0).sum())
+
+
+def open_gaps(problem: Problem, at: Floor, candidate: Candidate, measure: Measure) -> np.ndarray:
+    """Gaps of all positions on `train` and `select` in floor units, [positions], by one of `decide.measures`."""
+    found = np.sqrt(measure(finite(squares(at, candidate)) / at.counts.bins))
+    return found[[signal == "q" for signal, _ in problem.cells]]
