@@ -44,29 +44,49 @@ def _undo_delay(values, readings, dt):
 
 
 def _sensor_lag(values, readings, now, memory):
-    """seconds d readings' / dt = readings - readings', with seconds of its own for positions and for velocities."""
+    """seconds d readings' / dt = readings - readings'; velocities may have a shorter time constant than positions."""
     return filtered(memory, readings, _time_constants(values), now.dt)
 
 
 def _time_constants(values):
-    """Of positions and velocities, [2, joints] s: at a skew of -1 positions alone are filtered, at 1 velocities."""
-    skew = values["skew"]
-    return values["seconds"] * (1.0 - jnp.maximum(jnp.stack([skew, -skew]), 0.0))
+    """Of positions and velocities, [2, joints] s."""
+    return values["seconds"] * jnp.stack([jnp.ones_like(values["seconds"]), 1.0 - values["velocity_faster"]])
 
 
 def _behind(values, readings, dt):
     """Starts a lag one step before the readings of a joint that has always moved at one speed."""
     before = readings.at[0].add(-dt * readings[1])
-    return jnp.stack([before.at[0].add(-_time_constants(values)[0] * readings[1]), before])
+    return jnp.stack([before.at[0].add(-values["seconds"] * readings[1]), before])
 
 
 def _undo_lag(values, readings, dt):
-    """readings = readings' + seconds d readings' / dt; slopes span 20 ms, as a step's are mostly noise."""
+    """readings = readings' + seconds d readings' / dt."""
+    return readings + _time_constants(values) * _slopes(readings, dt)
+
+
+def _velocity_lag(values, readings, now, memory):
+    """seconds dv' / dt = v - v'; positions are as they were."""
+    velocity, memory = filtered(memory, readings[1], values["seconds"], now.dt)
+    return readings.at[1].set(velocity), memory
+
+
+def _steady(values, readings, dt):
+    """Starts the lag of a velocity that has always been the same."""
+    del values, dt
+    return jnp.stack([readings[1], readings[1]])
+
+
+def _undo_velocity_lag(values, readings, dt):
+    """v = v' + seconds dv' / dt."""
+    return readings.at[:, 1].add(values["seconds"] * _slopes(readings, dt)[:, 1])
+
+
+def _slopes(readings, dt):
+    """Time derivatives of readings [time, 2, joints]; they span 20 ms, as a step's are mostly noise."""
     count, half = len(readings), round(_HALF_SLOPE_S / dt)
     at = np.arange(count)
     after, before = np.minimum(at + half, count - 1), np.maximum(at - half, 0)
-    slope = (readings[after] - readings[before]) / ((after - before) * dt)[:, None, None]
-    return readings + _time_constants(values) * slope
+    return (readings[after] - readings[before]) / ((after - before) * dt)[:, None, None]
 
 
 def _imu_tilt(values, gravity, now, memory):
@@ -110,14 +130,26 @@ ROWS = (
         name="sensor_lag",
         on="joint",
         enters="sensor",
-        parameters=(_SECONDS, Parameter(name="skew", bounds=(-1.0, 1.0), prior=1.0)),
+        parameters=(_SECONDS, Parameter(name="velocity_faster", bounds=(0.0, 1.0), prior=1.0)),
         sizes=(0.001, 0.008),
         act=_sensor_lag,
         start=_behind,
         undo=_undo_lag,
-        forms=(Form("delayed", "sensor_delay", "seconds"), Form("skewed", "sensor_lag", "skew")),
-        sentence="Positions and velocities are read through a low-pass filter: positions alone at a skew of -1, "
-        "velocities alone at 1.",
+        forms=(Form("delayed", "sensor_delay", "seconds"), Form("fast_velocity", "sensor_lag", "velocity_faster")),
+        sentence="Positions and velocities are read through a low-pass filter, which may be faster for velocities.",
+        excited_by="a chirp to 10 Hz at two controller gains",
+        **_SENSING,
+    ),
+    Effect(
+        name="velocity_lag",
+        on="joint",
+        enters="sensor",
+        parameters=(_SECONDS,),
+        sizes=(0.001, 0.008),
+        act=_velocity_lag,
+        start=_steady,
+        undo=_undo_velocity_lag,
+        sentence="Velocities are read through a low-pass filter, and positions are not.",
         excited_by="a chirp to 10 Hz at two controller gains",
         **_SENSING,
     ),

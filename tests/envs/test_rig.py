@@ -222,7 +222,8 @@ SWING = np.array([0.4, -0.5]) + np.array([0.3, 0.4]) * np.sin(2 * np.pi * np.arr
     ("name", "value", "most"),
     [
         ("sensor_lag", {"seconds": 0.008}, 0.5e-3),
-        ("sensor_lag", {"seconds": 0.008, "skew": -1.0}, 0.5e-3),
+        ("sensor_lag", {"seconds": 0.008, "velocity_faster": 1.0}, 0.5e-3),
+        ("velocity_lag", {"seconds": 0.02}, 0.5e-3),
         ("sensor_delay", {"seconds": 0.008}, 0.5e-3),
         ("command_delay", {"seconds": 0.008}, 0.3e-3),
         ("torque_lag", {"seconds": 0.008}, 0.3e-3),

@@ -258,6 +258,17 @@ def _sensor_lag(setting: Setting):
     return act
 
 
+@FORMS.add("sensor", scalar=False)
+def _velocity_lag(setting: Setting):
+    """The way of the last steps over their time, late by half of it: what a servo makes of an encoder alone."""
+    line, span = Line(0.09, setting.dt), np.maximum(np.rint(2 * setting.size / setting.dt), 1.0) * setting.dt
+
+    def act(read: np.ndarray, now: Now) -> np.ndarray:
+        return np.stack([read[0], (read[0] - line(read[0], span)) / span])
+
+    return act
+
+
 @FORMS.add("links")
 def _drag(setting: Setting, links: Kinematics, at: list[int]):
     """force = -c (speed + 0.02 m/s tanh(speed / 0.02 m/s)): a little dry friction of the cable beside its drag."""

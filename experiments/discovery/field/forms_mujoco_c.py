@@ -248,6 +248,17 @@ def _sensor_lag(setting: Setting):
     return act
 
 
+@FORMS.add("sensor", scalar=False)
+def _velocity_lag(setting: Setting):
+    """The same of the velocity alone."""
+    filtered = _sensor_lag(setting)
+
+    def act(read: np.ndarray, now: Now) -> np.ndarray:
+        return np.stack([read[0], filtered(read, now)[1]])
+
+    return act
+
+
 @FORMS.add("links", scalar=False)
 def _drag(setting: Setting, links: Kinematics, at: list[int]):
     """force = -c speed (0.5 + 0.5 |speed| / (0.5 m/s)) at the centre of mass."""

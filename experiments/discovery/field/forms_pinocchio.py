@@ -252,6 +252,17 @@ def _sensor_lag(setting: Setting):
     return act
 
 
+@FORMS.add("sensor", scalar=False)
+def _velocity_lag(setting: Setting):
+    """The same of the velocity alone."""
+    averaged = _sensor_lag(setting)
+
+    def act(read: np.ndarray, now: Now) -> np.ndarray:
+        return np.stack([read[0], averaged(read, now)[1]])
+
+    return act
+
+
 @FORMS.add("links", scalar=False)
 def _drag(setting: Setting, links: Kinematics, at: list[int]):
     """At a point beyond the centre of mass."""

@@ -12,7 +12,7 @@ FAMILIES = {
     ),
     "transmission": ("backlash", "compliance", "armature"),
     "inertia": ("link_mass", "com_offset", "payload"),
-    "sensing": ("encoder_bias", "sensor_delay", "sensor_lag"),
+    "sensing": ("encoder_bias", "sensor_delay", "sensor_lag", "velocity_lag"),
     "external": ("drag", "constant_push"),
 }
 """Names of the library that a suspended robot can show, by family."""

@@ -528,13 +528,13 @@ def test_a_lagging_sensor_is_behind_a_ramp_by_its_time_constant():
 
 def test_a_filter_of_positions_alone_or_of_velocities_alone():
     truth, both = motion(), series("sensor_lag", motion(), seconds=0.01)
-    for skew, filtered, direct in ((-1.0, 0, 1), (1.0, 1, 0)):
-        got = series("sensor_lag", truth, seconds=0.01, skew=skew)
-        np.testing.assert_array_equal(got[:, filtered], both[:, filtered])
-        np.testing.assert_allclose(got[:, direct], truth[:, direct], rtol=1e-6)
+    for name, filtered, physical in (("sensor_lag", 0, {"velocity_faster": 1.0}), ("velocity_lag", 1, {})):
+        got = series(name, truth, seconds=0.01, **physical)
+        np.testing.assert_allclose(got[:, filtered], both[:, filtered], rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(got[:, 1 - filtered], truth[:, 1 - filtered], rtol=1e-6)
         assert np.abs(got[100:, filtered] - truth[100:, filtered]).max() > 0.01
     # Between them velocities have a part of the positions' time constant.
-    got = series("sensor_lag", truth, seconds=0.01, skew=-0.4)
+    got = series("sensor_lag", truth, seconds=0.01, velocity_faster=0.4)
     np.testing.assert_allclose(got[:, 1], series("sensor_lag", truth, seconds=0.006)[:, 1], rtol=1e-5)
 
 
@@ -544,7 +544,7 @@ def test_a_filter_of_positions_alone_or_of_velocities_alone():
         ("encoder_bias", {"rad": [0.03, -0.05]}),
         ("sensor_delay", {"seconds": [0.0124, 0.031]}),
         ("sensor_lag", {"seconds": [0.008, 0.02]}),
-        ("sensor_lag", {"seconds": [0.008, 0.02], "skew": [-0.6, -1.0]}),
+        ("sensor_lag", {"seconds": [0.008, 0.02], "velocity_faster": [0.6, 1.0]}),
     ],
 )
 def test_what_a_sensor_did_is_undone(name, physical):
