@@ -60,8 +60,15 @@ def _behind(values, readings, dt):
 
 
 def _undo_lag(values, readings, dt):
-    """readings = readings' + seconds d readings' / dt."""
-    return readings + _time_constants(values) * _slopes(readings, dt)
+    """readings = readings' + seconds d readings' / dt; slopes span 20 ms, as a step's are mostly noise.
+
+    Velocities that do not agree with positions are not used, so those that are undone are as late as positions.
+    """
+    count, half = len(readings), round(_HALF_SLOPE_S / dt)
+    at = np.arange(count)
+    after, before = np.minimum(at + half, count - 1), np.maximum(at - half, 0)
+    slope = (readings[after] - readings[before]) / ((after - before) * dt)[:, None, None]
+    return readings + values["seconds"] * slope
 
 
 def _velocity_lag(values, readings, now, memory):
@@ -74,19 +81,6 @@ def _steady(values, readings, dt):
     """Starts the lag of a velocity that has always been the same."""
     del values, dt
     return jnp.stack([readings[1], readings[1]])
-
-
-def _undo_velocity_lag(values, readings, dt):
-    """v = v' + seconds dv' / dt."""
-    return readings.at[:, 1].add(values["seconds"] * _slopes(readings, dt)[:, 1])
-
-
-def _slopes(readings, dt):
-    """Time derivatives of readings [time, 2, joints]; they span 20 ms, as a step's are mostly noise."""
-    count, half = len(readings), round(_HALF_SLOPE_S / dt)
-    at = np.arange(count)
-    after, before = np.minimum(at + half, count - 1), np.maximum(at - half, 0)
-    return (readings[after] - readings[before]) / ((after - before) * dt)[:, None, None]
 
 
 def _imu_tilt(values, gravity, now, memory):
@@ -148,7 +142,6 @@ ROWS = (
         sizes=(0.001, 0.008),
         act=_velocity_lag,
         start=_steady,
-        undo=_undo_velocity_lag,
         sentence="Velocities are read through a low-pass filter, and positions are not.",
         excited_by="a chirp to 10 Hz at two controller gains",
         **_SENSING,

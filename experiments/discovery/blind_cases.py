@@ -34,6 +34,7 @@ SIZE_BOUNDS = {
     "encoder_bias": (0.0005, 0.2),
     "sensor_delay": (0.001, 0.04),
     "sensor_lag": (0.001, 0.06),
+    "velocity_lag": (0.001, 0.06),
     "drag": (0.1, 100.0),
     "constant_push": (0.01, 15.0),
     "cogging": (0.02, 15.0),

@@ -41,7 +41,7 @@ __all__ = [
 
 _LEAST_STALE = 0.02  # share of readings
 _RATES = 1.8  # largest ratio of two runs' rates: all segments have one number of rows. A servo's logs differed by 1.5
-_LATE_S = 0.001  # a velocity that lags its position by more was filtered, and would be mistaken for a sensor's lag
+_LATE_S = 0.001  # where velocity and position are further apart, one of them was filtered
 
 
 @dataclass(frozen=True)
@@ -289,7 +289,9 @@ def drop_filtered(log: Log) -> tuple[Log, tuple[str, ...]]:
     """Leaves out signals that were filtered, because their lag would be mistaken for a sensor's.
 
     A signal counts as filtered if the log says so, and a velocity also if it lags the derivative of the position by
-    more than 1 ms in the median run. Positions stay: the delay of their filter is taken out (`envs.readings`).
+    more than 1 ms in the median run. So does one that is as much ahead: then the position is filtered, and states are
+    estimated from one signal alone. Positions stay: the delay of a filter that the log declares is taken out
+    (`envs.readings`).
 
     Args:
       log: as it was read.
@@ -301,8 +303,10 @@ def drop_filtered(log: Log) -> tuple[Log, tuple[str, ...]]:
     log, notes = _drop_declared(log)
     # Sealed runs are left out here too: nothing may be decided by them.
     late = [segments.velocity_lag(run) for run in without_sealed(log).runs if "dq" in run.signals]
-    if late and np.median(late) > _LATE_S:
-        notes.append(f"dq lags q by {1e3 * np.median(late):.0f} ms, so it was filtered and is not used")
+    apart = float(np.median(late)) if late else 0.0
+    if abs(apart) > _LATE_S:
+        which = "lags" if apart > 0 else "is ahead of"
+        notes.append(f"dq {which} q by {1e3 * abs(apart):.0f} ms, so one of them was filtered, and dq is not used")
         log = _without(log, "dq")
     return replace(log, rate_hz=row_rate(log)), tuple(notes)
 

@@ -111,14 +111,15 @@ def test_readings_are_rounded_and_noisy(spec, motions):
     assert noise(run.signals["dq"]) == pytest.approx(0.01, rel=0.3)
 
 
-def test_a_velocity_that_lags_is_left_out_and_said_so(plain):
+@pytest.mark.parametrize(("signal", "said"), [("dq", "dq lags q by 20 ms"), ("q", "dq is ahead of q by 10 ms")])
+def test_a_velocity_that_lags_or_leads_is_left_out_and_said_so(plain, signal, said):
     assert drop_filtered(plain)[1] == ()
-    runs = []
+    runs, seconds = [], 0.02 if signal == "dq" else 0.01
     for run in plain.runs:
-        late = np.stack([np.interp(run.time - 0.02, run.time, column) for column in run.signals["dq"].T], axis=1)
-        runs.append(type(run)(**{**run.__dict__, "signals": {**run.signals, "dq": late}}))
-    kept, notes = drop_filtered(type(plain)(**{**plain.__dict__, "runs": tuple(runs)}))
-    assert notes == ("dq lags q by 20 ms, so it was filtered and is not used",)
+        late = np.stack([np.interp(run.time - seconds, run.time, column) for column in run.signals[signal].T], axis=1)
+        runs.append(replace(run, signals={**run.signals, signal: late}))
+    kept, notes = drop_filtered(replace(plain, runs=tuple(runs)))
+    assert notes == (f"{said}, so one of them was filtered, and dq is not used",)
     assert all("dq" not in run.signals for run in kept.runs)
 
 

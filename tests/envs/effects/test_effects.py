@@ -544,7 +544,6 @@ def test_a_filter_of_positions_alone_or_of_velocities_alone():
         ("encoder_bias", {"rad": [0.03, -0.05]}),
         ("sensor_delay", {"seconds": [0.0124, 0.031]}),
         ("sensor_lag", {"seconds": [0.008, 0.02]}),
-        ("sensor_lag", {"seconds": [0.008, 0.02], "velocity_faster": [0.6, 1.0]}),
     ],
 )
 def test_what_a_sensor_did_is_undone(name, physical):
