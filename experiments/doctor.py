@@ -49,13 +49,13 @@ def main(args: Args) -> None:
     for note in log.notes:
         console.print(note, highlight=False, markup=False)
     if not said:
-        console.print(f"nothing is suspected in {len(log.runs)} run(s); plot in {out}")
+        console.print(f"nothing is suspected in {len(log.runs)} run(s); plot in {out}", markup=False)
         return
     table = Table("what is suspected", "runs", title=escape(str(args.log)))
     for finding, names in said:
-        table.add_row(escape(finding.sentence), f"{len(names)} of {len(log.runs)}: {', '.join(names[:3])}")
+        table.add_row(escape(finding.sentence), f"{len(names)} of {len(log.runs)}: {escape(', '.join(names[:3]))}")
     console.print(table)
-    console.print(f"plot of {worst.name} in {out}")
+    console.print(f"plot of {worst.name} in {out}", markup=False)
 
 
 if __name__ == "__main__":

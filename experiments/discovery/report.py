@@ -5,6 +5,7 @@ from functools import partial
 from pathlib import Path
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from envs.logs import Log
@@ -96,8 +97,10 @@ def show(console: Console, question: Question, summary: dict, free: dict) -> Non
       summary: of `experiments.discovery.summary.summarise`.
       free: of `experiments.discovery.summary.free_runs`.
     """
+    # Names of joints and links are printed as they are.
+    say = partial(console.print, markup=False, highlight=False)
     console.print(f"[bold]{summary['verdict']}[/bold]: {VERDICTS[summary['verdict']]}")
-    console.print(ADVICE[summary["verdict"]])
+    say(ADVICE[summary["verdict"]])
     table = Table("effect", "place", "size (95 % interval)", "not distinguishable from", "experiment to decide")
     table.caption = "sizes come on top of what the model has"
     for effect in _presented(summary, question):
@@ -107,24 +110,24 @@ def show(console: Console, question: Question, summary: dict, free: dict) -> Non
         )
         others = ", ".join(effect["confusable_with"]) or "-"
         name = f"{effect['name']} ({effect['form'].replace('_', ' ')})" if effect["form"] else effect["name"]
-        table.add_row(name, effect["place"], values, others, effect["experiment"])
+        table.add_row(name, escape(effect["place"]), values, others, escape(effect["experiment"]))
     if table.row_count:
         console.print(table)
     for effect in summary["not_named"]:
         name, why = f"{effect['name']} at {place_in_words(question, effect)}", "explains only a part"
         if effect["refines"] is not None:
             why = f"may only make up for the form of {brief_keys(question, effect['refines'])}"
-        console.print(f"accepted, not named: {name}, which {why}")
+        say(f"accepted, not named: {name}, which {why}")
     table = Table("error on held-out runs", "nominal model", "parameters fitted", "corrected model")
     gap, error = summary["gap"], free["error_rad"]["sealed"]
     table.add_row("short segments, floor units", *(f"{gap[name]:.2f}" for name in ("before", "null", "after")))
     table.add_row("whole runs, mean in rad", *(f"{error[name]:.4f}" for name in ("before", "null", "after")))
     console.print(table)
     if summary["effects"] or summary["not_named"]:
-        console.print(f"explained: {summary['explained_share']:.0%} of what can be explained")
+        say(f"explained: {summary['explained_share']:.0%} of what can be explained")
     for one in summary["dropped"]:
         name = f"{one['name']} ({one['form'].replace('_', ' ')})" if one["form"] else one["name"]
-        console.print(f"taken out again: {name} at {place_in_words(question, one)}, since {_reasons(one['failed'])}")
+        say(f"taken out again: {name} at {place_in_words(question, one)}, since {_reasons(one['failed'])}")
     suspects = [
         f"{one['name']} at {place_in_words(question, one)} {one['probability']:.2f}"
         f"{' (taken out again)' if _failed(summary, one) else ''}"
@@ -132,19 +135,19 @@ def show(console: Console, question: Question, summary: dict, free: dict) -> Non
         if one["probability"] >= _SUSPECT
     ]
     if suspects:
-        console.print(f"suspects: {'; '.join(suspects[:_SHOWN])}")
+        say(f"suspects: {'; '.join(suspects[:_SHOWN])}")
     if summary["next_experiment"]:
         experiment = brief_keys(question, summary["next_experiment"])
-        console.print(f"to decide between them: {experiment}", highlight=False, markup=False)
+        say(f"to decide between them: {experiment}")
     if summary["verdict"] == "unnamed" and summary["explainable_share"] < _HARDLY:
-        console.print(
+        say(
             f"A learned torque at all joints explains {summary['explainable_share']:.0%} of what is left: the rest may "
             "differ from run to run. Record a motion several times, as one condition, to see whether it does."
         )
     if summary["withdrawn"]:
-        console.print("the corrected model was withdrawn: on held-out runs it was worse than the one that is saved")
+        say("the corrected model was withdrawn: on held-out runs it was worse than the one that is saved")
     if summary["not_testable"]:
-        console.print(f"effects that these logs could not show: {', '.join(summary['not_testable'])}")
+        say(f"effects that these logs could not show: {', '.join(summary['not_testable'])}")
 
 
 def _presented(summary: dict, question: Question) -> list[dict]:

@@ -160,5 +160,18 @@ def test_page_and_console_say_what_was_found(tmp_path, asked, withdrawn):
     assert page.count(why) == 2
 
 
+def test_names_with_brackets_are_printed_as_they_are(asked):
+    log, question = asked
+    result = found(question)
+    summary, free = summarise(question, log, Path("logs"), result), free_runs(log, question, result)
+    for kind in ("effects", "not_named", "dropped", "suspects"):
+        summary[kind] = [one | {"places": [f"[red]{place}" for place in one["places"]]} for one in summary[kind]]
+    console = Console(record=True, width=400)
+    report.show(console, question, summary, free)
+    said = console.export_text()
+    assert said.count("[red]elbow") >= 4
+    assert said.count("[red]shoulder") == 2
+
+
 def test_every_test_that_an_effect_may_fail_has_words():
     assert set(report.FAILED) == set(passes(EVIDENCE, Thresholds(10.0)))
