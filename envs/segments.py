@@ -15,18 +15,18 @@ import numpy as np
 from envs.effects.memory import LONGEST_S, PAST_STEP_S, PAST_TARGET_STEP_S
 from envs.logs import Run
 from envs.readings import aligned, hermite, noise, quantum_of
-from envs.smoothing import smoothed, velocity_lag
+from envs.smoothing import lateness, smoothed
 
 __all__ = [
     "HISTORY_S",
     "Cut",
     "Segment",
     "cut",
+    "lateness",
     "noise",
     "quantum_of",
     "rows_together",
     "smoothed",
-    "velocity_lag",
     "whole",
 ]
 

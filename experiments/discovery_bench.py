@@ -69,7 +69,7 @@ def main(args: Args) -> None:
     with bars() as progress:
         for done, case in enumerate(progress.track(cases, description="cases"), start=1):
             if args.write_only:
-                console.print(f"{done}/{len(cases)} {bench.write(case)}")
+                console.print(f"{done}/{len(cases)} {bench.write(case)}", markup=False)
                 continue
             answer = bench.answer(case)
             names = ", ".join(effect["name"] for effect in [*answer["effects"], *answer["parameter_changes"]])

@@ -87,7 +87,8 @@ def main(args: Args) -> None:
     write(log, args.out)
     console.print(
         f"wrote {len(runs)} runs of {args.seconds:g} s for {', '.join(joints)} to {args.out}. Play each run's targets "
-        "on the robot, and add the measured columns to its file or a copy of it: q.*, and dq.* if there is a sensor."
+        "on the robot, and add the measured columns to its file or a copy of it: q.*, and dq.* if there is a sensor.",
+        markup=False,
     )
 
 

@@ -46,7 +46,7 @@ def main(args: Args) -> None:
         raise ValueError(f"policy: got {args.policy}, expected a folder of experiments.train --robot {args.robot}")
     export(args.out, starting_policy(policy, learner).learner, learner)
     files = ", ".join(sorted(file.name for file in args.out.iterdir()))
-    console.print(f"{args.out} holds {files}")
+    console.print(f"{args.out} holds {files}", markup=False)
 
 
 if __name__ == "__main__":

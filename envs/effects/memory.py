@@ -79,7 +79,7 @@ def filtered(memory: jax.Array, signal: jax.Array, seconds: jax.Array, dt: float
     Args:
       memory: y and the signal at the sample before, [2, ..., joints].
       signal: [..., joints], at this sample.
-      seconds: time constant [joints]; the signal passes unchanged where it is zero.
+      seconds: time constant, [joints] or as the signal; the signal passes unchanged where it is zero.
       dt: time between samples in s.
 
     Returns:

@@ -62,7 +62,8 @@ def _behind(values, readings, dt):
 def _undo_lag(values, readings, dt):
     """readings = readings' + seconds d readings' / dt; slopes span 20 ms, as a step's are mostly noise.
 
-    Velocities that do not agree with positions are not used, so those that are undone are as late as positions.
+    Of both alike: recorded velocities that do not agree with positions are not used, and those of a state follow from
+    its positions.
     """
     count, half = len(readings), round(_HALF_SLOPE_S / dt)
     at = np.arange(count)

@@ -74,7 +74,7 @@ def bars() -> Progress:
     plain line once a minute, so that a long run can be followed without thousands of redrawn bars. Both say the time
     that is left, by the mean pace so far, once two steps are done.
     """
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()
+    columns = TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn()
     kind = Progress if console.is_terminal else _Lines
     # A step may take minutes, and the pace is that of all steps within the period.
     return kind(*columns, TimeElapsedColumn(), TimeRemainingColumn(), console=console, speed_estimate_period=_DAY_S)

@@ -34,7 +34,6 @@ SIZE_BOUNDS = {
     "encoder_bias": (0.0005, 0.2),
     "sensor_delay": (0.001, 0.04),
     "sensor_lag": (0.001, 0.06),
-    "velocity_lag": (0.001, 0.06),
     "drag": (0.1, 100.0),
     "constant_push": (0.01, 15.0),
     "cogging": (0.02, 15.0),
@@ -87,7 +86,8 @@ def _spread(names: Sequence[str], count: int) -> tuple[tuple[str, float], ...]:
     return tuple((names[i % len(names)], SEVERITIES[i % len(SEVERITIES)]) for i in range(count))
 
 
-_HIDDEN = tuple(name for name, row in LIBRARY.items() if not row.needs)
+# Where velocities lag they are not compared, so such a log has no severity beside one without the effect.
+_HIDDEN = tuple(name for name, row in LIBRARY.items() if not row.needs and name != "velocity_lag")
 _ARM = (str(ARM), ("shoulder", "elbow"), ((40.0, 20.0), (2.0, 0.8), (15.0, 15.0)))
 _BITENO = ("biteno", constants.JOINTS, ((60.0,) * 6, (2.0,) * 6, (60.0,) * 6))
 SIZES = {

@@ -212,13 +212,12 @@ class _Robot:
             seen = np.stack([position, speed])
             if effect == "encoder_bias":
                 seen[0] += size * at
-            if effect in ("sensor_lag", "velocity_lag"):
+            if effect == "sensor_lag":
                 lag_read = np.stack([seen, seen]) if lag_read is None else lag_read
                 share = _STEP_S / (0.5 * size)  # two equal stages, each with half of the time constant
                 lag_read[0] += share * (seen - lag_read[0])
                 lag_read[1] += share * (lag_read[0] - lag_read[1])
-                late = np.where(at > 0, lag_read[1], seen)
-                seen = late if effect == "sensor_lag" else np.stack([seen[0], late[1]])
+                seen = np.where(at > 0, lag_read[1], seen)
             read[step] = seen
             if effect == "sensor_delay":
                 read[step] = np.where(at > 0, self._past(read_true := seen, step, behind), read_true)

@@ -38,7 +38,7 @@ FAILED = {
     "matters": "it closes too little of the gap",
     "inside_bounds": "its fit went to the end of its range",
     "clear_of_zero": "its size may be zero",
-    "horizons": "it helps at one length of segments alone",
+    "horizons": "it helps at too few lengths of segments",
 }
 """Why an effect was taken out of the model again, by the test of `jaxtune.discovery.decide.passes` that it failed."""
 

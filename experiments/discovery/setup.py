@@ -288,10 +288,9 @@ def without_sealed(log: Log) -> Log:
 def drop_filtered(log: Log) -> tuple[Log, tuple[str, ...]]:
     """Leaves out signals that were filtered, because their lag would be mistaken for a sensor's.
 
-    A signal counts as filtered if the log says so, and a velocity also if it lags the derivative of the position by
-    more than 1 ms in the median run. So does one that is as much ahead: then the position is filtered, and states are
-    estimated from one signal alone. Positions stay: the delay of a filter that the log declares is taken out
-    (`envs.readings`).
+    A signal counts as filtered if the log says so. Velocities are left out too if those of a joint lag the derivative
+    of its position by more than 1 ms in the median run, or are as much ahead of it: states are estimated from signals
+    that agree. Positions stay: the delay of a filter that the log declares is taken out (`envs.readings`).
 
     Args:
       log: as it was read.
@@ -302,12 +301,15 @@ def drop_filtered(log: Log) -> tuple[Log, tuple[str, ...]]:
     """
     log, notes = _drop_declared(log)
     # Sealed runs are left out here too: nothing may be decided by them.
-    late = [segments.velocity_lag(run) for run in without_sealed(log).runs if "dq" in run.signals]
-    apart = float(np.median(late)) if late else 0.0
-    if abs(apart) > _LATE_S:
-        which = "lags" if apart > 0 else "is ahead of"
-        notes.append(f"dq {which} q by {1e3 * abs(apart):.0f} ms, so one of them was filtered, and dq is not used")
-        log = _without(log, "dq")
+    late = [segments.lateness(run) for run in without_sealed(log).runs if "dq" in run.signals]
+    if late:
+        apart = np.median(late, axis=0)
+        worst = int(np.abs(apart).argmax())
+        if abs(apart[worst]) > _LATE_S:
+            which = "lags" if apart[worst] > 0 else "is ahead of"
+            said = f"dq {which} q by {1e3 * abs(apart[worst]):.0f} ms at {log.joints[worst]}"
+            notes.append(f"{said}, so one of them was filtered or read late, and dq is not used")
+            log = _without(log, "dq")
     return replace(log, rate_hz=row_rate(log)), tuple(notes)
 
 

@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import mujoco
 import numpy as np
 
 from envs.effects import LIBRARY
@@ -43,9 +42,7 @@ def summarise(question: Question, log: Log, folder: Path, result: Result) -> dic
             changes.append(effect)
         else:
             effects.append(effect)
-    # A robot that cannot leave its place has no ground under it.
-    moves = any(joint.type == mujoco.mjtJoint.mjJNT_FREE for joint in question.spec.joints)
-    not_there = [name for name in LIBRARY if name not in question.rig.effects] if moves else []
+    not_there = [name for name in LIBRARY if name not in question.rig.effects]
     return {
         "verdict": result.verdict,
         "effects": effects,

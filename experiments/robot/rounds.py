@@ -222,7 +222,8 @@ class Rounds:
         policy_files.export(place / "policy", state.policy.learner, self._learner)
         episodes, seconds = self._learner.preset.tuner.set_episodes, self._terms.walk_s
         request(place, episodes, seconds, 1000 * self._terms.seed + index)
-        console.print(f"round {index}: requested {episodes} walks of {seconds:g} s in {place}, waiting for the log")
+        text = f"round {index}: requested {episodes} walks of {seconds:g} s in {place}, waiting for the log"
+        console.print(text, markup=False)
 
     def _learn(self, index: int, state: TunerState) -> None:
         """Turns the robot's log into the next distribution, and writes what was measured and what moved."""

@@ -32,7 +32,7 @@ from jaxtune.discovery.shares import energy, explained, explained_shares, open_g
 from jaxtune.discovery.state import State
 
 _SUSPECTS = 8
-_BELIEVED = 0.01  # probability from which on a model is worth an experiment
+_BELIEVED = 0.01  # probability from which on effects are worth an experiment
 _BOUND = 1e-6  # of the width of the bounds: how near to one a coordinate is at it
 
 
@@ -70,6 +70,9 @@ def conclude(settings: Settings, problem: Problem, floor: NoiseFloor, state: Sta
     """
     at = floor[problem.main_horizon]
     say("evidence")
+    # A model that was found in two forms, each with the name of the other's form, is one model.
+    alike = [renamed(problem, one) for one in state.candidates]
+    state = replace(state, candidates=(), best=renamed(problem, state.best)).with_candidates(alike)
     best, terms, ablated, dropped = _proved(settings, problem, floor, state)
     candidates = sorted(
         {one.key: one for one in (best, *state.candidates)}.values(), key=lambda one: total_cost(at, one, state.price)
@@ -128,12 +131,17 @@ def conclude(settings: Settings, problem: Problem, floor: NoiseFloor, state: Sta
 
 
 def _rivals(candidates: Sequence[Candidate], probabilities: np.ndarray) -> tuple[tuple[str, np.ndarray], ...]:
-    """The two models that are most believed, of those with effects and of those that are at all; best first."""
-    found: dict[str, np.ndarray] = {}
+    """The two sets of effects that are most believed, best first, each by its best model; none that hardly is."""
+    models: dict[str, np.ndarray] = {}
+    belief: dict[str, float] = {}
     for index in np.argsort(-probabilities, kind="stable"):
-        if candidates[index].effects and probabilities[index] >= _BELIEVED:
-            found.setdefault(key_of(candidates[index].effects), candidates[index].fit.vector)
-    return tuple(found.items())[:2]
+        candidate = candidates[index]
+        if candidate.effects:
+            key = key_of(candidate.effects)
+            models.setdefault(key, candidate.fit.vector)
+            belief[key] = belief.get(key, 0.0) + float(probabilities[index])
+    best = sorted((key for key in models if belief[key] >= _BELIEVED), key=lambda key: -belief[key])
+    return tuple((key, models[key]) for key in best[:2])
 
 
 def learn(settings: Settings, problem: Problem, at: Floor, best: Candidate) -> Candidate:
@@ -162,7 +170,7 @@ def _proved(
     """The cheapest model without the effects that do not pass, which are taken out one by one, the weakest first."""
     at, dropped = floor[problem.main_horizon], []
     (fit,) = polish([state.best.fit], at.residuals["train"], 0)
-    best = renamed(problem, replace(state.best, fit=fit))
+    best = replace(state.best, fit=fit)
     of_effect = Thresholds(state.price)
     # Much of what forms are about ends at its bounds: friction can be all at the motor, a limit as soft as it gets.
     of_form = Thresholds(0.5 * state.price, floors=0.0, of_left=0.0, inside=False, horizons=1)
@@ -180,7 +188,7 @@ def _proved(
         hypothesis, evidence, best = weighed[weakest]
         dropped.append(DroppedTerm(hypothesis, evidence, failed[weakest]))
         (fit,) = polish([best.fit], at.residuals["train"], 1)
-        best = replace(best, fit=fit, select=at.residuals["select"](fit.vector[None])[0])
+        best = renamed(problem, replace(best, fit=fit, select=at.residuals["select"](fit.vector[None])[0]))
     if not best.hypotheses:
         best = state.null
         (fit,) = polish([best.fit], at.residuals["train"], 0)

@@ -129,8 +129,8 @@ class Result:
     families: Mapping[tuple[str, tuple[str, ...]], float]
     """The probability that an effect of a family is at some places, by family and places, most likely first."""
     rivals: tuple[tuple[str, np.ndarray], ...]
-    """Keys and vectors [axes] of the two models that are most believed, of those with effects and a probability of at
-    least 0.01; their effects differ in more than form. One or none where no other is believed."""
+    """Keys of the two sets of effects that are most believed, and vectors [axes] of their best models. Fewer where
+    others have a probability below 0.01."""
     explained_share: float
     """Share that the reported effects explain on `train` and `select`, of what they and a learned torque explain
     together: of the gap or of the cost, whichever is smaller. The gap is that of all segments but a few or of typical

@@ -18,6 +18,7 @@ from jaxtune.discovery.problem import Problem
 from jaxtune.discovery.result import Settings
 
 _NULL_ROUNDS = 8
+_BESIDE = 4  # numbers of a saved coordinate beside its direction: standard deviation, two bounds, nominal or not
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -145,9 +146,11 @@ def from_json(problem: Problem, floor: NoiseFloor, begun: State, saved: Mapping[
     Raises:
       ValueError: another version saved it.
     """
-    if not {"rows", "screened"} <= saved.keys():
-        raise ValueError("the saved state is of another version: remove state.json to begin anew")
     by_key = {hypothesis.key: hypothesis for hypothesis in (*problem.hypotheses, *problem.forms)}
+    known = {"rows", "screened"} <= saved.keys()
+    # A library that has grown since has more axes.
+    if not known or {len(row) for row in saved["rows"]} - {problem.axes + _BESIDE}:
+        raise ValueError("the saved state is of another version: remove state.json to begin anew")
     at = floor[problem.main_horizon]
     rows = np.array(saved["rows"])
     frees = [_free(rows[one["free"]]) for one in saved["candidates"]]
@@ -186,4 +189,4 @@ def _rows(free: Free) -> list[tuple[float, ...]]:
 
 def _free(rows: np.ndarray) -> Free:
     """The coordinates of some rows."""
-    return Free(rows[:, :-4], rows[:, -4], rows[:, -3:-1], rows[:, -1].astype(bool))
+    return Free(rows[:, :-_BESIDE], rows[:, -4], rows[:, -3:-1], rows[:, -1].astype(bool))

@@ -128,13 +128,24 @@ def test_what_was_not_rounded_has_no_quantum():
         np.testing.assert_array_equal(segments.quantum_of(values), [0.0, 0.0])
 
 
-@pytest.mark.parametrize("late_s", [0.0, 0.007, 0.02])
-def test_a_late_velocity_is_found(late_s):
+@pytest.mark.parametrize("late_s", [[0.0, 0.0], [0.007, 0.0], [0.0, 0.02], [-0.006, 0.02]])
+def test_late_and_early_velocities_are_found_joint_by_joint(late_s):
     time = times(4.0)
     pace = 2 * np.pi * np.array([1.0, 2.5])
     position = 0.3 * np.sin(pace * time[:, None])
     velocity = 0.3 * pace * np.cos(pace * (time[:, None] - late_s))
-    np.testing.assert_allclose(segments.velocity_lag(run(time, q=position, dq=velocity)), late_s, atol=0.0011)
+    np.testing.assert_allclose(segments.lateness(run(time, q=position, dq=velocity)), late_s, atol=1.1e-3)
+
+
+@pytest.mark.parametrize("rate_hz", [50.0, 200.0, 500.0])
+@pytest.mark.parametrize("seed", range(5))
+def test_noise_of_slow_motion_is_not_taken_for_a_lag(rate_hz, seed):
+    time, rng, pace = times(6.0, rate_hz), np.random.default_rng(seed), 2 * np.pi * 0.3
+    position = 0.2 * np.sin(pace * time[:, None] + [0.0, 1.0])
+    velocity = 0.2 * pace * np.cos(pace * time[:, None] + [0.0, 1.0])
+    position = np.round(position / 0.0015) * 0.0015
+    noisy = velocity + 0.02 * rng.standard_normal(velocity.shape)
+    assert (segments.lateness(run(time, q=position, dq=noisy)) == 0.0).all()
 
 
 def slow_bus(every=3, rate_hz=200.0):

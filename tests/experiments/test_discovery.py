@@ -111,15 +111,19 @@ def test_readings_are_rounded_and_noisy(spec, motions):
     assert noise(run.signals["dq"]) == pytest.approx(0.01, rel=0.3)
 
 
-@pytest.mark.parametrize(("signal", "said"), [("dq", "dq lags q by 20 ms"), ("q", "dq is ahead of q by 10 ms")])
+@pytest.mark.parametrize(
+    ("signal", "said"), [("dq", "dq lags q by 20 ms at elbow"), ("q", "dq is ahead of q by 10 ms at elbow")]
+)
 def test_a_velocity_that_lags_or_leads_is_left_out_and_said_so(plain, signal, said):
     assert drop_filtered(plain)[1] == ()
-    runs, seconds = [], 0.02 if signal == "dq" else 0.01
+    # At one joint alone.
+    runs, seconds = [], np.array([0.0, 0.02 if signal == "dq" else 0.01])
     for run in plain.runs:
-        late = np.stack([np.interp(run.time - seconds, run.time, column) for column in run.signals[signal].T], axis=1)
+        columns = zip(seconds, run.signals[signal].T, strict=True)
+        late = np.stack([np.interp(run.time - behind, run.time, column) for behind, column in columns], axis=1)
         runs.append(replace(run, signals={**run.signals, signal: late}))
     kept, notes = drop_filtered(replace(plain, runs=tuple(runs)))
-    assert notes == (f"{said}, so one of them was filtered, and dq is not used",)
+    assert notes == (f"{said}, so one of them was filtered or read late, and dq is not used",)
     assert all("dq" not in run.signals for run in kept.runs)
 
 
@@ -270,6 +274,9 @@ def test_sizes_hide_what_the_library_has_and_what_it_has_not():
     for severity in (2.0, 5.0, 15.0):
         assert sum(asked == severity for _, asked in standard.hidden) == 16
     assert all(name in SIZE_BOUNDS for name, _ in (*standard.hidden, *standard.outside))
+    # An effect is not always as large.
+    severities = {name: {asked for other, asked in standard.hidden if other == name} for name, _ in standard.hidden}
+    assert min(map(len, severities.values())) > 1
 
 
 def test_the_learner_reads_a_log_that_says_nothing_of_the_truth(tmp_path, spec, motions):

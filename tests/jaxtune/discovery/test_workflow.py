@@ -2,12 +2,14 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from slider import AXES, DIRECTION, HYPOTHESES, LEARNED, WARPED, WILD, problem
 
 from jaxtune.discovery import noise_floor, state, step, workflow
+from jaxtune.discovery.conclude import _rivals
 from jaxtune.discovery.decide import Candidate, Evidence
 from jaxtune.discovery.fit import begin
 from jaxtune.discovery.naming import renamed, with_refinements
@@ -155,6 +157,21 @@ def test_the_two_models_that_are_most_believed_differ_in_more_than_form():
     assert not np.allclose(vector, other)
 
 
+def test_what_hardly_anybody_believes_is_worth_no_experiment():
+    found = [
+        SimpleNamespace(effects=(effect,), fit=SimpleNamespace(vector=number))
+        for number, effect in enumerate((*HYPOTHESES[2:4], HYPOTHESES[3], HYPOTHESES[2]))
+    ] + [SimpleNamespace(effects=(), fit=SimpleNamespace(vector=4))]
+    # Two forms of the second set of effects are believed together.
+    assert [key for key, _ in _rivals(found, np.array([0.9, 0.008, 0.009, 0.0, 0.083]))] == [
+        "coulomb@slider",
+        "push@slider",
+    ]
+    assert _rivals(found, np.array([0.3, 0.2, 0.4, 0.05, 0.05]))[0] == ("push@slider", 2)
+    assert [key for key, _ in _rivals(found, np.array([0.9, 0.004, 0.005, 0.0, 0.091]))] == ["coulomb@slider"]
+    assert _rivals(found, np.array([0.0, 0.004, 0.005, 0.0, 0.991])) == ()
+
+
 def test_what_no_hypothesis_explains_is_unnamed():
     result = discover({"cubic": 12.0})
     assert result.verdict == "unnamed"
@@ -260,6 +277,10 @@ def test_a_run_that_was_cut_goes_on_after_its_last_step():
         assert resumed.gap == result.gap
         assert resumed.details == result.details
         assert resumed.not_testable == result.not_testable
+    grown = saved[0] | {"rows": [[0.0, *row] for row in saved[0]["rows"]]}
+    for other in (grown, {name: value for name, value in saved[0].items() if name != "rows"}):
+        with pytest.raises(ValueError, match=r"another version: remove state.json"):
+            workflow.discover(problem(truth), saved=other)
 
 
 def test_a_step_changes_nothing_that_it_is_given():
@@ -395,6 +416,10 @@ def test_the_larger_part_gives_the_name_where_two_effects_are_forms_of_each_othe
     swapped = renamed(asked, model([0.4, -0.8]))
     assert [h.key for h in swapped.hypotheses] == ["push@slider", "push(with_friction)@slider"]
     assert [h.key for h in swapped.effects] == [push.key]
+    # A further form would have no effect to be a form of.
+    warped = replace(model([0.4, -0.8]), hypotheses=(coulomb, DIRECTION, WARPED))
+    assert renamed(asked, warped) is not swapped
+    assert [h.key for h in renamed(asked, warped).hypotheses] == [coulomb.key, DIRECTION.key, WARPED.key]
     # A form that is no effect with the other one as its form changes no name.
     alone = replace(asked, forms=(DIRECTION,))
     assert [h.key for h in renamed(alone, model([0.4, -0.8])).effects] == [coulomb.key]
