@@ -7,7 +7,7 @@ tuned parameter expresses.
 
 import fnmatch
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import isnan
 from pathlib import Path
@@ -17,7 +17,7 @@ from rich.progress import Progress
 from rich.table import Table
 
 from experiments.common import checkpoint, compiler, plots
-from experiments.common.cli import bars, console, run
+from experiments.common.cli import bars, console, count, run
 from experiments.common.config import preset
 from experiments.common.rates import interval
 from experiments.walking import memory
@@ -40,7 +40,8 @@ class Args:
     """Tests on simulated robots what the tuner would find: false alarms, power, errors and coverage."""
 
     out: Path = Path("runs/selftest")
-    """Folder of the results: selftest.json and power.png."""
+    """Folder of the results: selftest.json and power.png. The same command with the same folder goes on where it was
+    stopped."""
     robot: str = "biteno"
     """Robot: biteno, go2, playground:NAME, playground-warp:NAME, or path/to/file.py:function."""
     policy: str | None = None
@@ -170,7 +171,22 @@ def tested(args: Args, robot: Kind, entries, others, episodes: int, progress: Pr
         name: {one: float(value) for one, value in parameters.to_coords(table, values).items()}
         for name, values in others.items()
     }
-    task = progress.add_task(f"{episodes} episodes", total=None)
+    task, parts = progress.add_task(f"{episodes} episodes", total=None), args.out / "parts" / str(episodes)
+    parts.mkdir(parents=True, exist_ok=True)
+    computed = []
+
+    def keep(name: str, compute: Callable[[], dict]) -> dict:
+        path = parts / f"{name}.json"
+        if not checkpoint.exists(path):
+            checkpoint.write_json(path, compute())
+            computed.append(path)
+        # Read again in any case, so that the numbers are those of a run that was interrupted.
+        return checkpoint.read_json(path)
+
+    def done(number: int, total: int) -> None:
+        progress.update(task, total=total)
+        count(progress, task, number, kept=not computed)
+
     return selftest.run(
         jax.random.PRNGKey(args.seed),
         machine,
@@ -180,7 +196,8 @@ def tested(args: Args, robot: Kind, entries, others, episodes: int, progress: Pr
         whole=args.whole,
         tunings=args.tunings,
         others=coords,
-        done=lambda number, total: progress.update(task, completed=number, total=total),
+        keep=keep,
+        done=done,
     )
 
 
@@ -201,8 +218,8 @@ def show(reports: Mapping[int, SelfTest]) -> None:
             table.add_row(name, "", "", "", _rate(rate), "")
         console.print(table)
         console.print(f"all true values in their intervals: {_rate(report.covered)}", markup=False)
-        for name, count in report.unusable.items():
-            console.print(f"{name}: {count} sets are too short or not finite, and are not counted", markup=False)
+        for name, sets in report.unusable.items():
+            console.print(f"{name}: {sets} sets are too short or not finite, and are not counted", markup=False)
         for place, text in selftest.whole_tunings(report).items():
             console.print(f"{place}: {text}", markup=False)
     for line in lacking(reports):

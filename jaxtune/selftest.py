@@ -30,6 +30,10 @@ INSIDE = "inside the distribution"
 """Case of the robots that the distribution could have drawn."""
 _OFF = 2.0  # radii from the centre: one outside
 
+Keep = Callable[[str, Callable[[], dict]], dict]
+"""`(name, compute) -> part`: what `compute` gives, numbers and lists of them by name, or what it gave an earlier call.
+A number that is not finite may be None then."""
+
 
 @dataclass(frozen=True)
 class Rate:
@@ -117,6 +121,7 @@ def run(
     whole: int = 0,
     tunings: int = 1,
     others: Mapping[str, Coords] = MappingProxyType({}),
+    keep: Keep = lambda name, compute: compute(),
     done: Callable[[int, int], None] = lambda number, total: None,
 ) -> SelfTest:
     """Runs a self-test. Gate and update are called once for each measured set; nothing is trained but their models.
@@ -132,6 +137,7 @@ def run(
         one before left; the policy stays as it is.
       others: cases by name, of coordinates that replace those drawn. `tuner.simulate` must know them; a coordinate that
         is not in the distribution is 0, that is nominal, in all other cases.
+      keep: given every part of the test, a gate or a robot's whole tunings, so that one that was interrupted goes on.
       done: called after every gate and tuning with their number so far and in all.
 
     Raises:
@@ -147,7 +153,7 @@ def run(
     key_gates, key_whole = jax.random.split(key)
     total = gates + whole * tunings * (1 + len(others))
     cases = [{}, *outside.values(), *others.values()]
-    calls = _call(key_gates, tuner, state, cases, extra, robots, gates, lambda number: done(number, total))
+    calls = _call(key_gates, tuner, state, cases, extra, robots, gates, keep, lambda number: done(number, total))
     rejected, noticed = (
         [_told(column) for column in np.moveaxis(calls[name], 1, 0)] for name in ("rejected", "noticed")
     )
@@ -155,7 +161,7 @@ def run(
     ends = len(outside) + 1
     whole_cases = {INSIDE: {}} | others if whole else {}
     tuned = _tune(
-        key_whole, tuner, state, whole_cases, extra, whole, tunings, lambda number: done(gates + number, total)
+        key_whole, tuner, state, whole_cases, extra, whole, tunings, keep, lambda number: done(gates + number, total)
     )
     errors, intervals = calls["errors"], calls["intervals"]
     accepted = calls["rejected"][:, 0] == 0.0
@@ -190,6 +196,7 @@ def _call(
     extra: list[str],
     robots: int,
     gates: int,
+    keep: Keep,
     done: Callable[[int], None],
 ) -> dict[str, np.ndarray]:
     """Calls gate and update for the robots of every case, the first of which is the one inside the distribution.
@@ -202,8 +209,8 @@ def _call(
     seen = replace(tuner, simulate=lambda *args: tuner.simulate(*args).replace(state=None))
     programs = (_scorer(seen, robots), seen.collect, partial(_measured, seen))
     score, collect, measure = (devices.on_all(jax.jit(program)) for program in programs)
-    calls = []
-    for gate in range(gates):
+
+    def call(gate: int) -> dict:
         keys = jax.random.split(jax.random.fold_in(key, gate), 4)
         drawn = [
             _draw(jax.random.fold_in(keys[0], number), state.dist, robots, replaced, extra)
@@ -213,17 +220,21 @@ def _call(
         sets, collected = measure(keys[1], state, coords), collect(keys[2], state.policy, state.dist)
         rejected, usable, update, moved = jax.device_get(score(keys[3], collected, sets, state))
         truth = np.asarray(dists.normalise(state.dist, {name: drawn[0][name] for name in state.dist.centre}))
-        calls.append(
-            {
-                "rejected": np.where(usable, rejected, np.nan).reshape(-1, robots),
-                "noticed": np.where(usable, rejected | _inside(moved, coords), np.nan).reshape(-1, robots),
-                "identifiable": update.identifiable,
-                "errors": np.abs(update.step - truth),
-                "intervals": update.interval,
-            }
-        )
+        return {
+            "rejected": np.where(usable, rejected, np.nan).reshape(-1, robots),
+            "noticed": np.where(usable, rejected | _inside(moved, coords), np.nan).reshape(-1, robots),
+            "identifiable": update.identifiable,
+            "errors": np.abs(update.step - truth),
+            "intervals": update.interval,
+        }
+
+    calls = []
+    for gate in range(gates):
+        part = keep(f"gate_{gate}", partial(call, gate))
+        calls.append({name: np.array(values, float) for name, values in part.items()})
         done(gate + 1)
-    return jax.tree.map(lambda *values: np.stack(values), *calls)
+    found = {name: np.stack([one[name] for one in calls]) for name in calls[0]}
+    return found | {"identifiable": found["identifiable"] == 1.0}
 
 
 def _tune(
@@ -234,26 +245,34 @@ def _tune(
     extra: list[str],
     robots: int,
     tunings: int,
+    keep: Keep,
     done: Callable[[int], None],
 ) -> dict[str, tuple[Tuned, ...]]:
     """Runs whole tunings of robots of every case, and counts how they end."""
     measure, tune = (devices.on_all(jax.jit(program)) for program in (partial(_measured, tuner), tuner.tune))
+
+    def each(number: int, replaced: Mapping, robot: int) -> dict:
+        key_robot = jax.random.fold_in(jax.random.fold_in(key, number), robot)
+        key_draw, *keys = jax.random.split(key_robot, 1 + 2 * tunings)
+        coords = _draw(key_draw, state.dist, 1, replaced, extra)
+        # What is known of the real robot says nothing of this one.
+        now, rows = state.replace(past=pooling.nothing(state.dist)), []
+        for index, (key_measure, key_tune) in enumerate(zip(keys[::2], keys[1::2], strict=True)):
+            if index:
+                done((number * robots + robot) * tunings + index)
+            measured = jax.tree.map(lambda leaf: leaf[0], measure(key_measure, now, coords))
+            # The state stays on its devices: from others the programs would be compiled anew.
+            now, info = tune(key_tune, now, measured)
+            rows.append(_ended(*jax.device_get((now.dist, info)), coords))
+        return {"tunings": rows}
+
     tuned = {}
     for number, (name, replaced) in enumerate(cases.items()):
-        rows = []
+        ended = []
         for robot in range(robots):
-            key_robot = jax.random.fold_in(jax.random.fold_in(key, number), robot)
-            key_draw, *keys = jax.random.split(key_robot, 1 + 2 * tunings)
-            coords = _draw(key_draw, state.dist, 1, replaced, extra)
-            # What is known of the real robot says nothing of this one.
-            now = state.replace(past=pooling.nothing(state.dist))
-            for index, (key_measure, key_tune) in enumerate(zip(keys[::2], keys[1::2], strict=True)):
-                measured = jax.tree.map(lambda leaf: leaf[0], measure(key_measure, now, coords))
-                # The state stays on its devices: from others the programs would be compiled anew.
-                now, info = tune(key_tune, now, measured)
-                rows.append(_ended(*jax.device_get((now.dist, info)), coords))
-                done((number * robots + robot) * tunings + index + 1)
-        tuned[name] = tuple(_tuned(rows[index::tunings], dists.names(state.dist)) for index in range(tunings))
+            ended.append(keep(f"case_{number}_robot_{robot}", partial(each, number, replaced, robot))["tunings"])
+            done((number * robots + robot + 1) * tunings)
+        tuned[name] = tuple(_tuned(rows, dists.names(state.dist)) for rows in zip(*ended, strict=True))
     return tuned
 
 
@@ -262,9 +281,8 @@ def _ended(dist: ParamDist, info: Info, coords: Coords) -> dict:
     truth = np.asarray(dists.ravel({name: coords[name][0] for name in dist.centre}))
     centre, radius = (np.asarray(dists.ravel(value)) for value in (info.dist.centre, info.dist.radius))
     errors = np.abs(centre + radius * info.update.step - truth)
-    verdict = Verdict(int(info.verdicts[int(info.calls) - 1]))
     return {
-        "verdict": verdict,
+        "verdict": int(info.verdicts[int(info.calls) - 1]),
         "held": bool(_inside(dist, coords).all()),
         "covered": float(_covers(errors, radius * info.update.interval, info.update.identifiable)),
         "errors": np.abs(np.asarray(dists.ravel(dist.centre)) - truth),
@@ -275,9 +293,9 @@ def _tuned(rows: Sequence[Mapping], names: Sequence[str]) -> Tuned:
     """Counts rows of `_ended`, one for each robot."""
     accepted = [row for row in rows if row["verdict"] == Verdict.ACCEPT]
     return Tuned(
-        verdicts=dict(Counter(row["verdict"].name.lower() for row in rows)),
+        verdicts=dict(Counter(Verdict(row["verdict"]).name.lower() for row in rows)),
         held=Rate(sum(row["held"] for row in accepted), len(accepted)),
-        covered=_told(np.array([row["covered"] for row in accepted])),
+        covered=_told(np.array([row["covered"] for row in accepted], float)),
         error=dict(zip(names, np.median([row["errors"] for row in rows], axis=0).tolist(), strict=True)),
     )
 

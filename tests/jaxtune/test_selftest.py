@@ -1,4 +1,5 @@
 import dataclasses
+import json
 
 import jax
 import jax.numpy as jnp
@@ -6,6 +7,7 @@ import numpy as np
 import pytest
 import toys
 
+from experiments.common.checkpoint import as_json
 from jaxtune import selftest
 from jaxtune.gate import GateInfo
 from jaxtune.host import HostTuner
@@ -22,24 +24,42 @@ def machine(config=CONFIG):
     return tuner, tuner.init(toys.policy(), toys.uniform(THREE, 0.2), knobs())
 
 
-@pytest.fixture(scope="module")
-def report():
+def counted(parts, **options):
+    """A self-test that keeps its parts, as a command writes and reads them."""
     tuner, state = machine()
+
+    def keep(name, compute):
+        if name not in parts:
+            parts[name] = json.dumps(as_json(compute()))
+        return json.loads(parts[name])
+
     others = {"push": {"wind": 0.6}, "heavy": {"mass": 0.9}}
+    sizes = {"robots": 12, "gates": 2, "whole": 1, "tunings": 2}
+    return selftest.run(jax.random.key(0), tuner, state, **sizes, others=others, keep=keep, **options)
+
+
+@pytest.fixture(scope="module")
+def parts():
+    return {}
+
+
+@pytest.fixture(scope="module")
+def report(parts):
     calls = []
-    found = selftest.run(
-        jax.random.key(0),
-        tuner,
-        state,
-        robots=12,
-        gates=2,
-        whole=1,
-        tunings=2,
-        others=others,
-        done=lambda *now: calls.append(now),
-    )
+    found = counted(parts, done=lambda *now: calls.append(now))
     assert calls == [(number, 8) for number in range(1, 9)]
     return found
+
+
+def test_a_test_that_was_interrupted_goes_on_to_the_same_numbers(report, parts):
+    again = dict(parts)
+    for name in ("gate_1", "case_1_robot_0"):
+        del again[name]
+    calls = []
+    assert as_json(counted(again, done=lambda *now: calls.append(now))) == as_json(report)
+    assert again == parts
+    # One whole tuning says how far it is.
+    assert [number for number, _ in calls] == [1, 2, 4, 5, 6, 8]
 
 
 def test_robots_inside_pass_and_robots_outside_do_not(report):
