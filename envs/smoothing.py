@@ -13,6 +13,8 @@ _PARABOLA_S, _CUBIC_S = 0.012, 0.03  # half widths of the local fits
 _WIDEST_S = 0.018  # half width from which on a parabola no longer follows the motion
 _MIN_HALF_ROWS = 2  # a parabola needs three rows
 _CLEARER = 0.9  # share of a misfit that is left by a lag that is there
+_TELLS = 3.0  # how much worse the worst shift is than the best, of a joint that moves enough to tell
+_SAME_RATE = 0.02
 _AGREES = 2.0  # chi squared per degree of freedom below which a polynomial agrees with readings
 
 
@@ -100,28 +102,35 @@ def _nearest(at: np.ndarray, time: np.ndarray, half: int) -> np.ndarray:
     return np.clip(middle[:, None] + np.arange(-half, half + 1), 0, len(at) - 1)
 
 
-def lateness(run: Run) -> np.ndarray:
+def lateness(runs: Sequence[Run]) -> np.ndarray:
     """Estimates by how many seconds recorded velocities lag behind the slopes of recorded positions, [joints].
 
     A lag means that the robot filtered its velocities before they were logged, a negative one that it filtered its
-    positions. Of shifts by whole rows, from -10 to 50 ms, the one with the least mean square counts, and between rows
-    the vertex of a parabola through its neighbours. Shifts by a part of a row would average noise away, and seem right
-    for that. The lag is zero where none lowers the mean square by a tenth, as in slow motion, of which velocities are
-    mostly noise.
+    positions. Of shifts by whole rows, from about -10 to 50 ms, the one with the least mean square of all runs counts,
+    and between rows the vertex of a parabola through its neighbours. Shifts by a part of a row would average noise
+    away, and seem right for that. A joint has no lag where none lowers the mean square by a tenth, or where the worst
+    shift is hardly worse than the best: one that rests or moves slowly, whose velocities are mostly noise.
 
     Args:
-      run: with `q` and `dq`.
+      runs: with `q` and `dq`. Of runs at several rates those at the first one's count.
     """
-    # Slopes of the positions alone: with `dq` among the signals the fit would follow it.
-    own, read = smoothed(replace(run, signals={"q": run.signals["q"]}))[:, 1], aligned(run, "dq")
-    period = float(np.median(np.diff(run.time)))
+    period = _spacing(runs[0])
     least, most = max(1, round(0.01 / period)), max(2, round(0.05 / period))
-    inner = np.arange(most, len(own) - least)
-    rows = np.arange(-least, most + 1)
-    misfit = np.stack([((own[inner - row] - read[inner]) ** 2).mean(axis=0) for row in rows])
+    rows, misfit = np.arange(-least, most + 1), 0.0
+    for run in (one for one in runs if abs(_spacing(one) / period - 1.0) < _SAME_RATE):
+        # Slopes of the positions alone: with `dq` among the signals the fit would follow it.
+        own, read = smoothed(replace(run, signals={"q": run.signals["q"]}))[:, 1], aligned(run, "dq")
+        inner = np.arange(most, len(own) - least)
+        misfit = misfit + np.stack([((own[inner - row] - read[inner]) ** 2).sum(axis=0) for row in rows])
     middle, joint = np.clip(misfit.argmin(axis=0), 1, len(rows) - 2), np.arange(misfit.shape[1])
     before, here, after = (misfit[middle + step, joint] for step in (-1, 0, 1))
     bend = np.maximum(before - 2.0 * here + after, 1e-12)
     vertex = np.clip(0.5 * (before - after) / bend, -1.0, 1.0)
     lowest = here - 0.5 * bend * vertex**2
-    return np.where(lowest < _CLEARER * misfit[rows == 0][0], period * (rows[middle] + vertex), 0.0)
+    clear = (lowest < _CLEARER * misfit[rows == 0][0]) & (misfit.max(axis=0) > _TELLS * lowest)
+    return np.where(clear, period * (rows[middle] + vertex), 0.0)
+
+
+def _spacing(run: Run) -> float:
+    """Mean time between rows in s; stamps may come in bursts."""
+    return float(run.time[-1] - run.time[0]) / max(len(run.time) - 1, 1)

@@ -6,13 +6,17 @@ tuned parameter expresses.
 """
 
 import fnmatch
+import hashlib
+import json
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import isnan
 from pathlib import Path
+from typing import Any
 
 import jax
+import numpy as np
 from rich.progress import Progress
 from rich.table import Table
 
@@ -154,8 +158,58 @@ def check(args: Args) -> tuple[Kind, dict[str, Entry], dict[str, dict[str, float
     return robot, entries, other_cases(robot, entries, args.others), numbers
 
 
-def tested(args: Args, robot: Kind, entries, others, episodes: int, progress: Progress) -> SelfTest:
-    """Runs the self-test with sets of so many episodes."""
+@dataclass
+class Parts:
+    """Parts of a self-test in files, so that it goes on where it was stopped.
+
+    Attributes:
+      folder: of the files; made when the first part is kept.
+      seconds: that the parts took, in this call or an earlier one.
+      computed: how many were computed in this call.
+    """
+
+    folder: Path
+    seconds: float = 0.0
+    computed: int = 0
+
+    def keep(self, name: str, compute: Callable[[], dict]) -> dict:
+        """Computes a part, or reads it where it was computed before (`jaxtune.selftest.Keep`)."""
+        path = self.folder / f"{name}.json"
+        if not checkpoint.exists(path):
+            begin = time.monotonic()
+            part = compute()
+            self.folder.mkdir(parents=True, exist_ok=True)
+            checkpoint.write_json(path, {"seconds": time.monotonic() - begin, "part": part})
+            self.computed += 1
+        # Read again in any case, so that the numbers are those of a run that was interrupted.
+        found = checkpoint.read_json(path)
+        if not {"seconds", "part"} <= found.keys():
+            raise ValueError(f"{path}: is damaged: got {', '.join(found) or 'nothing'}, expected seconds and part")
+        self.seconds += found["seconds"]
+        return found["part"]
+
+
+def digest(robot: str, policy: Any, table: Mapping[str, Entry], others: Mapping[str, Mapping[str, float]]) -> str:
+    """Names what the parts of a self-test depend on beside its options: they may change behind the same names.
+
+    Args:
+      robot: as `Args.robot`; a file's content counts.
+      policy: arrays of the policy that walks.
+      table: of all parameters.
+      others: coordinates of the cases.
+    """
+    named = json.dumps(checkpoint.as_json([table, others]), default=lambda one: getattr(one, "__qualname__", str(one)))
+    found = hashlib.sha256(named.encode())
+    file = Path(robot.rpartition(":")[0])
+    if file.is_file():
+        found.update(file.read_bytes())
+    for leaf in jax.tree.leaves(policy):
+        found.update(np.asarray(leaf).tobytes())
+    return found.hexdigest()[:16]
+
+
+def tested(args: Args, robot: Kind, entries, others, episodes: int, progress: Progress) -> tuple[SelfTest, Parts]:
+    """Runs the self-test with sets of so many episodes, or what is left of it."""
     sizes = preset(args.preset)
     sizes = replace(sizes, tuner=replace(sizes.tuner, set_episodes=episodes))
     hidden = {name: robot.entries[name] for values in others.values() for name in values if name not in entries}
@@ -171,23 +225,14 @@ def tested(args: Args, robot: Kind, entries, others, episodes: int, progress: Pr
         name: {one: float(value) for one, value in parameters.to_coords(table, values).items()}
         for name, values in others.items()
     }
-    task, parts = progress.add_task(f"{episodes} episodes", total=None), args.out / "parts" / str(episodes)
-    parts.mkdir(parents=True, exist_ok=True)
-    computed = []
-
-    def keep(name: str, compute: Callable[[], dict]) -> dict:
-        path = parts / f"{name}.json"
-        if not checkpoint.exists(path):
-            checkpoint.write_json(path, compute())
-            computed.append(path)
-        # Read again in any case, so that the numbers are those of a run that was interrupted.
-        return checkpoint.read_json(path)
+    task = progress.add_task(f"{episodes} episodes", total=None)
+    parts = Parts(args.out / "parts" / digest(args.robot, policy.learner, table, coords) / str(episodes))
 
     def done(number: int, total: int) -> None:
         progress.update(task, total=total)
-        count(progress, task, number, kept=not computed)
+        count(progress, task, number, kept=not parts.computed)
 
-    return selftest.run(
+    report = selftest.run(
         jax.random.PRNGKey(args.seed),
         machine,
         state,
@@ -196,9 +241,10 @@ def tested(args: Args, robot: Kind, entries, others, episodes: int, progress: Pr
         whole=args.whole,
         tunings=args.tunings,
         others=coords,
-        keep=keep,
+        keep=parts.keep,
         done=done,
     )
+    return report, parts
 
 
 def show(reports: Mapping[int, SelfTest]) -> None:
@@ -254,17 +300,20 @@ def main(args: Args) -> None:
     identity = {name: value for name, value in vars(args).items() if name != "out"}
     # A policy that is trained first is kept in the folder, and is another one for other sizes.
     checkpoint.open_run(args.out, identity | {"sizes": preset(args.preset)})
-    begin = time.monotonic()
-    with checkpoint.lock(args.out / "selftest.json"), bars() as progress:
-        reports = {number: tested(args, robot, entries, others, number, progress) for number in numbers}
+    path = args.out / "selftest.json"
+    with checkpoint.lock(path), bars() as progress:
+        found = {number: tested(args, robot, entries, others, number, progress) for number in numbers}
+    reports = {number: report for number, (report, _) in found.items()}
     show(reports)
+    if path.exists() and not any(parts.computed for _, parts in found.values()):
+        return
     result = {
         "args": {name: value for name, value in vars(args).items() if name != "out"},
         "episodes": {str(number): report for number, report in reports.items()},
-        "seconds": time.monotonic() - begin,
+        "seconds": sum(parts.seconds for _, parts in found.values()),
         "versions": checkpoint.versions(),
     }
-    checkpoint.write_json(args.out / "selftest.json", result)
+    checkpoint.write_json(path, result)
     plots.power(args.out / "power.png", reports, 1.0 - args.level)
 
 

@@ -296,7 +296,9 @@ def _tuned(rows: Sequence[Mapping], names: Sequence[str]) -> Tuned:
         verdicts=dict(Counter(Verdict(row["verdict"]).name.lower() for row in rows)),
         held=Rate(sum(row["held"] for row in accepted), len(accepted)),
         covered=_told(np.array([row["covered"] for row in accepted], float)),
-        error=dict(zip(names, np.median([row["errors"] for row in rows], axis=0).tolist(), strict=True)),
+        error=dict(
+            zip(names, np.median(np.array([row["errors"] for row in rows], float), axis=0).tolist(), strict=True)
+        ),
     )
 
 

@@ -41,7 +41,7 @@ __all__ = [
 
 _LEAST_STALE = 0.02  # share of readings
 _RATES = 1.8  # largest ratio of two runs' rates: all segments have one number of rows. A servo's logs differed by 1.5
-_LATE_S = 0.001  # where velocity and position are further apart, one of them was filtered
+_LATE_S = 0.001  # where velocity and position are further apart, states would follow neither
 
 
 @dataclass(frozen=True)
@@ -289,7 +289,7 @@ def drop_filtered(log: Log) -> tuple[Log, tuple[str, ...]]:
     """Leaves out signals that were filtered, because their lag would be mistaken for a sensor's.
 
     A signal counts as filtered if the log says so. Velocities are left out too if those of a joint lag the derivative
-    of its position by more than 1 ms in the median run, or are as much ahead of it: states are estimated from signals
+    of its position by more than 1 ms, or are as much ahead of it: states are estimated from signals
     that agree. Positions stay: the delay of a filter that the log declares is taken out (`envs.readings`).
 
     Args:
@@ -301,9 +301,8 @@ def drop_filtered(log: Log) -> tuple[Log, tuple[str, ...]]:
     """
     log, notes = _drop_declared(log)
     # Sealed runs are left out here too: nothing may be decided by them.
-    late = [segments.lateness(run) for run in without_sealed(log).runs if "dq" in run.signals]
-    if late:
-        apart = np.median(late, axis=0)
+    if runs := [run for run in without_sealed(log).runs if "dq" in run.signals]:
+        apart = segments.lateness(runs)
         worst = int(np.abs(apart).argmax())
         if abs(apart[worst]) > _LATE_S:
             which = "lags" if apart[worst] > 0 else "is ahead of"

@@ -70,12 +70,10 @@ def conclude(settings: Settings, problem: Problem, floor: NoiseFloor, state: Sta
     """
     at = floor[problem.main_horizon]
     say("evidence")
-    # A model that was found in two forms, each with the name of the other's form, is one model.
-    alike = [renamed(problem, one) for one in state.candidates]
-    state = replace(state, candidates=(), best=renamed(problem, state.best)).with_candidates(alike)
+    state = _with_one_name(problem, at, state)
     best, terms, ablated, dropped = _proved(settings, problem, floor, state)
     candidates = sorted(
-        {one.key: one for one in (best, *state.candidates)}.values(), key=lambda one: total_cost(at, one, state.price)
+        {one.key: one for one in (*state.candidates, best)}.values(), key=lambda one: total_cost(at, one, state.price)
     )
     probabilities = posterior(problem, at, candidates, state.price)
     terms = tuple(
@@ -142,6 +140,13 @@ def _rivals(candidates: Sequence[Candidate], probabilities: np.ndarray) -> tuple
             belief[key] = belief.get(key, 0.0) + float(probabilities[index])
     best = sorted((key for key in models if belief[key] >= _BELIEVED), key=lambda key: -belief[key])
     return tuple((key, models[key]) for key in best[:2])
+
+
+def _with_one_name(problem: Problem, at: Floor, state: State) -> State:
+    """Makes one of models that were found in two forms, each with the name of the other's form: the cheapest."""
+    named = [renamed(problem, one) for one in state.candidates]
+    named.sort(key=lambda one: total_cost(at, one, state.price), reverse=True)
+    return replace(state, best=renamed(problem, state.best), candidates=tuple({one.key: one for one in named}.values()))
 
 
 def learn(settings: Settings, problem: Problem, at: Floor, best: Candidate) -> Candidate:

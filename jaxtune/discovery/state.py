@@ -148,8 +148,11 @@ def from_json(problem: Problem, floor: NoiseFloor, begun: State, saved: Mapping[
     """
     by_key = {hypothesis.key: hypothesis for hypothesis in (*problem.hypotheses, *problem.forms)}
     known = {"rows", "screened"} <= saved.keys()
-    # A library that has grown since has more axes.
-    if not known or {len(row) for row in saved["rows"]} - {problem.axes + _BESIDE}:
+    if known:
+        # The library may have grown since, or names may have changed.
+        known = {len(row) for row in saved["rows"]} == {problem.axes + _BESIDE}
+        known &= {key for one in saved["candidates"] for key in one["hypotheses"]} <= by_key.keys()
+    if not known:
         raise ValueError("the saved state is of another version: remove state.json to begin anew")
     at = floor[problem.main_horizon]
     rows = np.array(saved["rows"])

@@ -134,18 +134,35 @@ def test_late_and_early_velocities_are_found_joint_by_joint(late_s):
     pace = 2 * np.pi * np.array([1.0, 2.5])
     position = 0.3 * np.sin(pace * time[:, None])
     velocity = 0.3 * pace * np.cos(pace * (time[:, None] - late_s))
-    np.testing.assert_allclose(segments.lateness(run(time, q=position, dq=velocity)), late_s, atol=1.1e-3)
+    # Each joint moves in a run of its own, and rests in the other.
+    rests = run(time, q=np.zeros_like(position), dq=np.zeros_like(velocity))
+    alone = [run(time, q=position * mine, dq=velocity * mine) for mine in np.eye(2)]
+    for runs in ([run(time, q=position, dq=velocity)], alone, [rests, *alone, rests]):
+        np.testing.assert_allclose(segments.lateness(runs), late_s, atol=3e-4)
 
 
-@pytest.mark.parametrize("rate_hz", [50.0, 200.0, 500.0])
+@pytest.mark.parametrize("pace_hz", [0.0, 0.3])
+@pytest.mark.parametrize(("rate_hz", "quantum"), [(50.0, 0.0015), (200.0, 0.0015), (200.0, 1e-9), (500.0, 2e-4)])
 @pytest.mark.parametrize("seed", range(5))
-def test_noise_of_slow_motion_is_not_taken_for_a_lag(rate_hz, seed):
-    time, rng, pace = times(6.0, rate_hz), np.random.default_rng(seed), 2 * np.pi * 0.3
-    position = 0.2 * np.sin(pace * time[:, None] + [0.0, 1.0])
-    velocity = 0.2 * pace * np.cos(pace * time[:, None] + [0.0, 1.0])
-    position = np.round(position / 0.0015) * 0.0015
-    noisy = velocity + 0.02 * rng.standard_normal(velocity.shape)
-    assert (segments.lateness(run(time, q=position, dq=noisy)) == 0.0).all()
+def test_noise_of_joints_that_rest_or_move_slowly_is_not_taken_for_a_lag(pace_hz, rate_hz, quantum, seed):
+    time, rng, pace = times(3.0, rate_hz), np.random.default_rng(seed), 2 * np.pi * pace_hz
+    runs = []
+    for _ in range(2):
+        position = 0.2 * np.sin(pace * time[:, None] + [0.0, 1.0]) + 1e-4 * rng.standard_normal((len(time), 2))
+        velocity = 0.2 * pace * np.cos(pace * time[:, None] + [0.0, 1.0])
+        noisy = velocity + 0.02 * rng.standard_normal(velocity.shape)
+        runs.append(run(time, q=np.round(position / quantum) * quantum, dq=noisy))
+    assert (np.abs(segments.lateness(runs)) <= 1e-3).all()
+
+
+def test_stamps_in_bursts_and_short_runs_tell_nothing_rather_than_break():
+    time = times(4.0, 250.0)
+    pace = 2 * np.pi * np.array([1.0, 2.5])
+    position, velocity = 0.3 * np.sin(pace * time[:, None]), 0.3 * pace * np.cos(pace * (time[:, None] - 0.016))
+    bursts = 0.016 * (np.arange(len(time)) // 4) + 1e-4 * (np.arange(len(time)) % 4)
+    assert np.isfinite(segments.lateness([run(bursts, q=position, dq=velocity)])).all()
+    few = [run(time[:10], q=position[:10], dq=velocity[:10])]
+    assert (segments.lateness(few) == 0.0).all()
 
 
 def slow_bus(every=3, rate_hz=200.0):

@@ -1,6 +1,7 @@
 import re
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from rich.console import Console
 
@@ -124,3 +125,37 @@ def test_parameters_that_the_walk_does_not_show_are_named_with_what_helps():
     assert mass == "mass: 10 episodes show it in 80% and more"
     assert "friction: outside by one radius, it is noticed in less than 80% with 5, 10 episodes" in friction
     assert selftest.lacking({5: REPORT}) == []
+
+
+def test_parts_are_computed_once_and_a_damaged_one_is_named(tmp_path):
+    calls = []
+
+    def compute():
+        calls.append(1)
+        return {"rejected": np.array([[1.0, float("nan")]]), "identifiable": np.array([True])}
+
+    first, second = (selftest.Parts(tmp_path / "parts") for _ in range(2))
+    wanted = {"rejected": [[1.0, None]], "identifiable": [True]}
+    assert first.keep("gate_0", compute) == second.keep("gate_0", compute) == wanted
+    assert (len(calls), first.computed, second.computed) == (1, 1, 0)
+    assert first.seconds == second.seconds > 0.0
+    for text, message in (("{}", "is damaged: got nothing, expected seconds and part"), ("{", "is damaged")):
+        (tmp_path / "parts" / "gate_0.json").write_text(text)
+        with pytest.raises(ValueError, match=f"gate_0.json: {message}"):
+            second.keep("gate_0", compute)
+
+
+def test_parts_of_another_policy_table_case_or_robot_are_others(tmp_path):
+    file = tmp_path / "robot.py"
+    file.write_text("a = 1")
+    robot, policy, cases = f"{file}:robot", {"mean": np.zeros(3)}, {"weak": {"torque_scale": -0.1}}
+    same = selftest.digest(robot, policy, LEGS, cases)
+    assert same == selftest.digest(robot, {"mean": np.zeros(3)}, BITENO.chosen("legs6"), cases)
+    others = [
+        selftest.digest(robot, {"mean": np.ones(3)}, LEGS, cases),
+        selftest.digest(robot, policy, dict(reversed(LEGS.items())), cases),
+        selftest.digest(robot, policy, LEGS, {"weak": {"torque_scale": -0.2}}),
+    ]
+    file.write_text("a = 2")
+    others.append(selftest.digest(robot, policy, LEGS, cases))
+    assert len({same, *others}) == 5

@@ -278,7 +278,8 @@ def test_a_run_that_was_cut_goes_on_after_its_last_step():
         assert resumed.details == result.details
         assert resumed.not_testable == result.not_testable
     grown = saved[0] | {"rows": [[0.0, *row] for row in saved[0]["rows"]]}
-    for other in (grown, {name: value for name, value in saved[0].items() if name != "rows"}):
+    found = json.dumps(saved[0]).replace("coulomb@slider", "friction@slider")
+    for other in (grown, json.loads(found), {name: value for name, value in saved[0].items() if name != "rows"}):
         with pytest.raises(ValueError, match=r"another version: remove state.json"):
             workflow.discover(problem(truth), saved=other)
 
@@ -418,7 +419,6 @@ def test_the_larger_part_gives_the_name_where_two_effects_are_forms_of_each_othe
     assert [h.key for h in swapped.effects] == [push.key]
     # A further form would have no effect to be a form of.
     warped = replace(model([0.4, -0.8]), hypotheses=(coulomb, DIRECTION, WARPED))
-    assert renamed(asked, warped) is not swapped
     assert [h.key for h in renamed(asked, warped).hypotheses] == [coulomb.key, DIRECTION.key, WARPED.key]
     # A form that is no effect with the other one as its form changes no name.
     alone = replace(asked, forms=(DIRECTION,))
