@@ -133,4 +133,4 @@ def lateness(runs: Sequence[Run]) -> np.ndarray:
 
 def _spacing(run: Run) -> float:
     """Mean time between rows in s; stamps may come in bursts."""
-    return float(run.time[-1] - run.time[0]) / max(len(run.time) - 1, 1)
+    return max(float(run.time[-1] - run.time[0]) / max(len(run.time) - 1, 1), 1e-5)

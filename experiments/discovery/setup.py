@@ -289,8 +289,8 @@ def drop_filtered(log: Log) -> tuple[Log, tuple[str, ...]]:
     """Leaves out signals that were filtered, because their lag would be mistaken for a sensor's.
 
     A signal counts as filtered if the log says so. Velocities are left out too if those of a joint lag the derivative
-    of its position by more than 1 ms, or are as much ahead of it: states are estimated from signals
-    that agree. Positions stay: the delay of a filter that the log declares is taken out (`envs.readings`).
+    of its position by more than 1 ms, or are as much ahead of it: states are estimated from signals that agree.
+    Positions stay: the delay of a filter that the log declares is taken out (`envs.readings`).
 
     Args:
       log: as it was read.

@@ -161,8 +161,9 @@ def test_stamps_in_bursts_and_short_runs_tell_nothing_rather_than_break():
     position, velocity = 0.3 * np.sin(pace * time[:, None]), 0.3 * pace * np.cos(pace * (time[:, None] - 0.016))
     bursts = 0.016 * (np.arange(len(time)) // 4) + 1e-4 * (np.arange(len(time)) % 4)
     assert np.isfinite(segments.lateness([run(bursts, q=position, dq=velocity)])).all()
-    few = [run(time[:10], q=position[:10], dq=velocity[:10])]
-    assert (segments.lateness(few) == 0.0).all()
+    for count in (1, 2, 10):
+        few = [run(time[:count], q=position[:count], dq=velocity[:count])]
+        assert (segments.lateness(few) == 0.0).all()
 
 
 def slow_bus(every=3, rate_hz=200.0):
