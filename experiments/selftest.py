@@ -198,8 +198,7 @@ def digest(robot: str, policy: Any, table: Mapping[str, Entry], others: Mapping[
       table: of all parameters.
       others: coordinates of the cases.
     """
-    named = json.dumps(checkpoint.as_json([table, others]), default=lambda one: getattr(one, "__qualname__", str(one)))
-    found = hashlib.sha256(named.encode())
+    found = hashlib.sha256(json.dumps(checkpoint.as_json([table, others])).encode())
     file = Path(robot.rpartition(":")[0])
     if file.is_file():
         found.update(file.read_bytes())

@@ -82,6 +82,7 @@ def write(path: Path, log: Log, question: Question, result: Result, summary: dic
         terms=result.terms,
         failed=partial(_failed, summary),
         reasons=_reasons,
+        named=_named,
         free=free,
         pictures={name: plots.embedded(figure) for name, figure in pictures.items()},
     )
@@ -109,8 +110,7 @@ def show(console: Console, question: Question, summary: dict, free: dict) -> Non
             for name, value in effect["parameters"].items()
         )
         others = ", ".join(effect["confusable_with"]) or "-"
-        name = f"{effect['name']} ({effect['form'].replace('_', ' ')})" if effect["form"] else effect["name"]
-        table.add_row(name, escape(effect["place"]), values, others, escape(effect["experiment"]))
+        table.add_row(_named(effect), escape(effect["place"]), values, others, escape(effect["experiment"]))
     if table.row_count:
         console.print(table)
     for effect in summary["not_named"]:
@@ -126,8 +126,8 @@ def show(console: Console, question: Question, summary: dict, free: dict) -> Non
     if summary["effects"] or summary["not_named"]:
         say(f"explained: {summary['explained_share']:.0%} of what can be explained")
     for one in summary["dropped"]:
-        name = f"{one['name']} ({one['form'].replace('_', ' ')})" if one["form"] else one["name"]
-        say(f"taken out again: {name} at {place_in_words(question, one)}, since {_reasons(one['failed'])}")
+        why = _reasons(one["failed"])
+        say(f"taken out again: {_named(one)} at {place_in_words(question, one)}, since {why}")
     suspects = [
         f"{one['name']} at {place_in_words(question, one)} {one['probability']:.2f}"
         f"{' (taken out again)' if _failed(summary, one) else ''}"
@@ -164,6 +164,11 @@ def _failed(summary: dict, suspect: Mapping) -> list[str]:
     """The tests that a suspect failed when it was taken out of the model again; none where it was not."""
     same = [one for one in summary["dropped"] if not one["form"] and one["name"] == suspect["name"]]
     return next((one["failed"] for one in same if one["places"] == suspect["places"]), [])
+
+
+def _named(effect: Mapping) -> str:
+    """The name of an effect of the summary, with its form where it has another than the first."""
+    return f"{effect['name']} ({effect['form'].replace('_', ' ')})" if effect["form"] else effect["name"]
 
 
 def _reasons(failed: Sequence[str]) -> str:

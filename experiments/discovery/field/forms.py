@@ -82,6 +82,11 @@ class Forms(dict):
         return register
 
 
+def of_velocity(act: Callable) -> Callable:
+    """Makes an act of a sensor on velocities alone of one on positions and velocities, [2, lanes, joints]."""
+    return lambda read, now: np.stack([read[0], act(read, now)[1]])
+
+
 class Line:
     """A delay line whose delay may change from step to step, in whole steps.
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from experiments.discovery.field.forms import Forms, Line, Now, Setting
+from experiments.discovery.field.forms import Forms, Line, Now, Setting, of_velocity
 from experiments.discovery.field.links import Kinematics, loaded
 from experiments.discovery.field.robots import Robot
 
@@ -255,12 +255,7 @@ def _sensor_lag(setting: Setting):
 @FORMS.add("sensor", scalar=False)
 def _velocity_lag(setting: Setting):
     """The same of the velocity alone."""
-    averaged = _sensor_lag(setting)
-
-    def act(read: np.ndarray, now: Now) -> np.ndarray:
-        return np.stack([read[0], averaged(read, now)[1]])
-
-    return act
+    return of_velocity(_sensor_lag(setting))
 
 
 @FORMS.add("links", scalar=False)
