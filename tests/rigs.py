@@ -1,5 +1,7 @@
 """Robots on the rig, the motion that they are sent, and the same motion in MuJoCo C."""
 
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import jax
@@ -28,15 +30,32 @@ CONTROL_HZ = 200.0
 STEPS = 150
 
 
+@dataclass(frozen=True)
+class Program:
+    """A function of a rig. Those of rigs of equal layout are equal, so they are compiled once."""
+
+    rig: Rig = field(compare=False)
+    layout: Hashable
+    function: Callable
+
+    def __call__(self, system, *args):
+        return self.function(self.rig.on(system), *args)
+
+
+_run = jax.jit(lambda program, *args: program(*args), static_argnums=0)
+
+
 class Player:
-    """A rig whose motion is compiled once."""
+    """A rig whose motion is compiled once for all rigs of its layout."""
 
     def __init__(self, rig):
         self.rig = rig
-        self._simulate = jax.jit(
-            lambda vector, segment: self.rig.simulate(self.rig.values(self.rig.tree(vector)), segment)
-        )
-        self._model = jax.jit(lambda vector: self.rig.model(self.rig.values(self.rig.tree(vector))))
+        self._system = jax.device_put(rig.system)
+
+    def run(self, function, vector, *args):
+        """Calls a function of the rig, of an effect's values, and of what else it is given."""
+        values = self.rig.values(self.rig.tree(vector))
+        return _run(Program(self.rig, self.rig.layout, function), self._system, values, *args)
 
     def vector(self, **effects):
         """Coordinates [axes] of physical values: `effect={place: {parameter: value}}`."""
@@ -57,10 +76,10 @@ class Player:
         return self.read(self.vector(**effects), segment)
 
     def read(self, vector, segment):
-        return jax.tree.map(np.asarray, self._simulate(vector, segment))
+        return jax.tree.map(np.asarray, self.run(Rig.simulate, vector, segment))
 
     def model(self, **effects):
-        return self._model(self.vector(**effects))
+        return self.run(Rig.model, self.vector(**effects))
 
 
 def cells(places):

@@ -295,9 +295,8 @@ def of_two_bodies(effect, spec, at_motor):
     return model
 
 
-def read_and_true(rig, vector, segment):
-    """Positions that are read of a robot, which are those of its motors, and those of its joints, [steps, joints]."""
-    values = rig.values(rig.tree(vector))
+def read_and_true(rig, values, segment):
+    """Positions that are read of a robot, which are those of its motors, and those of its joints, [steps, 2 joints]."""
     model = rig.model(values)
     data, memory, future = rig._begin(model, values, segment)
 
@@ -307,7 +306,7 @@ def read_and_true(rig, vector, segment):
         data, memory, read = rig.chain.step(model, data, memory, values, x)
         return (data, memory), (read["q"], joint)
 
-    return jax.lax.scan(step, (data, memory), future)[1]
+    return jnp.hstack(jax.lax.scan(step, (data, memory), future)[1])
 
 
 @pytest.mark.parametrize(
@@ -325,11 +324,10 @@ def test_gears_between_a_rotor_and_a_link_are_those_of_two_bodies(rotor, rubs, r
     # light ones swing by 0.8 rad. For the lightest one the rig's controller acts continuously: once in a period it
     # would throw it about.
     arm = rigs.Player(Rig(with_rotor(rotor, **rubs), rigs.ARM_JOINTS, rate_hz))
-    play = jax.jit(lambda vector, segment: jnp.hstack(read_and_true(arm.rig, vector, segment)))
     for effect, at_motor in itertools.product(GEARS, (0.0, 0.5, 1.0) if rubs else (0.0,)):
         expected, segment = pushed(arm, of_two_bodies(effect, with_rotor(rotor, **rubs), at_motor), effect, period)
         right, wrong = (
-            np.abs(play(arm.vector(**{effect: {"elbow": gears}}), segment) - expected).max(axis=0)
+            np.abs(arm.run(read_and_true, arm.vector(**{effect: {"elbow": gears}}), segment) - expected).max(axis=0)
             for gears in (GEARS[effect] | {"at_motor": share} for share in (at_motor, 1.0 - at_motor))
         )
         assert right[:2].max() < most
@@ -340,12 +338,11 @@ def test_gears_between_a_rotor_and_a_link_are_those_of_two_bodies(rotor, rubs, r
 
 def test_bristles_of_a_link_behind_its_gears_rub_as_those_of_two_bodies():
     arm = rigs.Player(Rig(with_rotor(0.2, friction=1.0), rigs.ARM_JOINTS, 200.0))
-    play = jax.jit(lambda vector, segment: jnp.hstack(read_and_true(arm.rig, vector, segment)))
     for effect in GEARS:
         model = of_two_bodies(effect, with_rotor(0.2), 0.0)
         expected, segment = pushed(arm, model, effect, 5e-3, rub=bristles(1.0, 0.05))
         effects = {effect: {"elbow": GEARS[effect]}, "presliding": {"elbow": {"travel_rad": 0.05}}}
-        assert np.abs(play(arm.vector(**effects), segment) - expected).max() < 5e-3
+        assert np.abs(arm.run(read_and_true, arm.vector(**effects), segment) - expected).max() < 5e-3
 
 
 def bristles(bound, travel):

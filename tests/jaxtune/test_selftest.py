@@ -11,7 +11,7 @@ from experiments.common.checkpoint import as_json
 from jaxtune import selftest
 from jaxtune.gate import GateInfo
 from jaxtune.host import HostTuner
-from jaxtune.selftest import INSIDE, Rate
+from jaxtune.selftest import INSIDE, Rate, robots
 from jaxtune.tuner import Tuner, keep, knobs
 from jaxtune.types import Verdict
 
@@ -119,7 +119,7 @@ def test_whole_tunings_may_end_with_measured_states():
 def test_a_tuning_is_counted_by_its_verdict_box_and_intervals():
     row = {"verdict": Verdict.ACCEPT, "held": True, "covered": False, "errors": np.array([0.1, 0.3])}
     rows = [row, row | {"covered": True, "errors": np.array([0.2, 0.3])}, row | {"verdict": Verdict.UNEXPLAINED}]
-    one = selftest._tuned(rows, ("friction", "mass"))
+    one = robots._tuned(rows, ("friction", "mass"))
     assert one.verdicts == {"accept": 2, "unexplained": 1}
     assert (one.held, one.covered) == (Rate(2, 2), Rate(1, 2))
     assert one.error == {"friction": 0.1, "mass": 0.3}
@@ -128,12 +128,12 @@ def test_a_tuning_is_counted_by_its_verdict_box_and_intervals():
 def test_robots_without_intervals_are_not_counted_as_misses():
     errors, known = np.array([[0.1, 0.3], [0.1, 0.3], [0.1, 0.3]]), np.array([True, True])
     intervals = np.array([[0.2, 0.4], [0.2, 0.1], [0.2, np.nan]])
-    covers = selftest._covers(errors, intervals, known)
+    covers = robots._covers(errors, intervals, known)
     np.testing.assert_array_equal(covers, [1.0, 0.0, np.nan])
-    assert selftest._told(covers) == Rate(1, 2)
-    assert selftest._told(covers[None, :2]) == Rate(1, 2, ((1, 2),))
+    assert robots._told(covers) == Rate(1, 2)
+    assert robots._told(covers[None, :2]) == Rate(1, 2, ((1, 2),))
     # A coordinate that is not identifiable needs none.
-    assert selftest._covers(errors[2], intervals[2], np.array([True, False])) == 1.0
+    assert robots._covers(errors[2], intervals[2], np.array([True, False])) == 1.0
 
 
 def test_sets_that_tell_nothing_are_counted_apart():
@@ -164,10 +164,10 @@ def test_gates_that_differ_count_for_fewer_robots():
 
 
 def test_a_bound_that_leaves_no_room_outside_is_left_out():
-    cases = selftest._outside(toys.uniform({"friction": 0.1, "mass": 0.0}, 0.2, 0.45))
+    cases = robots._outside(toys.uniform({"friction": 0.1, "mass": 0.0}, 0.2, 0.45))
     np.testing.assert_allclose(cases["mass"]["mass"], [-0.4, 0.4], rtol=1e-6)
     np.testing.assert_allclose(cases["friction"]["friction"], [-0.3], rtol=1e-6)
-    assert selftest._outside(toys.uniform({"mass": 0.0}, 0.2, 0.3)) == {}
+    assert robots._outside(toys.uniform({"mass": 0.0}, 0.2, 0.3)) == {}
 
 
 @pytest.mark.parametrize(("robots", "gates", "tunings"), [(1, 1, 1), (2, 0, 1), (2, 1, 0)])
