@@ -16,6 +16,7 @@ from jaxtune.tuner import Tuner, keep, knobs
 from jaxtune.types import Verdict
 
 THREE = {"colour": 0.0, "friction": 0.0, "mass": 0.0}  # colour enters no equation of the slider
+ROBOTS = 12  # of every case: as many cases of as many robots share a program
 CONFIG = dataclasses.replace(toys.TUNER, episodes=256, dvm=dataclasses.replace(toys.DVM, train_steps=60))
 
 
@@ -34,7 +35,7 @@ def counted(parts, **options):
         return json.loads(parts[name])
 
     others = {"push": {"wind": 0.6}, "heavy": {"mass": 0.9}}
-    sizes = {"robots": 12, "gates": 2, "whole": 1, "tunings": 2}
+    sizes = {"robots": ROBOTS, "gates": 2, "whole": 1, "tunings": 2}
     return selftest.run(jax.random.key(0), tuner, state, **sizes, others=others, keep=keep, **options)
 
 
@@ -146,12 +147,13 @@ def test_sets_that_tell_nothing_are_counted_apart():
         return episodes.replace(alive=episodes.alive & ~falls)
 
     tuner = dataclasses.replace(tuner, simulate=simulate)
-    found = selftest.run(jax.random.key(0), tuner, state, robots=3, others={"falls": {"mass": 0.9}})
-    assert found.unusable == {"falls": 3}
+    others = {"push": {"wind": 0.6}, "falls": {"mass": 0.9}}
+    found = selftest.run(jax.random.key(0), tuner, state, robots=ROBOTS, others=others)
+    assert found.unusable == {"falls": ROBOTS}
     assert found.others["falls"].of == 0
     assert np.isnan(found.others["falls"].share)
-    assert found.alarms.of == 3
-    assert "falls: 3 sets are too short or not finite" in selftest.summary(found)
+    assert found.alarms.of == found.others["push"].of == ROBOTS
+    assert f"falls: {ROBOTS} sets are too short or not finite" in selftest.summary(found)
 
 
 def test_gates_that_differ_count_for_fewer_robots():
