@@ -221,9 +221,11 @@ def _of_run(run: Run, states: np.ndarray, start: np.ndarray, rows: np.ndarray, a
     before, ahead = round(HISTORY_S / dt), round(LONGEST_S / dt)
     begin = run.time[start][:, None]
     grid = begin + dt * np.arange(-before, after)
-    # A row's values act from its time stamp until the next.
-    last = _last_row(run, grid)
-    target, between = _between_rows(run, run.signals.get("target"), grid)
+    # A row's values act from its time stamp until the next, that is from the step nearest to it: stamps jitter, and one
+    # that is a little late would miss a tick of the controller.
+    acting = grid + 0.5 * dt
+    last = _last_row(run, acting)
+    target, between = _between_rows(run, run.signals.get("target"), grid, last)
     controller = run.impedance()
     held = {
         "stiffness": controller.stiffness,
@@ -232,7 +234,7 @@ def _of_run(run: Run, states: np.ndarray, start: np.ndarray, rows: np.ndarray, a
         "emf": controller.back_emf,
     }
     # Where the controller's ticks lie between rows is unknown; they are counted from the run's first row.
-    ticks = np.floor((grid + _SAME_S - run.time[0]) * run.controller.rate_hz)
+    ticks = np.floor((acting + _SAME_S - run.time[0]) * run.controller.rate_hz)
     at = (run.time[rows] - begin) / dt
     step = np.minimum(np.floor(at + _SAME_S / dt).astype(np.int32), after - 1)
     position, velocity = np.moveaxis(states, 1, 0)
@@ -248,12 +250,12 @@ def _of_run(run: Run, states: np.ndarray, start: np.ndarray, rows: np.ndarray, a
     return Segment(
         target=target,
         between=between,
-        feed=_between_rows(run, run.sent_torque(), grid)[0],
+        feed=_between_rows(run, run.sent_torque(), grid, last)[0],
         **{name: values.astype(np.float32)[last] for name, values in held.items()},
         sample=np.diff(ticks, axis=1, prepend=-np.inf) > 0,
         measured=np.stack(between_rows, axis=2).astype(np.float32),
         past=hermite(run.time, position, velocity, past)[0].astype(np.float32),
-        past_target=_between_rows(run, run.signals.get("target"), past_target)[0],
+        past_target=_between_rows(run, run.signals.get("target"), past_target, _last_row(run, past_target))[0],
         row_step=step,
         row_share=np.clip(at - step, 0.0, 1.0).astype(np.float32),
     )
@@ -264,19 +266,21 @@ def _last_row(run: Run, times: np.ndarray) -> np.ndarray:
     return np.clip(np.searchsorted(run.time, times + _SAME_S, side="right") - 1, 0, len(run.time) - 1)
 
 
-def _between_rows(run: Run, sent: np.ndarray | None, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _between_rows(
+    run: Run, sent: np.ndarray | None, times: np.ndarray, last: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Returns what was sent to the joints at other times, and how far a linear one is from it where that is unknown.
 
     Args:
       run: the run.
       sent: [rows, joints], targets or torques; zeros where None.
       times: s, of any shape.
+      last: the row whose values act at each of them.
 
     Returns:
       [*times.shape, joints] each.
     """
     sent = np.zeros(run.signals["q"].shape) if sent is None else sent
-    last = _last_row(run, times)
     following = np.minimum(last + 1, len(run.time) - 1)
     share = (times - run.time[last]) / np.maximum(run.time[following] - run.time[last], 1e-9)
     further = np.clip(share, 0.0, 1.0)[..., None] * (sent[following] - sent[last])

@@ -18,6 +18,7 @@ from jaxtune.discovery.result import Settings, Suspect
 
 _ABLATION_ROUNDS = 3
 _FAR = 1e9  # sum of squares
+_SEGMENTS = 8  # of a run that may speak alone
 
 Measure = Callable[[np.ndarray], np.ndarray]
 """Mean squares [components] from those of all segments, [segments, components]."""
@@ -66,9 +67,9 @@ class Evidence:
     confirmed: float
     """Fall of the cost on `select` alone, where nothing was fitted, prior included."""
     floors: float
-    """Root of the largest fall of a single component's mean square, in floor units, on `train` and `select` together:
-    the few motions that show an effect, such as hard steps, may all be in one of them. It is that of all segments but
-    a few (`Counts.usual`) or of typical ones (`Counts.variances`), where it is the larger share of what is left."""
+    """Root of the largest fall of a single component's mean square, in floor units. It is that of all segments of
+    `train` and `select` but a few (`Counts.usual`), of typical ones (`Counts.variances`), or of a run, since few motions
+    may show an effect: where it is largest against what it has to reach."""
     left: float
     """Rms of the same component with the effect, in floor units, of the same segments. What is left at other joints
     says nothing about an effect."""
@@ -140,8 +141,13 @@ def posterior(problem: Problem, at: Floor, candidates: Sequence[Candidate], pric
 
 def units_of(problem: Problem, at: Floor, of_segments: np.ndarray) -> np.ndarray:
     """Groups the segments of `train` and `select` into units that are drawn together, [segments]."""
-    train, select = (problem.data[split][at.horizon].run for split in ("train", "select"))
-    return units(np.concatenate([train, select]), of_segments, len(np.unique(select)))
+    select = problem.data["select"][at.horizon].run
+    return units(_runs(problem, at), of_segments, len(np.unique(select)))
+
+
+def _runs(problem: Problem, at: Floor) -> np.ndarray:
+    """The run of every segment of `train` and `select`, [segments]."""
+    return np.concatenate([problem.data[split][at.horizon].run for split in ("train", "select")])
 
 
 def weigh_evidence(
@@ -176,8 +182,9 @@ def weigh_evidence(
     clearest = int(distance.argmax())
     relief = ablated.fit.penalty - candidate.fit.penalty
     mean_squares = [finite(one) / at.counts.bins for one in (before, now)]
-    falls = (_largest_fall(*(measure(one) for one in mean_squares)) for measure in measures(at))
-    floors, left = max(falls, key=lambda pair: pair[0] / pair[1])
+    falls = [_largest_fall(*(measure(one) for one in mean_squares)) for measure in measures(at)]
+    falls += _falls_of_runs(*mean_squares, _runs(problem, at))
+    floors, left = max(falls, key=lambda pair: pair[0] / max(Thresholds.floors, Thresholds.of_left * pair[1]))
     evidence = Evidence(
         gain=total_cost(at, ablated, 0.0) - total_cost(at, candidate, 0.0),
         confirmed=_cost(at, before[held_out:]) - _cost(at, now[held_out:]) + relief,
@@ -316,6 +323,17 @@ def _largest_fall(before: np.ndarray, now: np.ndarray) -> tuple[float, float]:
     """Of mean squares [components]: the root of the largest fall, and the root of what is left there."""
     where = int((before - now).argmax())
     return float(np.sqrt(max(before[where] - now[where], 0.0))), float(np.sqrt(now[where]))
+
+
+def _falls_of_runs(before: np.ndarray, now: np.ndarray, run: np.ndarray) -> list[tuple[float, float]]:
+    """The same in every run with enough segments, without the two in which most falls: one or two are no evidence."""
+    found = []
+    for number in np.unique(run):
+        here = [one[run == number] for one in (before, now)]
+        if len(here[0]) >= _SEGMENTS:
+            kept = np.argsort(here[0] - here[1], axis=0)[:-2]
+            found.append(_largest_fall(*(np.take_along_axis(one, kept, axis=0).mean(axis=0) for one in here)))
+    return found
 
 
 def finite(of_segments: np.ndarray) -> np.ndarray:
