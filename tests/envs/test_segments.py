@@ -503,15 +503,27 @@ def test_velocities_between_rows_are_as_good_as_those_at_rows():
     assert by_phase.max() < 1.1 * by_phase[0]
 
 
-def test_rounded_time_stamps_move_no_tick_and_no_target():
+# As seconds since 1970 are, and as of a logger that is late by less than half a step of the simulation.
+@pytest.mark.parametrize(
+    "stamped",
+    [
+        lambda time: (1.7e9 + time) - 1.7e9,
+        lambda time: time + 2e-4 * np.random.default_rng(9).uniform(-1, 1, len(time)),
+    ],
+    ids=["rounded", "jittering"],
+)
+def test_inexact_time_stamps_move_no_tick_and_no_target(stamped):
     time = times(2.0)
     motion = {"q": parabola(time)[0], "target": np.random.default_rng(6).normal(size=(len(time), 2))}
-    exact = segments.cut([run(time, **motion)], 0.2, DT).segments
-    # As seconds since 1970 are.
-    rounded = segments.cut([run((1.7e9 + time) - 1.7e9, **motion)], 0.2, DT).segments
-    assert exact.target.shape == rounded.target.shape
-    np.testing.assert_array_equal(rounded.sample, exact.sample)
-    np.testing.assert_array_equal(rounded.target, exact.target)
+    cut = segments.cut([run(stamped(time), **motion)], 0.2, DT)
+    after = np.arange(cut.segments.target.shape[1]) - BEFORE
+    np.testing.assert_array_equal(
+        cut.segments.sample[:, 1:], np.broadcast_to(after % 5 == 0, cut.segments.sample.shape)[:, 1:]
+    )
+    acting = cut.row[:, :1] - 1 + after // 5
+    np.testing.assert_array_equal(
+        cut.segments.target, motion["target"][np.clip(acting, 0, len(time) - 1)].astype(np.float32)
+    )
 
 
 def test_torque_that_was_sent_drives_nothing_while_motors_are_off():

@@ -138,6 +138,23 @@ def test_an_effect_that_shows_in_few_motions_matters(stepped):
     assert evidence.floors < 0.5
 
 
+def test_an_effect_that_shows_in_one_run_matters(stepped):
+    asked, floor, found = stepped
+    (coulomb,) = found.best.hypotheses
+    at = floor[asked.main_horizon]
+    run = asked.data["train"][at.horizon].run
+    rare = np.flatnonzero(run == run[0])[:4]
+
+    def evidence(segments):
+        far = off(at, found.best, 0, segments, size=6.0)
+        far = replace(found.best, hypotheses=(), fit=replace(found.best.fit, residual=far.fit.residual))
+        return weigh_evidence(asked, floor, found.best, coulomb, {"null": far})[0]
+
+    # Of all segments but a few the fall is one floor unit.
+    assert evidence(rare).floors > 2.0
+    assert evidence(rare[:2]).floors < 0.5
+
+
 def test_what_is_left_counts_where_the_effect_helps(stepped):
     asked, floor, found = stepped
     (coulomb,) = found.best.hypotheses
