@@ -173,5 +173,13 @@ def test_names_with_brackets_are_printed_as_they_are(asked):
     assert said.count("[red]shoulder") == 2
 
 
+def test_a_model_that_lacks_nothing_and_is_far_off_somewhere_is_doubted():
+    where = {"joint": "elbow", "signal": "q", "regime": "fast", "excess_floor_units": 7.4}
+    summary = {"verdict": "no_missing_effect", "where": [where]}
+    assert "q of elbow is 7.4 floor units above it" in report._doubt(summary)
+    for change in ({"verdict": "unnamed"}, {"where": []}, {"where": [where | {"excess_floor_units": 2.0}]}):
+        assert report._doubt(summary | change) == ""
+
+
 def test_every_test_that_an_effect_may_fail_has_words():
     assert set(report.FAILED) == set(passes(EVIDENCE, Thresholds(10.0)))
