@@ -123,7 +123,7 @@ def show(console: Console, question: Question, summary: dict, free: dict) -> Non
     table = Table("error on held-out runs", "nominal model", "parameters fitted", "corrected model")
     gap, error = summary["gap"], free["error_rad"]["sealed"]
     table.add_row("short segments, floor units", *(f"{gap[name]:.2f}" for name in ("before", "null", "after")))
-    table.add_row("whole runs, mean in rad (slides: m)", *(f"{error[name]:.4f}" for name in ("before", "null", "after")))
+    table.add_row("whole runs, mean in rad or m", *(f"{error[name]:.4f}" for name in ("before", "null", "after")))
     console.print(table)
     if summary["effects"] or summary["not_named"]:
         say(f"explained: {summary['explained_share']:.0%} of what can be explained")

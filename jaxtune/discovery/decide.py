@@ -68,8 +68,8 @@ class Evidence:
     """Fall of the cost on `select` alone, where nothing was fitted, prior included."""
     floors: float
     """Root of the largest fall of a single component's mean square, in floor units. It is that of all segments of
-    `train` and `select` but a few (`Counts.usual`), of typical ones (`Counts.variances`), or of a run, since few motions
-    may show an effect: where it is largest against what it has to reach."""
+    `train` and `select` but a few (`Counts.usual`), of typical ones (`Counts.variances`), or of a run, since few
+    motions may show an effect: where it is largest against what it has to reach."""
     left: float
     """Rms of the same component with the effect, in floor units, of the same segments. What is left at other joints
     says nothing about an effect."""
