@@ -36,6 +36,7 @@ COMPARED = ("q", "dq", "tau", "abs_tau", "gravity")
 HISTORY_S = LONGEST_S + 0.02
 """Length of the history before a segment, in s: the longest delay and some time for lags to settle."""
 
+_WHOLE = 0.01  # how far rows may be from a whole number of ticks, as a share
 _SAME_S = 2e-6  # times that differ by less are the same: time stamps are rounded, those of a wall clock to 0.2 us
 _PAST_S = 2.0  # how far back before the history positions and targets are kept
 
@@ -220,12 +221,11 @@ def _of_run(run: Run, states: np.ndarray, start: np.ndarray, rows: np.ndarray, a
     """Makes the segments of one run, of `after` steps each (`_segments`)."""
     before, ahead = round(HISTORY_S / dt), round(LONGEST_S / dt)
     begin = run.time[start][:, None]
-    grid = begin + dt * np.arange(-before, after)
-    # A row's values act from its time stamp until the next, that is from the step nearest to it: stamps jitter, and one
-    # that is a little late would miss a tick of the controller.
-    acting = grid + 0.5 * dt
-    last = _last_row(run, acting)
-    target, between = _between_rows(run, run.signals.get("target"), grid, last)
+    clock = _clock(run, dt)
+    told = clock.rows[start][:, None] + dt * np.arange(-before, after)
+    # A row's values act from its time until the next.
+    last = clock.last_row(told)
+    target, between = _between_rows(run, run.signals.get("target"), clock, told)
     controller = run.impedance()
     held = {
         "stiffness": controller.stiffness,
@@ -234,7 +234,7 @@ def _of_run(run: Run, states: np.ndarray, start: np.ndarray, rows: np.ndarray, a
         "emf": controller.back_emf,
     }
     # Where the controller's ticks lie between rows is unknown; they are counted from the run's first row.
-    ticks = np.floor((acting + _SAME_S - run.time[0]) * run.controller.rate_hz)
+    ticks = np.floor((told + clock.same_s - clock.rows[0]) * clock.rate_hz)
     at = (run.time[rows] - begin) / dt
     step = np.minimum(np.floor(at + _SAME_S / dt).astype(np.int32), after - 1)
     position, velocity = np.moveaxis(states, 1, 0)
@@ -244,45 +244,82 @@ def _of_run(run: Run, states: np.ndarray, start: np.ndarray, rows: np.ndarray, a
     acceleration = np.gradient(velocity, run.time, axis=0)
     between_rows = [hermite(run.time, *pair, fine)[0] for pair in ((position, velocity), (velocity, acceleration))]
     past, past_target = (
-        begin - HISTORY_S + step_s * np.arange(-round(_PAST_S / step_s), 1)
-        for step_s in (PAST_STEP_S, PAST_TARGET_STEP_S)
+        first[start][:, None] - HISTORY_S + step_s * np.arange(-round(_PAST_S / step_s), 1)
+        for first, step_s in ((run.time, PAST_STEP_S), (clock.rows, PAST_TARGET_STEP_S))
     )
     return Segment(
         target=target,
         between=between,
-        feed=_between_rows(run, run.sent_torque(), grid, last)[0],
+        feed=_between_rows(run, run.sent_torque(), clock, told)[0],
         **{name: values.astype(np.float32)[last] for name, values in held.items()},
         sample=np.diff(ticks, axis=1, prepend=-np.inf) > 0,
         measured=np.stack(between_rows, axis=2).astype(np.float32),
         past=hermite(run.time, position, velocity, past)[0].astype(np.float32),
-        past_target=_between_rows(run, run.signals.get("target"), past_target, _last_row(run, past_target))[0],
+        past_target=_between_rows(run, run.signals.get("target"), clock, past_target)[0],
         row_step=step,
         row_share=np.clip(at - step, 0.0, 1.0).astype(np.float32),
     )
 
 
-def _last_row(run: Run, times: np.ndarray) -> np.ndarray:
-    """The last row at or before each time."""
-    return np.clip(np.searchsorted(run.time, times + _SAME_S, side="right") - 1, 0, len(run.time) - 1)
+@dataclass(frozen=True)
+class _Clock:
+    """When a controller has what the rows of a run say.
+
+    Attributes:
+      rows: [rows] s.
+      rate_hz: of its ticks, the first of which is at the first row.
+      same_s: times that differ by less are the same.
+    """
+
+    rows: np.ndarray
+    rate_hz: float
+    same_s: float
+
+    def last_row(self, times: np.ndarray) -> np.ndarray:
+        """The last row at or before each time."""
+        return np.clip(np.searchsorted(self.rows, times + self.same_s, side="right") - 1, 0, len(self.rows) - 1)
 
 
-def _between_rows(
-    run: Run, sent: np.ndarray | None, times: np.ndarray, last: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _clock(run: Run, dt: float) -> _Clock:
+    """Reads the controller's clock off time stamps.
+
+    Rows that are a whole number of ticks apart go with the ticks, and only their stamps jitter. These are put on a line
+    then, since a row that seems a little late would miss its tick. Rows that are not, or are off the line by half a
+    tick and more, have what their stamps say.
+
+    Args:
+      run: the run.
+      dt: step of the simulation in s; ticks are whole steps apart.
+    """
+    rate_hz, gaps = run.controller.rate_hz, np.diff(run.time)
+    period = np.median(gaps)
+    ticks = round(period * rate_hz)
+    if ticks >= 1 and abs(period * rate_hz / ticks - 1.0) < _WHOLE:
+        count = np.concatenate([[0.0], np.cumsum(np.round(gaps / period))])
+        row_s, first = np.polyfit(count, run.time, 1)
+        even = first + row_s * count
+        if np.abs(run.time - even).max() < 0.5 / rate_hz:
+            # The line's slope is not exact either.
+            return _Clock(even, ticks / row_s, 0.25 * dt)
+    return _Clock(run.time, rate_hz, _SAME_S)
+
+
+def _between_rows(run: Run, sent: np.ndarray | None, clock: _Clock, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Returns what was sent to the joints at other times, and how far a linear one is from it where that is unknown.
 
     Args:
       run: the run.
       sent: [rows, joints], targets or torques; zeros where None.
+      clock: of the controller.
       times: s, of any shape.
-      last: the row whose values act at each of them.
 
     Returns:
       [*times.shape, joints] each.
     """
     sent = np.zeros(run.signals["q"].shape) if sent is None else sent
-    following = np.minimum(last + 1, len(run.time) - 1)
-    share = (times - run.time[last]) / np.maximum(run.time[following] - run.time[last], 1e-9)
+    last = clock.last_row(times)
+    following = np.minimum(last + 1, len(clock.rows) - 1)
+    share = (times - clock.rows[last]) / np.maximum(clock.rows[following] - clock.rows[last], 1e-9)
     further = np.clip(share, 0.0, 1.0)[..., None] * (sent[following] - sent[last])
     held, none = sent[last], np.zeros_like(further)
     by_rows = {"hold": (held, none), "linear": (held + further, none), "unknown": (held, further)}

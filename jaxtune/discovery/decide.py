@@ -183,7 +183,7 @@ def weigh_evidence(
     relief = ablated.fit.penalty - candidate.fit.penalty
     mean_squares = [finite(one) / at.counts.bins for one in (before, now)]
     falls = [_largest_fall(*(measure(one) for one in mean_squares)) for measure in measures(at)]
-    falls += _falls_of_runs(*mean_squares, _runs(problem, at))
+    falls += _falls_of_runs(*mean_squares, _runs(problem, at), at.counts.usual(mean_squares[1]))
     floors, left = max(falls, key=lambda pair: pair[0] / max(Thresholds.floors, Thresholds.of_left * pair[1]))
     evidence = Evidence(
         gain=total_cost(at, ablated, 0.0) - total_cost(at, candidate, 0.0),
@@ -325,14 +325,20 @@ def _largest_fall(before: np.ndarray, now: np.ndarray) -> tuple[float, float]:
     return float(np.sqrt(max(before[where] - now[where], 0.0))), float(np.sqrt(now[where]))
 
 
-def _falls_of_runs(before: np.ndarray, now: np.ndarray, run: np.ndarray) -> list[tuple[float, float]]:
-    """The same in every run with enough segments, without the two in which most falls: one or two are no evidence."""
+def _falls_of_runs(before: np.ndarray, now: np.ndarray, run: np.ndarray, left: np.ndarray) -> list[tuple[float, float]]:
+    """The same of every run with enough segments, without the two in which most falls: one or two are no evidence.
+
+    What is left is no less than `left` [components], of all segments: a quiet run does not excuse the others.
+    """
     found = []
     for number in np.unique(run):
-        here = [one[run == number] for one in (before, now)]
-        if len(here[0]) >= _SEGMENTS:
-            kept = np.argsort(here[0] - here[1], axis=0)[:-2]
-            found.append(_largest_fall(*(np.take_along_axis(one, kept, axis=0).mean(axis=0) for one in here)))
+        here = run == number
+        if here.sum() >= _SEGMENTS:
+            kept = np.argsort(before[here] - now[here], axis=0)[:-2]
+            was, remains = (np.take_along_axis(one[here], kept, axis=0).mean(axis=0) for one in (before, now))
+            where = int((was - remains).argmax())
+            fall = max(was[where] - remains[where], 0.0)
+            found.append((float(np.sqrt(fall)), float(np.sqrt(max(remains[where], left[where])))))
     return found
 
 

@@ -503,27 +503,59 @@ def test_velocities_between_rows_are_as_good_as_those_at_rows():
     assert by_phase.max() < 1.1 * by_phase[0]
 
 
-# As seconds since 1970 are, and as of a logger that is late by less than half a step of the simulation.
+def late(time, most, seed=9):
+    """Stamps of a logger that is early or late by at most so much, in s."""
+    return time + most * np.random.default_rng(seed).uniform(-1.0, 1.0, len(time))
+
+
+# As seconds since 1970 are, and as of a logger that takes its time.
 @pytest.mark.parametrize(
-    "stamped",
-    [
-        lambda time: (1.7e9 + time) - 1.7e9,
-        lambda time: time + 2e-4 * np.random.default_rng(9).uniform(-1, 1, len(time)),
-    ],
-    ids=["rounded", "jittering"],
+    "stamped", [lambda time: (1.7e9 + time) - 1.7e9, lambda time: late(time, 1e-3)], ids=["rounded", "jittering"]
 )
 def test_inexact_time_stamps_move_no_tick_and_no_target(stamped):
     time = times(2.0)
     motion = {"q": parabola(time)[0], "target": np.random.default_rng(6).normal(size=(len(time), 2))}
     cut = segments.cut([run(stamped(time), **motion)], 0.2, DT)
     after = np.arange(cut.segments.target.shape[1]) - BEFORE
-    np.testing.assert_array_equal(
-        cut.segments.sample[:, 1:], np.broadcast_to(after % 5 == 0, cut.segments.sample.shape)[:, 1:]
-    )
-    acting = cut.row[:, :1] - 1 + after // 5
-    np.testing.assert_array_equal(
-        cut.segments.target, motion["target"][np.clip(acting, 0, len(time) - 1)].astype(np.float32)
-    )
+    ticks = np.broadcast_to(after % 5 == 0, cut.segments.sample.shape)
+    np.testing.assert_array_equal(cut.segments.sample[:, 1:], ticks[:, 1:])
+    acting = np.clip(cut.row[:, :1] - 1 + after // 5, 0, len(time) - 1)
+    np.testing.assert_array_equal(cut.segments.target, motion["target"][acting].astype(np.float32))
+
+
+@pytest.mark.parametrize(
+    ("rows_hz", "control_hz", "dt"), [(2000.0, 1000.0, 1e-3), (400.0, 500.0, 1e-3), (200.0, 60.0, 1e-3)]
+)
+def test_no_tick_has_a_target_that_comes_later(rows_hz, control_hz, dt):
+    time = times(2.0, rows_hz)
+    mine = run(time, target=np.arange(len(time))[:, None] * np.ones(2))
+    mine = replace(mine, controller=replace(mine.controller, rate_hz=control_hz, between_rows="hold"))
+    cut = segments.cut([mine], 0.2, dt)
+    steps = time[cut.row[:, :1] - 1] + dt * (np.arange(cut.segments.target.shape[1]) - BEFORE)
+    newest = np.clip(np.floor(steps * rows_hz + 1e-3), 0, len(time) - 1)
+    np.testing.assert_array_equal(cut.segments.target[..., 0], newest)
+
+
+@pytest.mark.parametrize("rows_hz", [200.0, 130.0])
+def test_targets_in_lines_are_where_they_were_sent(rows_hz):
+    time = times(2.0, rows_hz)
+    mine = run(late(time, 3e-4), target=time[:, None] * np.ones(2))
+    mine = replace(mine, controller=replace(mine.controller, between_rows="linear"))
+    cut = segments.cut([mine], 0.2, DT)
+    steps = time[cut.row[:, :1] - 1] + DT * (np.arange(cut.segments.target.shape[1]) - BEFORE)
+    inside = steps < time[-1] - 0.01
+    # Where rows do not go with the ticks, stamps are believed.
+    most = 1e-5 if rows_hz == 200.0 else 7e-4
+    assert np.abs(cut.segments.target[..., 0] - steps)[inside].max() < most
+
+
+def test_stamps_off_an_even_clock_are_believed():
+    # A logger's clock that goes wrong by a tick, and right again.
+    time = times(2.0)
+    moved = time + 0.005 * np.sin(np.pi * time)
+    clock = segments._clock(run(moved), DT)
+    np.testing.assert_array_equal(clock.rows, moved)
+    assert clock.rate_hz == 200.0
 
 
 def test_torque_that_was_sent_drives_nothing_while_motors_are_off():

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import mujoco
 import numpy as np
@@ -14,7 +15,7 @@ from experiments.discovery.blind_cases import ARM
 from experiments.discovery.blind_robots import Truth, record
 from experiments.discovery.excitation import excitation
 from experiments.discovery.setup import build_question
-from experiments.discovery.summary import details, free_runs, summarise
+from experiments.discovery.summary import _far_off, details, free_runs, summarise
 from jaxtune.discovery.decide import Evidence, Thresholds, passes
 from jaxtune.discovery.fit import Fit, Free
 from jaxtune.discovery.result import AcceptedTerm, DroppedTerm, Result, Suspect
@@ -174,11 +175,15 @@ def test_names_with_brackets_are_printed_as_they_are(asked):
 
 
 def test_a_model_that_lacks_nothing_and_is_far_off_somewhere_is_doubted():
-    where = {"joint": "elbow", "signal": "q", "regime": "fast", "excess_floor_units": 7.4}
-    summary = {"verdict": "no_missing_effect", "where": [where]}
-    assert "q of elbow is 7.4 floor units above it" in report._doubt(summary)
-    for change in ({"verdict": "unnamed"}, {"where": []}, {"where": [where | {"excess_floor_units": 2.0}]}):
-        assert report._doubt(summary | change) == ""
+    # Few segments show it, so its interval reaches zero.
+    cell = {"joint": "elbow", "signal": "q", "regime": "fast", "excess_floor_units": 7.4, "low": 0.0}
+    result = SimpleNamespace(verdict="no_missing_effect", where=[cell])
+    assert _far_off(result) == {"joint": "elbow", "regime": "fast", "excess_floor_units": 7.4}
+    assert "elbow is 7.4 floor units above it" in report._doubt({"far_off": _far_off(result)})
+    for where in ([], [cell | {"excess_floor_units": 2.0}], [cell | {"signal": "dq"}]):
+        assert _far_off(SimpleNamespace(verdict="no_missing_effect", where=where)) is None
+    assert _far_off(SimpleNamespace(verdict="unnamed", where=[cell])) is None
+    assert report._doubt({"far_off": None}) == ""
 
 
 def test_every_test_that_an_effect_may_fail_has_words():
