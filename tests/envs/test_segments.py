@@ -549,6 +549,16 @@ def test_targets_in_lines_are_where_they_were_sent(rows_hz):
     assert np.abs(cut.segments.target[..., 0] - steps)[inside].max() < most
 
 
+def test_stamps_that_jitter_where_positions_do_not_are_put_on_a_line():
+    time, position = times(2.0), lambda time: 0.3 * np.sin(8.0 * time)[:, None] * [1.0, -1.0]
+    noise = 1e-5 * np.random.default_rng(1).standard_normal((len(time), 2))
+    stamps = late(time, 3e-4)
+    np.testing.assert_allclose(np.diff(segments.evened(run(stamps, q=position(time) + noise)).time), 0.005, rtol=1e-3)
+    # Rows that were read when they say so, and stamps without jitter.
+    for one in (run(stamps, q=position(stamps) + noise), run(time, q=position(time) + noise)):
+        assert segments.evened(one) is one
+
+
 def test_stamps_off_an_even_clock_are_believed():
     # A logger's clock that goes wrong by a tick, and right again.
     time = times(2.0)
