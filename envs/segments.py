@@ -288,8 +288,10 @@ def evened(run: Run) -> Run:
     A joint at 3 rad/s that was stamped 0.15 ms late seems to be off by 0.45 mrad. Positions are much smoother on a line
     then. Rows that were really read late are not, and keep their stamps.
     """
+    if len(run.time) < 3 * _NEAR:
+        return run
     even = _clock(run, 0.0).rows
-    if even is run.time or len(run.time) < 3 * _NEAR:
+    if even is run.time:
         return run
     rough = [_roughness(time, run.signals["q"]) for time in (run.time, even)]
     return replace(run, time=even - even[0]) if (rough[1] < _SMOOTHER * rough[0]).any() else run
