@@ -6,12 +6,13 @@ they would remember. `envs.smoothing` estimates the states of a run, from which 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import chex
 import jax
 import numpy as np
 
+from envs.clock import SAME_S, Clock, clock_of
 from envs.effects.memory import LONGEST_S, PAST_STEP_S, PAST_TARGET_STEP_S
 from envs.logs import Run
 from envs.readings import aligned, hermite, noise, quantum_of
@@ -36,10 +37,6 @@ COMPARED = ("q", "dq", "tau", "abs_tau", "gravity")
 HISTORY_S = LONGEST_S + 0.02
 """Length of the history before a segment, in s: the longest delay and some time for lags to settle."""
 
-_NEAR = 9  # rows
-_SMOOTHER = 0.7  # least fall of the roughness of some joint's positions, as a share of its mean square
-_WHOLE = 0.01  # how far rows may be from a whole number of ticks, as a share
-_SAME_S = 2e-6  # times that differ by less are the same: time stamps are rounded, those of a wall clock to 0.2 us
 _PAST_S = 2.0  # how far back before the history positions and targets are kept
 
 
@@ -181,7 +178,7 @@ def whole(runs: Sequence[Run], dt: float) -> Cut:
 
 def _after_history(run: Run) -> int:
     """The first row before which there is a whole history."""
-    return int(np.searchsorted(run.time, run.time[0] + HISTORY_S - _SAME_S))
+    return int(np.searchsorted(run.time, run.time[0] + HISTORY_S - SAME_S))
 
 
 def _segments(
@@ -203,7 +200,7 @@ def _segments(
         all segments get as many steps as the longest.
       dt: step of the simulation in s.
     """
-    after = 1 + int(np.ceil((longest_s - _SAME_S) / dt))
+    after = 1 + int(np.ceil((longest_s - SAME_S) / dt))
     every = zip(runs, estimates, starts, rows, strict=True)
     parts = [_of_run(run, one.states, start, row, after, dt) for run, one, start, row in every]
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
@@ -223,7 +220,7 @@ def _of_run(run: Run, states: np.ndarray, start: np.ndarray, rows: np.ndarray, a
     """Makes the segments of one run, of `after` steps each (`_segments`)."""
     before, ahead = round(HISTORY_S / dt), round(LONGEST_S / dt)
     begin = run.time[start][:, None]
-    clock = _clock(run, dt)
+    clock = clock_of(run, dt)
     told = clock.rows[start][:, None] + dt * np.arange(-before, after)
     # A row's values act from its time until the next.
     last = clock.last_row(told)
@@ -238,7 +235,7 @@ def _of_run(run: Run, states: np.ndarray, start: np.ndarray, rows: np.ndarray, a
     # Where the controller's ticks lie between rows is unknown; they are counted from the run's first row.
     ticks = np.floor((told + clock.same_s - clock.rows[0]) * clock.rate_hz)
     at = (run.time[rows] - begin) / dt
-    step = np.minimum(np.floor(at + _SAME_S / dt).astype(np.int32), after - 1)
+    step = np.minimum(np.floor(at + SAME_S / dt).astype(np.int32), after - 1)
     position, velocity = np.moveaxis(states, 1, 0)
     fine = begin + dt * np.arange(-before, ahead + 1)
     # The slope of interpolated positions would have several times the noise of the velocities, but not at the rows: a
@@ -263,75 +260,7 @@ def _of_run(run: Run, states: np.ndarray, start: np.ndarray, rows: np.ndarray, a
     )
 
 
-@dataclass(frozen=True)
-class _Clock:
-    """When a controller has what the rows of a run say.
-
-    Attributes:
-      rows: [rows] s.
-      rate_hz: of its ticks, the first of which is at the first row.
-      same_s: times that differ by less are the same.
-    """
-
-    rows: np.ndarray
-    rate_hz: float
-    same_s: float
-
-    def last_row(self, times: np.ndarray) -> np.ndarray:
-        """The last row at or before each time."""
-        return np.clip(np.searchsorted(self.rows, times + self.same_s, side="right") - 1, 0, len(self.rows) - 1)
-
-
-def evened(run: Run) -> Run:
-    """Puts time stamps on a line where positions say that their jitter is of the stamps alone.
-
-    A joint at 3 rad/s that was stamped 0.15 ms late seems to be off by 0.45 mrad. Positions are much smoother on a line
-    then. Rows that were really read late are not, and keep their stamps.
-    """
-    if len(run.time) < 3 * _NEAR:
-        return run
-    even = _clock(run, 0.0).rows
-    if even is run.time:
-        return run
-    rough = [_roughness(time, run.signals["q"]) for time in (run.time, even)]
-    return replace(run, time=even - even[0]) if (rough[1] < _SMOOTHER * rough[0]).any() else run
-
-
-def _roughness(time: np.ndarray, position: np.ndarray) -> np.ndarray:
-    """Mean squares of what polynomials of degree 5 through few rows leave of positions [rows, joints], [joints]."""
-    begin = np.arange(0, len(time) - _NEAR, _NEAR)
-    near = begin[:, None] + np.arange(_NEAR)
-    at = time[near] - time[near].mean(axis=1, keepdims=True)
-    basis, _ = np.linalg.qr(np.stack([(at / np.ptp(at)) ** power for power in range(6)], axis=-1))
-    values = position[near]
-    return ((values - basis @ (basis.swapaxes(-1, -2) @ values)) ** 2).mean(axis=(0, 1))
-
-
-def _clock(run: Run, dt: float) -> _Clock:
-    """Reads the controller's clock off time stamps.
-
-    Rows that are a whole number of ticks apart go with the ticks, and only their stamps jitter. These are put on a line
-    then, since a row that seems a little late would miss its tick. Rows that are not, or are off the line by half a
-    tick and more, have what their stamps say.
-
-    Args:
-      run: the run.
-      dt: step of the simulation in s; ticks are whole steps apart.
-    """
-    rate_hz, gaps = run.controller.rate_hz, np.diff(run.time)
-    period = np.median(gaps)
-    ticks = round(period * rate_hz)
-    if ticks >= 1 and abs(period * rate_hz / ticks - 1.0) < _WHOLE:
-        count = np.concatenate([[0.0], np.cumsum(np.round(gaps / period))])
-        row_s, first = np.polyfit(count, run.time, 1)
-        even = first + row_s * count
-        if np.abs(run.time - even).max() < 0.5 / rate_hz:
-            # The line's slope is not exact either.
-            return _Clock(even, ticks / row_s, 0.25 * dt)
-    return _Clock(run.time, rate_hz, _SAME_S)
-
-
-def _between_rows(run: Run, sent: np.ndarray | None, clock: _Clock, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _between_rows(run: Run, sent: np.ndarray | None, clock: Clock, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Returns what was sent to the joints at other times, and how far a linear one is from it where that is unknown.
 
     Args:

@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 
 from envs import models, readings, segments
+from envs.clock import evened
 from envs.effects import LEARNED, LIBRARY
 from envs.logs import Log, Run, read_any, splits, with_halves_swapped, with_splits
 from envs.null_logs import simulate_null_logs
@@ -113,7 +114,7 @@ def read_logs(
     if len(logs) > 1:
         runs = tuple(_numbered(run, number) for number, log in enumerate(logs) for run in log.runs)
     notes += tuple(note for log in logs for note in log.notes)
-    stamped, runs = runs, tuple(segments.evened(run) for run in runs)
+    stamped, runs = runs, tuple(evened(run) for run in runs)
     if moved := [run.name for run, before in zip(runs, stamped, strict=True) if run is not before]:
         notes += (f"time stamps of {len(moved)} runs jitter and were put on a line: positions are smoother there",)
     log = split_in_time(replace(first, runs=runs, notes=notes))

@@ -319,10 +319,11 @@ def rivals(
     return tuple(sorted(found, key=lambda name: -found[name]))[: settings.rivals]
 
 
-def _largest_fall(before: np.ndarray, now: np.ndarray) -> tuple[float, float]:
-    """Of mean squares [components]: the root of the largest fall, and the root of what is left there."""
+def _largest_fall(before: np.ndarray, now: np.ndarray, least: np.ndarray | None = None) -> tuple[float, float]:
+    """Of mean squares [components]: the root of the largest fall, and that of what is left there, or of `least`."""
     where = int((before - now).argmax())
-    return float(np.sqrt(max(before[where] - now[where], 0.0))), float(np.sqrt(now[where]))
+    left = now[where] if least is None else max(now[where], least[where])
+    return float(np.sqrt(max(before[where] - now[where], 0.0))), float(np.sqrt(left))
 
 
 def _falls_of_runs(before: np.ndarray, now: np.ndarray, run: np.ndarray, left: np.ndarray) -> list[tuple[float, float]]:
@@ -336,9 +337,7 @@ def _falls_of_runs(before: np.ndarray, now: np.ndarray, run: np.ndarray, left: n
         if here.sum() >= _SEGMENTS:
             kept = np.argsort(before[here] - now[here], axis=0)[:-2]
             was, remains = (np.take_along_axis(one[here], kept, axis=0).mean(axis=0) for one in (before, now))
-            where = int((was - remains).argmax())
-            fall = max(was[where] - remains[where], 0.0)
-            found.append((float(np.sqrt(fall)), float(np.sqrt(max(remains[where], left[where])))))
+            found.append(_largest_fall(was, remains, left))
     return found
 
 

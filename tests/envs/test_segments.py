@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from envs import readings, segments
+from envs import clock, readings, segments
 from envs.effects.memory import LONGEST_S
 from envs.logs import Controller, Run
 
@@ -523,15 +523,13 @@ def test_inexact_time_stamps_move_no_tick_and_no_target(stamped):
     np.testing.assert_array_equal(cut.segments.target, motion["target"][acting].astype(np.float32))
 
 
-@pytest.mark.parametrize(
-    ("rows_hz", "control_hz", "dt"), [(2000.0, 1000.0, 1e-3), (400.0, 500.0, 1e-3), (200.0, 60.0, 1e-3)]
-)
-def test_no_tick_has_a_target_that_comes_later(rows_hz, control_hz, dt):
+@pytest.mark.parametrize(("rows_hz", "control_hz"), [(2000.0, 1000.0), (400.0, 500.0), (200.0, 60.0)])
+def test_no_tick_has_a_target_that_comes_later(rows_hz, control_hz):
     time = times(2.0, rows_hz)
     mine = run(time, target=np.arange(len(time))[:, None] * np.ones(2))
     mine = replace(mine, controller=replace(mine.controller, rate_hz=control_hz, between_rows="hold"))
-    cut = segments.cut([mine], 0.2, dt)
-    steps = time[cut.row[:, :1] - 1] + dt * (np.arange(cut.segments.target.shape[1]) - BEFORE)
+    cut = segments.cut([mine], 0.2, DT)
+    steps = time[cut.row[:, :1] - 1] + DT * (np.arange(cut.segments.target.shape[1]) - BEFORE)
     newest = np.clip(np.floor(steps * rows_hz + 1e-3), 0, len(time) - 1)
     np.testing.assert_array_equal(cut.segments.target[..., 0], newest)
 
@@ -553,19 +551,19 @@ def test_stamps_that_jitter_where_positions_do_not_are_put_on_a_line():
     time, position = times(2.0), lambda time: 0.3 * np.sin(8.0 * time)[:, None] * [1.0, -1.0]
     noise = 1e-5 * np.random.default_rng(1).standard_normal((len(time), 2))
     stamps = late(time, 3e-4)
-    np.testing.assert_allclose(np.diff(segments.evened(run(stamps, q=position(time) + noise)).time), 0.005, rtol=1e-3)
+    np.testing.assert_allclose(np.diff(clock.evened(run(stamps, q=position(time) + noise)).time), 0.005, rtol=1e-3)
     # Rows that were read when they say so, and stamps without jitter.
     for one in (run(stamps, q=position(stamps) + noise), run(time, q=position(time) + noise)):
-        assert segments.evened(one) is one
+        assert clock.evened(one) is one
 
 
 def test_stamps_off_an_even_clock_are_believed():
     # A logger's clock that goes wrong by a tick, and right again.
     time = times(2.0)
     moved = time + 0.005 * np.sin(np.pi * time)
-    clock = segments._clock(run(moved), DT)
-    np.testing.assert_array_equal(clock.rows, moved)
-    assert clock.rate_hz == 200.0
+    found = clock.clock_of(run(moved), DT)
+    np.testing.assert_array_equal(found.rows, moved)
+    assert found.rate_hz == 200.0
 
 
 def test_torque_that_was_sent_drives_nothing_while_motors_are_off():
