@@ -66,6 +66,8 @@ class Args:
     """Robots of every case with which whole tunings are run as well."""
     tunings: int = 1
     """Whole tunings of each of these robots, one after another; the policy stays as it is."""
+    lanes: int = 1
+    """Robots whose whole tunings run side by side. 1 suits a CPU; on a GPU 10 take little longer than one."""
     states: bool = False
     """Whether whole tunings estimate last from measured states, and are `unexplained` where these fit no parameters."""
     others: tuple[str, ...] = ()
@@ -146,7 +148,7 @@ def check(args: Args) -> tuple[Kind, dict[str, Entry], dict[str, dict[str, float
     """
     sizes, robot = preset(args.preset), kind(args.robot)
     entries = robot.chosen(args.parameters)
-    check_positive(radius=args.radius, robots=args.robots, gates=args.gates, tunings=args.tunings)
+    check_positive(radius=args.radius, robots=args.robots, gates=args.gates, tunings=args.tunings, lanes=args.lanes)
     if args.whole < 0:
         raise ValueError(f"whole: got {args.whole}, expected 0 or more")
     if args.states and not args.whole:
@@ -215,6 +217,7 @@ def tested(args: Args, robot: Kind, entries, others, episodes: int, progress: Pr
     learner = Learner(sizes, entries, hidden, kind=robot, states=args.states)
     # The robots of every case: inside, outside in a parameter, and the others.
     memory.check(learner, sets=args.robots * (1 + len(entries) + len(others)))
+    memory.check(learner, lanes=args.lanes)
     policy = starting_policy(args.policy or default_policy(robot), learner, args.out)
     dist = learner.dist(parameters.nominal(entries), args.radius)
     machine = learner.tuner()
@@ -239,6 +242,7 @@ def tested(args: Args, robot: Kind, entries, others, episodes: int, progress: Pr
         gates=args.gates,
         whole=args.whole,
         tunings=args.tunings,
+        lanes=args.lanes,
         others=coords,
         keep=parts.keep,
         done=done,

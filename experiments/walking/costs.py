@@ -23,6 +23,7 @@ from experiments.common.config import Preset
 from experiments.walking.learner import Learner, Policy
 from experiments.walking.policies import starting_policy
 from experiments.walking.robots import BITENO
+from experiments.walking.work import peaks, work
 from jaxtune import devices, dvm, readings, regression, spm, tuner
 from jaxtune import dist as dists
 from jaxtune.mjx import parameters
@@ -42,8 +43,9 @@ def profile(sizes: Preset, policy: str) -> dict[str, dict]:
 
     Returns:
       By part: `calls` in a tuning whose set is accepted at once, `compile_s` of its program where none is kept on disk,
-      `run_s` of a call, `share` of the tuning's time without compilation, and `limit_s`, what MuJoCo C takes for the
-      same control steps on the same cores (nan for parts that simulate nothing).
+      `run_s` of a call, `share` of the tuning's time without compilation, and limits: `limit_s`, what MuJoCo C takes
+      for the same control steps on all cores (nan for parts that simulate nothing), and `flops_s` and `bytes_s`, what
+      one device needs for the operations of a call, and for the data that they must read and write (`work`).
     """
     jax.config.update("jax_enable_compilation_cache", False)
     learner = Learner(sizes, BITENO.chosen("legs6"))
@@ -93,13 +95,15 @@ def profile(sizes: Preset, policy: str) -> dict[str, dict]:
             (start,),
         ),
     }
-    rows = {}
+    rows, most = {}, peaks()
     for name, (calls, simulated, program, inputs) in parts.items():
         compile_s, run_s = _seconds(program, inputs)
-        limit = np.nan if simulated is None else simulated / rate
-        rows[name] = {"calls": calls, "compile_s": compile_s, "run_s": run_s, "limit_s": limit}
+        limit, least = np.nan if simulated is None else simulated / rate, work(program, *inputs)
+        limits = {"limit_s": limit, "flops_s": least.flops / most.flops, "bytes_s": least.moved / most.moved}
+        rows[name] = {"calls": calls, "compile_s": compile_s, "run_s": run_s, **limits}
     learning = rows.pop("policy: whole updates")
-    learning["run_s"] -= rows["policy: rollouts"]["run_s"]
+    for column in ("run_s", "flops_s", "bytes_s"):
+        learning[column] -= rows["policy: rollouts"][column]
     rows["policy: learning"] = learning
     whole = sum(row["calls"] * row["run_s"] for row in rows.values())
     return {name: row | {"share": row["calls"] * row["run_s"] / whole} for name, row in rows.items()}

@@ -33,6 +33,7 @@ def run(
     gates: int = 1,
     whole: int = 0,
     tunings: int = 1,
+    lanes: int = 1,
     others: Mapping[str, Coords] = MappingProxyType({}),
     keep: Keep = lambda name, compute: compute(),
     done: Callable[[int, int], None] = lambda number, total: None,
@@ -48,18 +49,22 @@ def run(
       whole: robots of every case with which whole tunings are run as well, widenings and refinements included.
       tunings: of each such robot, one after another. Each measures a new set and starts from the distribution that the
         one before left; the policy stays as it is.
+      lanes: robots of which whole tunings run side by side, in one program. On a GPU 10 take little longer than one. On
+        a CPU they take longer than one after another, because all wait for the robot with the most gate calls.
       others: cases by name, of coordinates that replace those drawn. `tuner.simulate` must know them; a coordinate that
         is not in the distribution is 0, that is nominal, in all other cases.
       keep: given every part of the test, a gate or a robot's whole tunings, so that one that was interrupted goes on.
       done: called after every gate and tuning with their number so far and in all.
 
     Raises:
-      ValueError: fewer than two robots, no gate or tuning, or a tuner whose `simulate` JAX cannot trace.
+      ValueError: fewer than two robots, no gate, tuning or lane, or a tuner whose `simulate` JAX cannot trace.
     """
     if not isinstance(tuner, Tuner):
         raise ValueError(f"tuner: got {type(tuner).__name__}, expected a Tuner, whose simulate JAX can trace")
     if robots < 2 or gates < 1 or tunings < 1:
         raise ValueError(f"robots, gates, tunings: got {robots}, {gates} and {tunings}, expected at least 2, 1 and 1")
+    if lanes < 1:
+        raise ValueError(f"lanes: got {lanes}, expected 1 or more")
     outside = _outside(state.dist)
     others = {name: dict(coords) for name, coords in others.items()}
     extra = sorted({name for coords in others.values() for name in coords} - set(dists.names(state.dist)))
@@ -67,9 +72,10 @@ def run(
     total = gates + whole * tunings * (1 + len(others))
     cases = [{}, *outside.values(), *others.values()]
     calls = _call(key_gates, tuner, state, cases, extra, robots, gates, keep, lambda number: done(number, total))
+    groups = [range(first, min(first + lanes, whole)) for first in range(0, whole, lanes)]
     whole_cases = {INSIDE: {}} | others if whole else {}
     tuned = _tune(
-        key_whole, tuner, state, whole_cases, extra, whole, tunings, keep, lambda number: done(gates + number, total)
+        key_whole, tuner, state, whole_cases, extra, groups, tunings, keep, lambda number: done(gates + number, total)
     )
     return _counted(state, calls, list(outside), list(others), tuned)
 
@@ -167,37 +173,64 @@ def _tune(
     state: TunerState,
     cases: Mapping[str, Mapping],
     extra: list[str],
-    robots: int,
+    groups: Sequence[range],
     tunings: int,
     keep: Keep,
     done: Callable[[int], None],
 ) -> dict[str, tuple[Tuned, ...]]:
-    """Runs whole tunings of robots of every case, and counts how they end."""
-    measure, tune = (devices.on_all(jax.jit(program)) for program in (partial(_measured, tuner), tuner.tune))
+    """Runs whole tunings of robots of every case, those of a group side by side, and counts how they end."""
+    measure, tune = (devices.on_all(jax.jit(_by_side(program))) for program in (partial(_measured, tuner), tuner.tune))
 
-    def each(number: int, replaced: Mapping, robot: int) -> dict:
-        key_robot = jax.random.fold_in(jax.random.fold_in(key, number), robot)
-        key_draw, *keys = jax.random.split(key_robot, 1 + 2 * tunings)
-        coords = _draw(key_draw, state.dist, 1, replaced, extra)
-        # What is known of the real robot says nothing of this one.
-        now, rows = state.replace(past=pooling.nothing(state.dist)), []
+    def each(number: int, replaced: Mapping, group: range) -> dict:
+        key_draws, *keys = zip(
+            *(
+                jax.random.split(jax.random.fold_in(jax.random.fold_in(key, number), robot), 1 + 2 * tunings)
+                for robot in group
+            ),
+            strict=True,
+        )
+        drawn = [_draw(one, state.dist, 1, replaced, extra) for one in key_draws]
+        coords = jax.tree.map(lambda *values: jnp.stack(values), *drawn)
+        # What is known of the real robot says nothing of these.
+        blank = state.replace(past=pooling.nothing(state.dist))
+        now, rows = jax.tree.map(lambda leaf: jnp.stack([leaf] * len(group)), blank), []
         for index, (key_measure, key_tune) in enumerate(zip(keys[::2], keys[1::2], strict=True)):
             if index:
-                done((number * robots + robot) * tunings + index)
-            measured = jax.tree.map(lambda leaf: leaf[0], measure(key_measure, now, coords))
+                done(group.start * tunings + index * len(group) + number * whole)
+            measured = jax.tree.map(lambda leaf: leaf[:, 0], measure(jnp.stack(key_measure), now, coords))
             # The state stays on its devices: from others the programs would be compiled anew.
-            now, info = tune(key_tune, now, measured)
-            rows.append(_ended(*jax.device_get((now.dist, info)), coords))
-        return {"tunings": rows}
+            now, info = tune(jnp.stack(key_tune), now, measured)
+            ended = jax.device_get((now.dist, info))
+            rows.append([_ended(*_lane(ended, lane), one) for lane, one in enumerate(drawn)])
+        return {"robots": list(zip(*rows, strict=True))}
 
-    tuned = {}
+    tuned, whole = {}, groups[-1].stop * tunings if groups else 0
     for number, (name, replaced) in enumerate(cases.items()):
         ended = []
-        for robot in range(robots):
-            ended.append(keep(f"case_{number}_robot_{robot}", partial(each, number, replaced, robot))["tunings"])
-            done((number * robots + robot + 1) * tunings)
+        for group in groups:
+            part = f"case_{number}_robots_{group.start}_to_{group.stop - 1}"
+            ended += keep(part, partial(each, number, replaced, group))["robots"]
+            done(group.stop * tunings + number * whole)
         tuned[name] = tuple(_tuned(rows, dists.names(state.dist)) for rows in zip(*ended, strict=True))
     return tuned
+
+
+def _by_side(program: Callable) -> Callable:
+    """Makes a program work on several robots, as the first axis of every input.
+
+    One robot gets the program as it is: mapped, it would compute both branches of every `cond`.
+    """
+
+    def of_all(*inputs):
+        if len(jax.tree.leaves(inputs)[0]) > 1:
+            return jax.vmap(program)(*inputs)
+        return jax.tree.map(lambda leaf: leaf[None], program(*_lane(inputs, 0)))
+
+    return of_all
+
+
+def _lane(tree, lane: int):
+    return jax.tree.map(lambda leaf: leaf[lane], tree)
 
 
 def _ended(dist: ParamDist, info: Info, coords: Coords) -> dict:

@@ -54,7 +54,7 @@ def report(parts):
 
 def test_a_test_that_was_interrupted_goes_on_to_the_same_numbers(report, parts):
     again = dict(parts)
-    for name in ("gate_1", "case_1_robot_0"):
+    for name in ("gate_1", "case_1_robots_0_to_0"):
         del again[name]
     calls = []
     assert as_json(counted(again, done=lambda *now: calls.append(now))) == as_json(report)
@@ -96,6 +96,27 @@ def test_whole_tunings_say_how_they_end(report):
         assert "accept" not in one.verdicts
         assert one.held == Rate(0, 0)
     assert "tuning 2, heavy: 1 accept, truth in the distribution: 1 of 1" in selftest.summary(report)
+
+
+def test_whole_tunings_side_by_side_end_as_one_after_another():
+    tuner, state = machine(toys.TINY)
+    sizes = {"robots": 2, "whole": 3, "tunings": 2}
+
+    def rows(lanes, calls):
+        parts = {}
+        keep = lambda name, compute: parts.setdefault(name, compute())  # noqa: E731
+        done = lambda number, total: calls.append((number, total))  # noqa: E731
+        selftest.run(jax.random.key(0), tuner, state, **sizes, lanes=lanes, keep=keep, done=done)
+        return [row for name, part in parts.items() if "case" in name for robot in part["robots"] for row in robot]
+
+    calls = []
+    alone, together = rows(1, []), rows(2, calls)
+    assert len(alone) == len(together) == 6
+    # A gate call and six tunings, of two robots and then of one.
+    assert calls == [(number, 7) for number in (1, 3, 5, 6, 7)]
+    for one, other in zip(alone, together, strict=True):
+        assert (one["verdict"], one["held"], one["covered"]) == (other["verdict"], other["held"], other["covered"])
+        np.testing.assert_allclose(one["errors"], other["errors"], atol=5e-3)
 
 
 def test_whole_tunings_may_end_with_measured_states():
@@ -177,6 +198,8 @@ def test_a_test_of_nothing_is_refused(robots, gates, tunings):
     got = f"robots, gates, tunings: got {robots}, {gates} and {tunings}, expected at least 2, 1 and 1"
     with pytest.raises(ValueError, match=got):
         selftest.run(jax.random.key(0), *machine(), robots=robots, gates=gates, tunings=tunings)
+    with pytest.raises(ValueError, match="lanes: got 0, expected 1 or more"):
+        selftest.run(jax.random.key(0), *machine(), lanes=0)
 
 
 def test_a_simulator_that_cannot_be_traced_is_refused():
