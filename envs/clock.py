@@ -1,5 +1,6 @@
 """What the time stamps of a log say of its controller's clock, and which of them only jitter."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -57,19 +58,24 @@ def clock_of(run: Run, dt: float) -> Clock:
     return Clock(run.time, rate_hz, SAME_S)
 
 
-def evened(run: Run) -> Run:
-    """Puts time stamps on a line where positions say that their jitter is of the stamps alone.
+def evened(runs: Sequence[Run]) -> tuple[Run, ...]:
+    """Puts the time stamps of a log on lines where positions say that their jitter is of the stamps alone.
 
     A joint at 3 rad/s that was stamped 0.15 ms late seems to be off by 0.45 mrad. Positions are much smoother on a line
-    then. Rows that were really read late are not, and keep their stamps.
+    then. Rows that were really read late are not, and keep their stamps. All runs are judged together, as one program
+    recorded them, and those in which little moves say little.
     """
-    if len(run.time) < 3 * _NEAR:
-        return run
-    even = clock_of(run, 0.0).rows
-    if even is run.time:
-        return run
-    rough = [_roughness(time, run.signals["q"]) for time in (run.time, even)]
-    return replace(run, time=even - even[0]) if (rough[1] < _SMOOTHER * rough[0]).any() else run
+    lines = [clock_of(run, 0.0).rows if len(run.time) >= 3 * _NEAR else run.time for run in runs]
+    jitters = [(run, line) for run, line in zip(runs, lines, strict=True) if line is not run.time]
+    before, after = (
+        sum(len(time) * _roughness(time, run.signals["q"]) for run, time in stamps)
+        for stamps in ([(run, run.time) for run, _ in jitters], jitters)
+    )
+    if not np.any(after < _SMOOTHER * before):
+        return tuple(runs)
+    return tuple(
+        run if line is run.time else replace(run, time=line - line[0]) for run, line in zip(runs, lines, strict=True)
+    )
 
 
 def _roughness(time: np.ndarray, position: np.ndarray) -> np.ndarray:

@@ -551,10 +551,16 @@ def test_stamps_that_jitter_where_positions_do_not_are_put_on_a_line():
     time, position = times(2.0), lambda time: 0.3 * np.sin(8.0 * time)[:, None] * [1.0, -1.0]
     noise = 1e-5 * np.random.default_rng(1).standard_normal((len(time), 2))
     stamps = late(time, 3e-4)
-    np.testing.assert_allclose(np.diff(clock.evened(run(stamps, q=position(time) + noise)).time), 0.005, rtol=1e-3)
+    moves, rests, short = (run(stamps, q=position(time) + noise), run(stamps, q=noise), run(time[:9], q=noise[:9]))
+    *even, same = clock.evened([moves, rests, short])
+    # The run at rest does not show it, but the same program stamped it.
+    for one in even:
+        np.testing.assert_allclose(np.diff(one.time), 0.005, rtol=1e-3)
+    assert same is short
     # Rows that were read when they say so, and stamps without jitter.
     for one in (run(stamps, q=position(stamps) + noise), run(time, q=position(time) + noise)):
-        assert clock.evened(one) is one
+        assert clock.evened([one, rests]) == (one, rests)
+    assert clock.evened([short]) == (short,)
 
 
 def test_stamps_off_an_even_clock_are_believed():
