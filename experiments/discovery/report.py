@@ -40,7 +40,7 @@ FAILED = {
     "clear_of_zero": "its size may be zero",
     "horizons": "it helps at too few lengths of segments",
 }
-"""Why an effect was taken out of the model again, by the test of `jaxtune.discovery.decide.passes` that it failed."""
+"""Why an effect was taken out of the model again, by the test of `jaxtune.discovery.evidence.passes` that it failed."""
 
 _SHOWN = 4  # suspects on the console
 _HARDLY = 0.2  # share of the gap

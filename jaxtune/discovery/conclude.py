@@ -6,22 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from jaxtune.discovery.decide import (
-    Candidate,
-    Thresholds,
-    believed,
-    families,
-    key_of,
-    measures,
-    passes,
-    posterior,
-    rivals,
-    squares,
-    total_cost,
-    units_of,
-    weigh_evidence,
-)
+from jaxtune.discovery.belief import believed, families, posterior, rivals
+from jaxtune.discovery.candidate import Candidate, key_of, measures, squares, total_cost, units_of
 from jaxtune.discovery.evaluate import rms
+from jaxtune.discovery.evidence import Thresholds, passes, weigh_evidence
 from jaxtune.discovery.fit import Fit, begin, polish, refine
 from jaxtune.discovery.naming import moved_forms, renamed, with_refinements
 from jaxtune.discovery.noise_floor import Floor, NoiseFloor, Say

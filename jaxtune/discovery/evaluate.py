@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jaxtune.discovery.decide import Candidate
+from jaxtune.discovery.candidate import Candidate
 from jaxtune.discovery.noise_floor import Floor
 from jaxtune.discovery.problem import Problem
 

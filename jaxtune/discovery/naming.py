@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from jaxtune.discovery.decide import Candidate
+from jaxtune.discovery.candidate import Candidate
 from jaxtune.discovery.fit import Fit, taken_over
 from jaxtune.discovery.problem import Hypothesis, Problem, acts_within
 from jaxtune.discovery.result import AcceptedTerm

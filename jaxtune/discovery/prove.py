@@ -4,8 +4,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from jaxtune.discovery.candidate import Candidate
 from jaxtune.discovery.conclude import Conclusion
-from jaxtune.discovery.decide import Candidate
 from jaxtune.discovery.evaluate import position_gap, rms
 from jaxtune.discovery.noise_floor import NoiseFloor
 from jaxtune.discovery.problem import Problem

@@ -70,9 +70,9 @@ class AcceptedTerm:
     hypothesis: Any
     """A `problem.Hypothesis`."""
     evidence: Any
-    """A `decide.Evidence`."""
+    """A `evidence.Evidence`."""
     thresholds: Any
-    """The `decide.Thresholds` that it passed."""
+    """The `evidence.Thresholds` that it passed."""
     confusable_with: tuple[str, ...] = ()
     """Names of other effects that these logs cannot distinguish from it, or that explain nearly as much."""
     forms: tuple[Any, ...] = ()
@@ -88,9 +88,9 @@ class DroppedTerm:
     hypothesis: Any
     """A `problem.Hypothesis`."""
     evidence: Any
-    """A `decide.Evidence`."""
+    """A `evidence.Evidence`."""
     failed: tuple[str, ...]
-    """The tests of `decide.passes` that it failed."""
+    """The tests of `evidence.passes` that it failed."""
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from jaxtune.discovery.decide import Candidate, Measure, finite, squares
+from jaxtune.discovery.candidate import Candidate, Measure, finite, squares
 from jaxtune.discovery.noise_floor import Floor
 from jaxtune.discovery.problem import Problem
 
@@ -59,6 +59,6 @@ def energy(gaps: np.ndarray) -> float:
 
 
 def open_gaps(problem: Problem, at: Floor, candidate: Candidate, measure: Measure) -> np.ndarray:
-    """Gaps of all positions on `train` and `select` in floor units, [positions], by one of `decide.measures`."""
+    """Gaps of all positions on `train` and `select` in floor units, [positions], by one of `candidate.measures`."""
     found = np.sqrt(measure(finite(squares(at, candidate)) / at.counts.bins))
     return found[[signal == "q" for signal, _ in problem.cells]]

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from jaxtune.discovery.candidate import Candidate
 from jaxtune.discovery.curves import Library
-from jaxtune.discovery.decide import Candidate
 from jaxtune.discovery.fit import Fit, Free, refine
 from jaxtune.discovery.noise_floor import NoiseFloor, with_systematic_share
 from jaxtune.discovery.problem import Problem

@@ -12,9 +12,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from jaxtune.discovery.candidate import Candidate, key_of, total_cost
 from jaxtune.discovery.curves import Group, Library, groups_of, on_segments, simulate_library, spread_segments
-from jaxtune.discovery.decide import Candidate, ablate, key_of, total_cost
 from jaxtune.discovery.evaluate import usual
+from jaxtune.discovery.evidence import ablate
 from jaxtune.discovery.fit import Fit, begin, polish, refine, taken_over
 from jaxtune.discovery.localise import localise
 from jaxtune.discovery.noise_floor import Floor, NoiseFloor, Say

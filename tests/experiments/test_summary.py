@@ -16,7 +16,7 @@ from experiments.discovery.blind_robots import Truth, record
 from experiments.discovery.excitation import excitation
 from experiments.discovery.setup import build_question
 from experiments.discovery.summary import _far_off, details, free_runs, summarise
-from jaxtune.discovery.decide import Evidence, Thresholds, passes
+from jaxtune.discovery.evidence import Evidence, Thresholds, passes
 from jaxtune.discovery.fit import Fit, Free
 from jaxtune.discovery.result import AcceptedTerm, DroppedTerm, Result, Suspect
 

@@ -9,8 +9,9 @@ import pytest
 from slider import AXES, DIRECTION, HYPOTHESES, LEARNED, WARPED, WILD, problem
 
 from jaxtune.discovery import noise_floor, state, step, workflow
+from jaxtune.discovery.candidate import Candidate
 from jaxtune.discovery.conclude import _rivals
-from jaxtune.discovery.decide import Candidate, Evidence
+from jaxtune.discovery.evidence import Evidence
 from jaxtune.discovery.fit import begin
 from jaxtune.discovery.naming import renamed, with_refinements
 from jaxtune.discovery.prove import is_worse

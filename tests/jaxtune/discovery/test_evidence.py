@@ -7,17 +7,9 @@ import pytest
 from slider import HYPOTHESES, problem
 
 from jaxtune.discovery import noise_floor, state, step
-from jaxtune.discovery.decide import (
-    Candidate,
-    Evidence,
-    Thresholds,
-    ablate,
-    believed,
-    passes,
-    posterior,
-    rivals,
-    weigh_evidence,
-)
+from jaxtune.discovery.belief import believed, posterior, rivals
+from jaxtune.discovery.candidate import Candidate
+from jaxtune.discovery.evidence import Evidence, Thresholds, ablate, passes, weigh_evidence
 from jaxtune.discovery.fit import begin, polish, without
 from jaxtune.discovery.resample import correlation_length, times_drawn, units
 from jaxtune.discovery.result import Settings
