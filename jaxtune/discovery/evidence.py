@@ -9,7 +9,6 @@ from jaxtune.discovery.candidate import (
     Candidate,
     cost,
     finite,
-    key_of,
     measures,
     runs_of,
     squares,
@@ -89,7 +88,7 @@ def weigh_evidence(
       The evidence, and the model without the effect.
     """
     at = floor[problem.main_horizon]
-    ablated = ablate(at, candidate, hypothesis, fitted)
+    ablated = or_known(ablate(at, candidate, hypothesis), fitted)
     now, before = squares(at, candidate), squares(at, ablated)
     held_out = len(problem.data["train"][at.horizon].run)
     own = candidate.fit.along(hypothesis)
@@ -139,17 +138,13 @@ def passes(evidence: Evidence, thresholds: Thresholds) -> dict[str, bool]:
     }
 
 
-def ablate(at: Floor, candidate: Candidate, hypothesis: Hypothesis, fitted: Mapping[str, Candidate]) -> Candidate:
+def ablate(at: Floor, candidate: Candidate, hypothesis: Hypothesis) -> Candidate:
     """Takes an effect with its forms out of a candidate and fits the rest again.
-
-    Where that model was fitted already, the one that costs less counts: a fit that was not finished would be evidence
-    for the effect.
 
     Args:
       at: the floor at the main horizon.
       candidate: the model with the effect.
       hypothesis: the effect.
-      fitted: models by key.
     """
     gone = [hypothesis, *candidate.forms_of(hypothesis)]
     others = tuple(other for other in candidate.hypotheses if all(other is not one for one in gone))
@@ -158,10 +153,20 @@ def ablate(at: Floor, candidate: Candidate, hypothesis: Hypothesis, fitted: Mapp
         start = without(start, one, at.prior, at.slopes)
     start = replace(start, residual=evaluate(start.vector[None])[0])
     (fit,) = refine([start], evaluate, _ABLATION_ROUNDS)
-    known = fitted.get(key_of(others))
-    if known and known.fit.cost <= fit.cost:
-        return known
     return Candidate(others, fit, at.residuals["select"](fit.vector[None])[0])
+
+
+def or_known(candidate: Candidate, fitted: Mapping[str, Candidate]) -> Candidate:
+    """A candidate, or the same model where it was fitted already and costs less.
+
+    A fit that was not finished would be evidence for the effect that was taken out.
+
+    Args:
+      candidate: from `ablate`.
+      fitted: models by key.
+    """
+    known = fitted.get(candidate.key)
+    return known if known and known.fit.cost <= candidate.fit.cost else candidate
 
 
 def _largest_fall(before: np.ndarray, now: np.ndarray, least: np.ndarray | None = None) -> tuple[float, float]:

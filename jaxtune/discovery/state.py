@@ -55,6 +55,8 @@ class State:
     """Keys of models that broke the simulation."""
     library: Library | None = None
     """How the nominal model changes with every effect; it is not saved, but simulated again."""
+    ablated: tuple[Candidate, ...] = ()
+    """The best model without each of its effects, once nothing joins it any more; not saved, but fitted again."""
 
     def replaced(self, old: Candidate, new: Candidate) -> "State":
         """Puts a better fit of the same model in the place of the old one."""
@@ -140,8 +142,17 @@ def to_json(state: State) -> dict[str, Any]:
     }
 
 
-def from_json(problem: Problem, floor: NoiseFloor, begun: State, saved: Mapping[str, Any]) -> State:
+def from_json(
+    problem: Problem, floor: NoiseFloor, begun: State, saved: Mapping[str, Any], restored: Sequence[Candidate] = ()
+) -> State:
     """Restores the state that `to_json` turned into `saved`, for the same problem and noise floor.
+
+    Args:
+      problem: names the main horizon.
+      floor: the noise floor.
+      begun: what is not saved (`begin`).
+      saved: by `to_json`.
+      restored: models of an earlier state that this function made; these are not simulated again.
 
     Raises:
       ValueError: another version saved it.
@@ -158,15 +169,20 @@ def from_json(problem: Problem, floor: NoiseFloor, begun: State, saved: Mapping[
     rows = np.array(saved["rows"])
     frees = [_free(rows[one["free"]]) for one in saved["candidates"]]
     points = [np.array(one["coordinates"]) for one in saved["candidates"]]
-    vectors = np.stack([point @ free.directions for point, free in zip(points, frees, strict=True)])
-    simulated = zip(at.residuals["train"](vectors), at.residuals["select"](vectors), strict=True)
-    candidates = tuple(
-        Candidate(
-            tuple(by_key[key] for key in one["hypotheses"]),
-            Fit(free, point, train, np.zeros((len(train), len(point))), at.counts),
-            select,
+    known = {one.fit.vector.tobytes(): (one.fit.residual, one.select) for one in restored}
+
+    def candidate(hypotheses: Sequence[str], free: Free, point: np.ndarray) -> Candidate:
+        vector = point @ free.directions
+        # Each alone, since rounding depends on what is simulated beside it.
+        train, select = known.get(vector.tobytes()) or (
+            at.residuals[split](vector[None])[0] for split in ("train", "select")
         )
-        for one, free, point, (train, select) in zip(saved["candidates"], frees, points, simulated, strict=True)
+        fit = Fit(free, point, train, np.zeros((len(train), len(point))), at.counts)
+        return Candidate(tuple(by_key[key] for key in hypotheses), fit, select)
+
+    candidates = tuple(
+        candidate(one["hypotheses"], free, point)
+        for one, free, point in zip(saved["candidates"], frees, points, strict=True)
     )
     return replace(
         begun,

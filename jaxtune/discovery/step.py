@@ -15,7 +15,7 @@ import numpy as np
 from jaxtune.discovery.candidate import Candidate, key_of, total_cost
 from jaxtune.discovery.curves import Group, Library, groups_of, on_segments, simulate_library, spread_segments
 from jaxtune.discovery.evaluate import usual
-from jaxtune.discovery.evidence import ablate
+from jaxtune.discovery.evidence import ablate, or_known
 from jaxtune.discovery.fit import Fit, begin, polish, refine, taken_over
 from jaxtune.discovery.localise import localise
 from jaxtune.discovery.noise_floor import Floor, NoiseFloor, Say
@@ -62,7 +62,7 @@ def step(
       The next state, and what was tried.
     """
     at = floor[problem.main_horizon]
-    base = _next_base(at, state)
+    base, state = _next_base(at, state)
     if base is None:
         return replace(state, finished=True), Info()
     free, swapping = _free(settings, problem, at, base, state), base is not state.best
@@ -99,10 +99,11 @@ def step(
     least = min(state.candidates, key=lambda one: total_cost(at, one, state.price))
     ranked = tuple(sorted(((one.key, cost[one.key]) for one in fitted), key=lambda pair: pair[1]))
     ranked = (*ranked[:5], ("before", total_cost(at, best, state.price)), ("price", state.price))
-    return replace(state, best=least), Info(ranked, least.key != best.key)
+    state = replace(state, best=least, ablated=state.ablated if least is best else ())
+    return state, Info(ranked, least.key != best.key)
 
 
-def _next_base(at: Floor, state: State) -> Candidate | None:
+def _next_base(at: Floor, state: State) -> tuple[Candidate | None, State]:
     """The model beside which to look next; None where all that make sense were tried.
 
     It is the best one. Where nothing joins that, it is the best one without one of its effects, the weakest first:
@@ -110,17 +111,17 @@ def _next_base(at: Floor, state: State) -> Candidate | None:
     """
     best = state.best
     if best.key not in state.tried:
-        return best
+        return best, state
     if len(best.effects) < 2:
-        return None
+        return None, state
+    if not state.ablated:
+        (fit,) = polish([best.fit], at.residuals["train"], 0)
+        ablated = tuple(ablate(at, replace(best, fit=fit), effect) for effect in best.effects)
+        state = replace(state, ablated=ablated)
     fitted = {one.key: one for one in state.candidates}
-    (fit,) = polish([best.fit], at.residuals["train"], 0)
-    best = replace(best, fit=fit)
-    without = [ablate(at, best, effect, fitted) for effect in best.effects]
+    without = [or_known(one, fitted) for one in state.ablated]
     without = [one for one in without if one.key not in state.tried]
-    if not without:
-        return None
-    return min(without, key=lambda one: total_cost(at, one, state.price))
+    return min(without, key=lambda one: total_cost(at, one, state.price), default=None), state
 
 
 def _free(settings: Settings, problem: Problem, at: Floor, base: Candidate, state: State) -> list[Hypothesis]:

@@ -84,14 +84,17 @@ def discover(
     say("null")
     floor, begun = state.begin(problem, floor)
     found = state.from_json(problem, floor, begun, saved) if saved else begun
+    restored = found.candidates if saved else ()
     while not found.finished:
         found, info = step(settings, problem, floor, found, say)
         for line in info.lines():
             say(line)
         saved = state.to_json(found)
         save(saved)
-        # One batch more in a step, so that an interrupted run, which has nothing else, finds the same numbers.
-        found = state.from_json(problem, floor, replace(begun, library=found.library), saved)
+        # What is new is simulated again, so that an interrupted run, which has nothing else, finds the same numbers.
+        kept = replace(begun, library=found.library, ablated=found.ablated)
+        found = state.from_json(problem, floor, kept, saved, restored)
+        restored = found.candidates
     conclusion = conclude(settings, problem, floor, found, say)
     say("proof on the sealed runs")
     return prove(problem, floor, found, conclusion)
