@@ -67,7 +67,7 @@ class Args:
     tunings: int = 1
     """Whole tunings of each of these robots, one after another; the policy stays as it is."""
     lanes: int = 1
-    """Robots whose whole tunings run side by side. 1 suits a CPU; on a GPU 10 take little longer than one."""
+    """Robots whose whole tunings run side by side: 1 on a CPU, more on a GPU, where a larger batch costs little."""
     states: bool = False
     """Whether whole tunings estimate last from measured states, and are `unexplained` where these fit no parameters."""
     others: tuple[str, ...] = ()

@@ -8,6 +8,7 @@ import gc
 import os
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -32,6 +33,7 @@ _STEPS = 50  # in which the speed of MuJoCo C is measured
 _SETTLED = 5  # tunings after which memory should be flat
 _MODELS = 5  # search-parameter models whose mean is compared with one
 _TIMES = 3  # runs of a program, of which the fastest counts
+_ROLLOUTS, _UPDATES = "policy: rollouts", "policy: whole updates"
 
 
 def profile(sizes: Preset, policy: str) -> dict[str, dict]:
@@ -49,13 +51,42 @@ def profile(sizes: Preset, policy: str) -> dict[str, dict]:
     """
     jax.config.update("jax_enable_compilation_cache", False)
     learner = Learner(sizes, BITENO.chosen("legs6"))
+    start = starting_policy(policy, learner)
+    rate, most = _physics_rate(learner, start), peaks()
+    rows = {}
+    for name, part in _parts(learner, start).items():
+        compile_s, run_s = _seconds(part.program, part.inputs)
+        limit = np.nan if part.simulates is None else part.simulates / rate
+        least = work(part.program, *part.inputs)
+        limits = {"limit_s": limit, "flops_s": least.flops / most.flops, "bytes_s": least.moved / most.moved}
+        rows[name] = {"calls": part.calls, "compile_s": compile_s, "run_s": run_s, **limits}
+    learning = rows.pop(_UPDATES)
+    for column in ("run_s", "flops_s", "bytes_s"):
+        learning[column] -= rows[_ROLLOUTS][column]
+    rows["policy: learning"] = learning
+    whole = sum(row["calls"] * row["run_s"] for row in rows.values())
+    return {name: row | {"share": row["calls"] * row["run_s"] / whole} for name, row in rows.items()}
+
+
+@dataclass(frozen=True)
+class _Part:
+    """A part of a tuning that is timed by itself."""
+
+    program: Callable
+    inputs: tuple
+    calls: int = 1
+    """In a tuning whose set is accepted at once."""
+    simulates: int | None = None
+    """Control steps of a call."""
+
+
+def _parts(learner: Learner, start: Policy) -> dict[str, _Part]:
+    """All parts of a tuning of BITeno, by name."""
+    sizes, key = learner.preset, jax.random.PRNGKey(0)
     machine, config = learner.tuner(), sizes.tuner
     dist = learner.dist(parameters.nominal(learner.entries), 0.2)
-    start = starting_policy(policy, learner)
-    key = jax.random.PRNGKey(0)
     target = MjxTarget(robot=learner.robot, params=parameters.nominal(learner.entries))
     keys = jax.random.split(key, sizes.ppo.num_envs)
-    rate = _physics_rate(learner, start)
 
     def sets(score):
         """Scores all held-out sets, and the measured one."""
@@ -64,49 +95,35 @@ def profile(sizes: Preset, policy: str) -> dict[str, dict]:
             score(model, measured),
         )
 
-    def episodes(policy, count, steps):
-        return target.episodes(key, learner.act(policy), count, steps)
+    def episodes(count, steps):
+        return lambda policy: target.episodes(key, learner.act(policy), count, steps)
 
-    steps, count = learner.preset.episode_steps, config.episodes + config.held_out_sets * config.set_episodes
-    measured = _compiled(lambda one: episodes(one, config.set_episodes, steps))(start)
-    collected = _compiled(lambda one: machine.collect(key, one, dist))(start)
-    train_dvm = lambda data: dvm.train(key, config.dvm, data.trajectory)[0]  # noqa: E731
-    regress = lambda data: regression.train(config.regression, data.trajectory, data.sampled_coords, dist)  # noqa: E731
+    def train_dvm(data):
+        return dvm.train(key, config.dvm, data.trajectory)[0]
+
+    def regress(data):
+        return regression.train(config.regression, data.trajectory, data.sampled_coords, dist)
+
+    steps, count = sizes.episode_steps, config.episodes + config.held_out_sets * config.set_episodes
+    measure, simulate = episodes(config.set_episodes, steps), lambda policy: machine.collect(key, policy, dist)
+    measured, collected = _compiled(measure)(start), _compiled(simulate)(start)
     gate, model = (_compiled(program)(collected) for program in (train_dvm, regress))
-    # Calls in a tuning, control steps of a call, program and inputs.
-    parts = {
-        "measured episodes": (
-            1,
-            config.set_episodes * steps,
-            lambda one: episodes(one, config.set_episodes, steps),
+    novelty, estimate = partial(dvm.novelty, config.dvm), partial(regression.estimate, config.regression)
+    return {
+        "measured episodes": _Part(measure, (start,), simulates=config.set_episodes * steps),
+        "simulated episodes": _Part(simulate, (start,), simulates=count * steps),
+        "verification model": _Part(train_dvm, (collected,)),
+        "its scores": _Part(sets(novelty), (gate, collected, measured)),
+        "regression": _Part(regress, (collected,)),
+        "its estimates": _Part(sets(estimate), (model, collected, measured)),
+        _ROLLOUTS: _Part(learner.collect, (keys, start), sizes.epochs, sizes.ppo.steps_per_update),
+        _UPDATES: _Part(lambda policy: learner.train(key, policy, dist, 1), (start,), sizes.epochs),
+        "evaluation": _Part(
+            episodes(sizes.evaluation_episodes, learner.longest),
             (start,),
-        ),
-        "simulated episodes": (1, count * steps, lambda one: machine.collect(key, one, dist), (start,)),
-        "verification model": (1, None, train_dvm, (collected,)),
-        "its scores": (1, None, sets(partial(dvm.novelty, config.dvm)), (gate, collected, measured)),
-        "regression": (1, None, regress, (collected,)),
-        "its estimates": (1, None, sets(partial(regression.estimate, config.regression)), (model, collected, measured)),
-        "policy: rollouts": (sizes.epochs, sizes.ppo.steps_per_update, learner.collect, (keys, start)),
-        "policy: whole updates": (sizes.epochs, None, lambda one: learner.train(key, one, dist, 1), (start,)),
-        "evaluation": (
-            1,
-            sizes.evaluation_episodes * learner.longest,
-            lambda one: episodes(one, sizes.evaluation_episodes, learner.longest),
-            (start,),
+            simulates=sizes.evaluation_episodes * learner.longest,
         ),
     }
-    rows, most = {}, peaks()
-    for name, (calls, simulated, program, inputs) in parts.items():
-        compile_s, run_s = _seconds(program, inputs)
-        limit, least = np.nan if simulated is None else simulated / rate, work(program, *inputs)
-        limits = {"limit_s": limit, "flops_s": least.flops / most.flops, "bytes_s": least.moved / most.moved}
-        rows[name] = {"calls": calls, "compile_s": compile_s, "run_s": run_s, **limits}
-    learning = rows.pop("policy: whole updates")
-    for column in ("run_s", "flops_s", "bytes_s"):
-        learning[column] -= rows["policy: rollouts"][column]
-    rows["policy: learning"] = learning
-    whole = sum(row["calls"] * row["run_s"] for row in rows.values())
-    return {name: row | {"share": row["calls"] * row["run_s"] / whole} for name, row in rows.items()}
 
 
 def on_devices(sizes: Preset, policy: str) -> dict[str, dict]:

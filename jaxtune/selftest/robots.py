@@ -49,8 +49,8 @@ def run(
       whole: robots of every case with which whole tunings are run as well, widenings and refinements included.
       tunings: of each such robot, one after another. Each measures a new set and starts from the distribution that the
         one before left; the policy stays as it is.
-      lanes: robots of which whole tunings run side by side, in one program. On a GPU 10 take little longer than one. On
-        a CPU they take longer than one after another, because all wait for the robot with the most gate calls.
+      lanes: robots of which whole tunings run side by side, in one program. More of them suit a GPU, on which a larger
+        batch costs little. All wait for the robot with the most gate calls, so one at a time is best on a CPU.
       others: cases by name, of coordinates that replace those drawn. `tuner.simulate` must know them; a coordinate that
         is not in the distribution is 0, that is nominal, in all other cases.
       keep: given every part of the test, a gate or a robot's whole tunings, so that one that was interrupted goes on.
