@@ -33,7 +33,7 @@ class Args:
     """Cases: smoke (6 two-joint arms, to see that it works), arm (75 arms, an hour), standard (98 BITenos, a night on a
     CPU) or full (BITenos with longer logs, for a GPU or a few nights). In field (184 cases, 6 hours on two cores) every
     case is another robot, in one of three engines; field_smoke is six of them. In field_wandering (24 cases) nothing is
-    missing, but frictions differ from run to run."""
+    missing, but frictions differ from run to run. In field_late (24 cases) rows are stamped late."""
     seed: int = 0
     """Random seed of the cases, their places, sizes and wrong parameters."""
     nominal_error: float = 0.1

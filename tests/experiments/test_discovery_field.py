@@ -164,6 +164,10 @@ def test_a_log_is_as_a_user_writes_it_and_says_nothing_of_the_truth(tmp_path, sh
         assert np.abs(run.signals["q"]).max() < 3.0
     written = "".join(path.read_text(errors="ignore") for path in folder.rglob("*") if path.suffix in (".yaml", ".xml"))
     assert not any(word in written for word in ("coulomb", "severity", "mujoco_c"))
+    late = read(writing.write_case(replace(case, late_stamps=True), 0.1, 3, tmp_path / "late"))
+    delays = np.concatenate([run.time - np.arange(len(run.time)) / 200 for run in late.runs])
+    assert 1e-5 < np.std(delays) < 4e-4 and np.abs(delays).max() > 3 * np.std(delays)
+    assert all((np.diff(run.time) > 0).all() for run in late.runs)
     # It is written again, and is the same, if only the truth was kept.
     shutil.rmtree(folder)
     again = read(writing.write_case(case, 0.1, 3, tmp_path / "one"))

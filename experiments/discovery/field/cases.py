@@ -27,11 +27,13 @@ class FieldCase:
     """Intended, in floor units."""
     topology: str
     generator: str
+    late_stamps: bool = False
+    """Whether its rows are stamped late, each by a time of its own; else stamps are exact."""
 
 
 @dataclass(frozen=True)
 class FieldSize:
-    """How many cases of each kind."""
+    """How many cases of each kind, and whether their time stamps are late."""
 
     single: int
     weak: int
@@ -41,15 +43,18 @@ class FieldSize:
     linear: int
     outside: int
     wandering: int = 0
+    late_stamps: bool = False
 
 
 FIELD_SIZES = {
     "field": FieldSize(single=60, weak=20, pair=16, triple=8, empty=50, linear=10, outside=20),
     "field_smoke": FieldSize(single=2, weak=0, pair=1, triple=0, empty=1, linear=1, outside=1),
     "field_wandering": FieldSize(single=0, weak=0, pair=0, triple=0, empty=0, linear=0, outside=0, wandering=24),
+    "field_late": FieldSize(single=16, weak=0, pair=0, triple=0, empty=8, linear=0, outside=0, late_stamps=True),
 }
-"""Sizes by the name that `--size` takes: `field` for a measurement, `field_smoke` to see that it works, and
-`field_wandering` for how often something is named where nothing is missing, but runs differ."""
+"""Sizes by the name that `--size` takes: `field` for a measurement, `field_smoke` to see that it works,
+`field_wandering` for how often something is named where nothing is missing, but runs differ, and `field_late` for logs
+whose rows are stamped late."""
 
 
 def cases(size: FieldSize, seed: int) -> list[FieldCase]:
@@ -82,7 +87,10 @@ def cases(size: FieldSize, seed: int) -> list[FieldCase]:
         "arm3" if len(one[1]) > 2 and name == "arm2" else name for one, name in zip(hidden, topologies, strict=True)
     ]
     order = rng.permutation(len(hidden))
-    return [FieldCase(number, *hidden[at], topologies[at], generators[at]) for number, at in enumerate(order)]
+    return [
+        FieldCase(number, *hidden[at], topologies[at], generators[at], size.late_stamps)
+        for number, at in enumerate(order)
+    ]
 
 
 def _severity(rng: np.random.Generator, low: float, high: float) -> float:

@@ -1,4 +1,4 @@
-"""What a log shows of a robot: noise and quantum of each joint, and speeds that are raw, filtered or not there."""
+"""What a log shows of a robot: noise and quantum of each joint, speeds raw, filtered or not there, and time stamps."""
 
 from dataclasses import dataclass
 
@@ -79,3 +79,16 @@ def draw(joints: int, rng: np.random.Generator) -> Sensors:
         speed_quantum=float(rng.choice([0.001, 0.005, 0.01])),
         filter_hz=float(rng.uniform(7, 14)),
     )
+
+
+def stamped_late(time: np.ndarray, late_s: float, rng: np.random.Generator) -> np.ndarray:
+    """Stamps rows as a program does that other programs delay: most by little, and a few by many times as much.
+
+    Args:
+      time: [rows] s, when they were read.
+      late_s: mean delay.
+      rng: random numbers.
+    """
+    # No row is stamped after the next one was.
+    late = np.minimum(rng.exponential(late_s, len(time)), 0.9 * np.diff(time).min())
+    return time + late - late[0]

@@ -17,12 +17,14 @@ from experiments.discovery.field.forms import Form
 from experiments.discovery.field.outside import OUTSIDE
 from experiments.discovery.field.plants import PLANTS
 from experiments.discovery.field.playing import Hidden, Script, Trace, script, whole
+from experiments.discovery.field.readings import stamped_late
 from experiments.discovery.field.severity import Generator, Meter, search
 from experiments.discovery.field.sizes import FAMILY, ON_BODY, bounds
 
 _TRIES = 8  # robots that are drawn until one can show what is wanted
 _SEVERITY_RATIO = 1.3  # between wanted and reached severity, at most
 _FARTHEST_RAD = 2.7  # that a joint may go, within the ranges that a model may give
+_LATE_S = (2e-5, 3e-4)  # mean delays of the stamps of late loggers, least and largest
 _WANDERING = 0.2  # standard deviation of the logarithms of frictions and dampings from run to run
 
 
@@ -103,10 +105,15 @@ class Scene:
             real, lanes = self.wandered, replace(lanes, robot=np.arange(runs))
         return self.generator.play(real, self.script, lanes, hidden)
 
-    def log(self, trace: Trace, rng: np.random.Generator) -> Log:
+    def log(self, trace: Trace, rng: np.random.Generator, late_s: float = 0.0) -> Log:
         """Makes the log that a user would have recorded.
 
         Half of the users say how targets go on between rows, and half of those whose speeds are filtered say how.
+
+        Args:
+          trace: what happened.
+          rng: random numbers.
+          late_s: by how much rows are stamped late, in the mean.
         """
         nominal, row_s = self.nominal, self.meter.row_s
         runs, tells_targets, tells_filter = [], rng.uniform() < 0.5, rng.uniform() < 0.5
@@ -118,7 +125,8 @@ class Scene:
             speed = self.sensors.speeds(v, row_s, rng)
             signals |= {} if speed is None else {"dq": speed}
             signals |= {} if motion.enabled.all() else {"enabled": motion.enabled}
-            runs.append(self._run(motion, between, signals, known))
+            time = stamped_late(motion.time, late_s, rng) if late_s else motion.time
+            runs.append(self._run(motion, time, between, signals, known))
         return Log(
             robot="robot.xml",
             base="fixed",
@@ -128,7 +136,7 @@ class Scene:
             runs=tuple(runs),
         )
 
-    def _run(self, motion: TargetRun, between: str, signals: dict, known: dict) -> Run:
+    def _run(self, motion: TargetRun, time: np.ndarray, between: str, signals: dict, known: dict) -> Run:
         nominal, rate = self.nominal, self.topology.control_hz
         gains = {"kp": nominal.kp * motion.gain, "kd": nominal.kd * motion.gain, "torque_limit_nm": nominal.limit}
         return Run(
@@ -136,7 +144,7 @@ class Scene:
             condition=motion.condition,
             split=motion.split or None,
             controller=Controller(kind="pd", rate_hz=rate, gains=gains, between_rows=between),
-            time=motion.time,
+            time=time,
             signals=signals,
             known=known,
         )
@@ -213,7 +221,8 @@ def write_case(case: FieldCase, error: float, seed: int, out: Path) -> Path:
     rng = np.random.default_rng((seed, case.number, 99))
     shutil.rmtree(folder.parent, ignore_errors=True)
     folder.parent.mkdir(parents=True)
-    write(scene.log(trace, rng), folder, ".csv" if rng.uniform() < 0.2 else ".npz")
+    late_s = float(np.exp(rng.uniform(*np.log(_LATE_S)))) if case.late_stamps else 0.0
+    write(scene.log(trace, rng, late_s), folder, ".csv" if rng.uniform() < 0.2 else ".npz")
     (folder / "robot.xml").write_text(robots.mjcf(scene.nominal))
     sealed.parent.mkdir(parents=True, exist_ok=True)
     write_json(sealed, _truth(case, scene, placed))
