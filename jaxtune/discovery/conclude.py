@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 
 from jaxtune.discovery.belief import believed, families, posterior, rivals
-from jaxtune.discovery.candidate import Candidate, key_of, measures, squares, total_cost, units_of
-from jaxtune.discovery.evaluate import rms
+from jaxtune.discovery.candidate import Candidate, cost, key_of, measures, squares, total_cost, units_of
 from jaxtune.discovery.evidence import Thresholds, passes, weigh_evidence
 from jaxtune.discovery.fit import Fit, begin, polish, refine
 from jaxtune.discovery.naming import moved_forms, renamed, with_refinements
@@ -193,18 +192,14 @@ def _proved(
 
 
 def _by_select(at: Floor, state: State, best: Candidate, learned: Candidate) -> dict[str, np.ndarray]:
-    """Models by what they are, the one that is best on `select` first."""
+    """Models by what they are, the one that costs least on `select` first."""
     fits = {"null": state.null, "effects": best, "learned": learned}
     models = {"nominal": np.zeros_like(best.fit.vector)} | {name: one.fit.vector for name, one in fits.items()}
-    costs = {name: _gap_on_select(at, one.select) for name, one in fits.items()}
-    costs["nominal"] = _gap_on_select(at, at.residuals["select"](models["nominal"][None])[0])
+    residuals = {name: one.select for name, one in fits.items()}
+    residuals["nominal"] = at.residuals["select"](models["nominal"][None])[0]
+    # That of the worst signal alone would be a few segments' where nothing explains these.
+    costs = {name: cost(at, (at.unflatten(one) ** 2).sum(axis=1)) for name, one in residuals.items()}
     return {name: models[name] for name in sorted(models, key=lambda name: costs[name])}
-
-
-def _gap_on_select(at: Floor, residual: np.ndarray) -> float:
-    """Rms of the worst component on `select`; infinite where the model breaks."""
-    found = float(rms(at, residual).max())
-    return found if np.isfinite(found) else np.inf
 
 
 def _at_bounds(problem: Problem, fit: Fit, price: float) -> dict[int, float]:
