@@ -45,16 +45,11 @@ def clock_of(run: Run, dt: float) -> Clock:
       run: the run.
       dt: step of the simulation in s; ticks are whole steps apart.
     """
-    rate_hz, gaps = run.controller.rate_hz, np.diff(run.time)
-    period = np.median(gaps)
-    ticks = round(period * rate_hz)
-    if ticks >= 1 and abs(period * rate_hz / ticks - 1.0) < _WHOLE:
-        count = np.concatenate([[0.0], np.cumsum(np.round(gaps / period))])
-        row_s, first = np.polyfit(count, run.time, 1)
-        even = first + row_s * count
-        if np.abs(run.time - even).max() < 0.5 / rate_hz:
-            # The line's slope is not exact either.
-            return Clock(even, ticks / row_s, 0.25 * dt)
+    rate_hz, (even, row_s) = run.controller.rate_hz, _line(run.time)
+    ticks = round(row_s * rate_hz)
+    if ticks >= 1 and abs(row_s * rate_hz / ticks - 1.0) < _WHOLE and _off(run.time, even) < 0.5 / rate_hz:
+        # The line's slope is not exact either.
+        return Clock(even, ticks / row_s, 0.25 * dt)
     return Clock(run.time, rate_hz, SAME_S)
 
 
@@ -65,17 +60,40 @@ def evened(runs: Sequence[Run]) -> tuple[Run, ...]:
     then. Rows that were really read late are not, and keep their stamps. All runs are judged together, as one program
     recorded them, and those in which little moves say little.
     """
-    lines = [clock_of(run, 0.0).rows if len(run.time) >= 3 * _NEAR else run.time for run in runs]
-    jitters = [(run, line) for run, line in zip(runs, lines, strict=True) if line is not run.time]
+    lines = [_line(run.time) if len(run.time) >= 3 * _NEAR else (run.time, 0.0) for run in runs]
+    even = [
+        time if _off(run.time, time) < 0.5 * row_s else run.time for run, (time, row_s) in zip(runs, lines, strict=True)
+    ]
+    moved = [(run, time) for run, time in zip(runs, even, strict=True) if time is not run.time]
     before, after = (
         sum(len(time) * _roughness(time, run.signals["q"]) for run, time in stamps)
-        for stamps in ([(run, run.time) for run, _ in jitters], jitters)
+        for stamps in ([(run, run.time) for run, _ in moved], moved)
     )
     if not np.any(after < _SMOOTHER * before):
         return tuple(runs)
     return tuple(
-        run if line is run.time else replace(run, time=line - line[0]) for run, line in zip(runs, lines, strict=True)
+        run if time is run.time else replace(run, time=time - time[0]) for run, time in zip(runs, even, strict=True)
     )
+
+
+def _line(time: np.ndarray) -> tuple[np.ndarray, float]:
+    """The times nearest to stamps [rows] that are on a line, and the time between two rows.
+
+    Either no row is missing, or gaps tell how many are. A stamp that is late by half a gap and more would be taken for
+    a row that is missing, and never made up for.
+    """
+    gaps = np.diff(time)
+    steps = np.maximum(np.round(gaps / np.median(gaps)), 1.0)
+    lines = []
+    for count in (np.arange(len(time)), np.concatenate([[0.0], np.cumsum(steps)])):
+        row_s, first = np.polyfit(count, time, 1)
+        lines.append((first + row_s * count, float(row_s)))
+    return min(lines, key=lambda line: np.abs(time - line[0]).mean())
+
+
+def _off(time: np.ndarray, even: np.ndarray) -> float:
+    """How far stamps are from a line, but for one in a hundred."""
+    return float(np.quantile(np.abs(time - even), 0.99))
 
 
 def _roughness(time: np.ndarray, position: np.ndarray) -> np.ndarray:

@@ -563,6 +563,22 @@ def test_stamps_that_jitter_where_positions_do_not_are_put_on_a_line():
     assert clock.evened([short]) == (short,)
 
 
+def test_a_few_rows_that_are_stamped_very_late_miss_no_tick():
+    time = times(2.0)
+    rng = np.random.default_rng(3)
+    late_s = np.minimum(rng.exponential(2e-4, len(time)), 4e-3)
+    # By more than half of the 5 ms between rows.
+    late_s[17] = 4e-3
+    mine = run(time + late_s, target=np.arange(len(time))[:, None] * np.ones(2))
+    found = clock.clock_of(mine, DT)
+    np.testing.assert_allclose(np.diff(found.rows), 0.005, rtol=1e-3)
+    # Where rows are missing, gaps tell how many.
+    there = np.delete(np.arange(len(time)), [40, 41, 90])
+    stamps = (time + np.minimum(late_s, 1e-3))[there]
+    even = clock.clock_of(run(stamps, target=mine.signals["target"][there]), DT).rows
+    np.testing.assert_allclose(np.diff(even), 0.005 * np.diff(there), rtol=1e-3)
+
+
 def test_stamps_off_an_even_clock_are_believed():
     # A logger's clock that goes wrong by a tick, and right again.
     time = times(2.0)
