@@ -179,11 +179,21 @@ def test_a_model_that_lacks_nothing_and_is_far_off_somewhere_is_doubted():
     cell = {"joint": "elbow", "signal": "q", "regime": "fast", "excess_floor_units": 7.4, "low": 0.0}
     result = SimpleNamespace(verdict="no_missing_effect", where=[cell])
     assert _far_off(result) == {"joint": "elbow", "regime": "fast", "excess_floor_units": 7.4}
-    assert "elbow is 7.4 floor units above it" in report._doubt({"far_off": _far_off(result)})
+    summary = {"verdict": result.verdict, "far_off": _far_off(result), "gap": {"after": 1.1}}
+    assert "elbow is 7.4 floor units above it" in report._doubt(summary)
     for where in ([], [cell | {"excess_floor_units": 2.0}], [cell | {"signal": "dq"}]):
         assert _far_off(SimpleNamespace(verdict="no_missing_effect", where=where)) is None
     assert _far_off(SimpleNamespace(verdict="unnamed", where=[cell])) is None
-    assert report._doubt({"far_off": None}) == ""
+    assert report._doubt(summary | {"far_off": None}) == ""
+
+
+@pytest.mark.parametrize(
+    ("verdict", "left", "doubted"),
+    [("named", 12.44, True), ("parameter_change", 5.0, True), ("named", 3.6, False), ("unnamed", 12.4, False)],
+)
+def test_a_name_that_leaves_much_is_doubted(verdict, left, doubted):
+    said = report._doubt({"verdict": verdict, "far_off": None, "gap": {"after": left}})
+    assert said == "" if not doubted else f"Yet {left:.1f} floor units are left" in said
 
 
 def test_every_test_that_an_effect_may_fail_has_words():
