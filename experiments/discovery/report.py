@@ -161,8 +161,8 @@ def _doubt(summary: dict) -> str:
     if summary["verdict"] == "unnamed" or not left >= _MUCH:
         return ""
     return (
-        f" Yet {left:.1f} floor units are left on held-out runs: something else may be missing as well, or in the place "
-        "of what is named."
+        f" Yet {left:.1f} floor units are left on held-out runs: something else may be missing as well, or in place of "
+        "what is named."
     )
 
 
