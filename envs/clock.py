@@ -12,6 +12,7 @@ SAME_S = 2e-6
 
 _WHOLE = 0.01  # how far rows may be from a whole number of ticks, as a share
 _NEAR = 9  # rows
+_WINDOW = 51  # rows, over which jitter averages out
 _SMOOTHER = 0.7  # least fall of the roughness of some joint's positions, as a share of its mean square
 
 
@@ -57,13 +58,12 @@ def evened(runs: Sequence[Run]) -> tuple[Run, ...]:
     """Puts the time stamps of a log on lines where positions say that their jitter is of the stamps alone.
 
     A joint at 3 rad/s that was stamped 0.15 ms late seems to be off by 0.45 mrad. Positions are much smoother on a line
-    then. Rows that were really read late are not, and keep their stamps. All runs are judged together, as one program
-    recorded them, and those in which little moves say little.
+    then. Rows that were really read late are not, and keep their stamps, as do those of a clock that wanders slowly, of
+    which smoothness says nothing. All runs are judged together, as one program recorded them, and those in which
+    little moves say little.
     """
-    lines = [_line(run.time) if len(run.time) >= 3 * _NEAR else (run.time, 0.0) for run in runs]
-    even = [
-        time if _off(run.time, time) < 0.5 * row_s else run.time for run, (time, row_s) in zip(runs, lines, strict=True)
-    ]
+    even = [_line(run.time)[0] if len(run.time) >= 3 * _NEAR else run.time for run in runs]
+    even = [line if _only_jitters(run.time, line) else run.time for run, line in zip(runs, even, strict=True)]
     moved = [(run, time) for run, time in zip(runs, even, strict=True) if time is not run.time]
     before, after = (
         sum(len(time) * _roughness(time, run.signals["q"]) for run, time in stamps)
@@ -77,23 +77,28 @@ def evened(runs: Sequence[Run]) -> tuple[Run, ...]:
 
 
 def _line(time: np.ndarray) -> tuple[np.ndarray, float]:
-    """The times nearest to stamps [rows] that are on a line, and the time between two rows.
-
-    Either no row is missing, or gaps tell how many are. A stamp that is late by half a gap and more would be taken for
-    a row that is missing, and never made up for.
-    """
-    gaps = np.diff(time)
-    steps = np.maximum(np.round(gaps / np.median(gaps)), 1.0)
-    lines = []
-    for count in (np.arange(len(time)), np.concatenate([[0.0], np.cumsum(steps)])):
-        row_s, first = np.polyfit(count, time, 1)
-        lines.append((first + row_s * count, float(row_s)))
-    return min(lines, key=lambda line: np.abs(time - line[0]).mean())
+    """The times nearest to stamps [rows] that are on a line, and the time between two rows; some may be missing."""
+    rows, period = np.arange(len(time)), float(np.median(np.diff(time)))
+    # Stamps may be late, so the earliest of the next ones says where a row is; a hole moves all of them.
+    behind = np.concatenate([time - period * rows, np.full(_WINDOW - 1, np.inf)])
+    level = np.lib.stride_tricks.sliding_window_view(behind, _WINDOW).min(axis=1)
+    missing = np.maximum(np.round(np.diff(level, prepend=level[0]) / period), 0.0)
+    count = rows + np.cumsum(missing)
+    row_s, first = np.polyfit(count, time, 1)
+    return first + row_s * count, float(row_s)
 
 
 def _off(time: np.ndarray, even: np.ndarray) -> float:
     """How far stamps are from a line, but for one in a hundred."""
     return float(np.quantile(np.abs(time - even), 0.99))
+
+
+def _only_jitters(time: np.ndarray, even: np.ndarray) -> bool:
+    """Tells whether stamps are off a line from row to row, and hardly in the mean of many rows."""
+    off, window = time - even, min(_WINDOW, len(time))
+    slow = np.median(np.lib.stride_tricks.sliding_window_view(off, window), axis=1)
+    fast = off[window // 2 :][: len(slow)] - slow
+    return bool(np.quantile(np.abs(slow), 0.99) < 0.5 * np.quantile(np.abs(fast), 0.9))
 
 
 def _roughness(time: np.ndarray, position: np.ndarray) -> np.ndarray:

@@ -67,7 +67,8 @@ class Args:
     tunings: int = 1
     """Whole tunings of each of these robots, one after another; the policy stays as it is."""
     lanes: int = 1
-    """Robots whose whole tunings run side by side: 1 on a CPU, more on a GPU, where a larger batch costs little."""
+    """Robots whose whole tunings run side by side: 1 on a CPU, more on a GPU, where a larger batch costs little.
+    A test that was stopped goes on with the same number."""
     states: bool = False
     """Whether whole tunings estimate last from measured states, and are `unexplained` where these fit no parameters."""
     others: tuple[str, ...] = ()
@@ -217,7 +218,8 @@ def tested(args: Args, robot: Kind, entries, others, episodes: int, progress: Pr
     learner = Learner(sizes, entries, hidden, kind=robot, states=args.states)
     # The robots of every case: inside, outside in a parameter, and the others.
     memory.check(learner, sets=args.robots * (1 + len(entries) + len(others)))
-    memory.check(learner, lanes=args.lanes)
+    if (lanes := min(args.lanes, args.whole)) > 1:
+        memory.check(learner, lanes)
     policy = starting_policy(args.policy or default_policy(robot), learner, args.out)
     dist = learner.dist(parameters.nominal(entries), args.radius)
     machine = learner.tuner()

@@ -8,6 +8,7 @@ pieces, and the same command goes on after the last one.
 
 import dataclasses
 import itertools
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -187,7 +188,8 @@ def main(args: Args) -> None:
     sizes, robot, entries, case = check(args)
     args = dataclasses.replace(args, policy=args.policy or default_policy(robot))
     learner = Learner(sizes, entries, kind=robot)
-    memory.check(learner, min(args.lanes or sizes.sweep_lanes, lanes(args)[..., 0].size))
+    side_by_side = min(args.lanes or sizes.sweep_lanes, lanes(args)[..., 0].size)
+    memory.check(learner, math.ceil(side_by_side / len(jax.devices())))
     identity = {**dataclasses.asdict(args), "sizes": sizes}
     for option in ("out", *hosts.OPTIONS):
         del identity[option]

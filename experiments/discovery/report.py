@@ -158,7 +158,7 @@ def _doubt(summary: dict) -> str:
         where = f"{cell['joint']} is {cell['excess_floor_units']:.1f} floor units above it in a few segments"
         return f" Yet {where} (regime: {cell['regime']}): record more motions of that kind."
     left = summary["gap"]["after"]
-    if summary["verdict"] == "unnamed" or not left >= _MUCH:
+    if summary["verdict"] not in ("named", "parameter_change") or left < _MUCH:
         return ""
     return (
         f" Yet {left:.1f} floor units are left on held-out runs: something else may be missing as well, or in place of "

@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from experiments.common.rates import wilson
-from jaxtune.discovery.prove import is_worse
+from jaxtune.discovery.evaluate import is_worse
 
 SEVERITIES = (2.0, 5.0, 15.0)
 """Severities at which effects are hidden in the sizes `arm` and `standard`, in floor units."""

@@ -46,12 +46,12 @@ def needed(learner: Learner, sets: int = 0) -> dict[str, float]:
     return {"training": _TRAINING * rollout, "tuning": tuning, "scoring": tuning + scores if sets else 0.0}
 
 
-def check(learner: Learner, lanes: int = 1, sets: int = 0) -> None:
+def check(learner: Learner, lanes: int | None = None, sets: int = 0) -> None:
     """Checks that a run fits.
 
     Args:
       learner: robot and sizes.
-      lanes: runs side by side, spread over devices.
+      lanes: runs side by side on each device; None for a single one, whose training all devices share.
       sets: measured sets that are scored at once.
 
     Raises:
@@ -59,13 +59,14 @@ def check(learner: Learner, lanes: int = 1, sets: int = 0) -> None:
     """
     there, devices = available(), len(jax.devices())
     for what, size in needed(learner, sets).items():
-        # Lanes are whole on a device; the training of a single run is shared, its tuning is not.
-        size *= math.ceil(lanes / devices) if lanes > 1 else 1.0 / devices if what == "training" else 1.0
+        # Every device learns from all episodes of a single run.
+        size *= lanes or (1.0 / devices if what == "training" else 1.0)
         if size > _USABLE * there:
             envs, episodes = learner.preset.ppo.num_envs, learner.preset.tuner.episodes
-            runs = f", {lanes} runs side by side" if lanes > 1 else ""
+            several = (lanes or 1) > 1
+            runs = f", {lanes} runs side by side" if several else ""
             raise ValueError(
-                f"{'lanes' if lanes > 1 else 'preset'}: {what} takes about {size / 2**30:.3g} GiB on a device ({envs} "
+                f"{'lanes' if several else 'preset'}: {what} takes about {size / 2**30:.3g} GiB on a device ({envs} "
                 f"environments, {episodes} episodes{runs}), expected less than {_USABLE * there / 2**30:.3g} GiB, "
                 f"{_USABLE:.0%} of what it has"
             )

@@ -1,7 +1,8 @@
 """What a program has to compute and to move, counted from its jaxpr, and how fast this device computes and moves.
 
-Both are estimates. What XLA finds to be unused counts as well. The steps of a `while` are not known, so they count
-once. Of the data only what must leave a kernel counts: inputs, outputs, and what a loop carries from step to step.
+Both are estimates. What XLA finds to be unused counts as well, and so do operations on integers. The steps of a `while`
+are not known, so they count once. Of the data only what must leave a kernel counts: inputs, outputs, and what a `scan`
+carries from step to step.
 """
 
 import itertools
@@ -73,11 +74,19 @@ def _within(jaxpr) -> Work:
 def _of(equation) -> Work:
     name, params = equation.primitive.name, equation.params
     if name == "scan":
-        body, carried = params["jaxpr"].jaxpr, slice(params["num_consts"], params["num_consts"] + params["num_carry"])
-        before, after = body.invars[carried], body.outvars[: params["num_carry"]]
+        body = getattr(params["jaxpr"], "jaxpr", params["jaxpr"])
+        # Slices have one axis more outside; how many there are has no name that all versions of JAX share.
+        slices_in, slices_out = (
+            sum(one.aval.ndim > inner.aval.ndim for one, inner in zip(*pair, strict=True))
+            for pair in ((equation.invars, body.invars), (equation.outvars, body.outvars))
+        )
+        carry, stop = len(body.outvars) - slices_out, len(body.invars) - slices_in
+        before, after = body.invars[stop - carry : stop], body.outvars[:carry]
         changed = sum(_bytes(new) for old, new in zip(before, after, strict=True) if old is not new)
-        sliced = sum(map(_bytes, (*body.invars[carried.stop :], *body.outvars[params["num_carry"] :])))
+        sliced = sum(map(_bytes, (*body.invars[stop:], *body.outvars[carry:])))
         return _within(body).plus(Work(moved=2.0 * changed + sliced)).times(params["length"])
+    if name.startswith("scatter"):
+        return Work(0.0 if name == "scatter" else float(equation.invars[2].aval.size))
     inner = list(_jaxprs(params))
     if name == "cond":
         return max(map(_within, inner))

@@ -8,6 +8,7 @@ import numpy as np
 
 from jaxtune.discovery.belief import believed, families, posterior, rivals
 from jaxtune.discovery.candidate import Candidate, cost, key_of, measures, squares, total_cost, units_of
+from jaxtune.discovery.evaluate import is_worse, position_gap, rms
 from jaxtune.discovery.evidence import Thresholds, passes, weigh_evidence
 from jaxtune.discovery.fit import Fit, begin, polish, refine
 from jaxtune.discovery.naming import moved_forms, renamed, with_refinements
@@ -69,7 +70,7 @@ def conclude(settings: Settings, problem: Problem, floor: NoiseFloor, state: Sta
     )
     say("learned torque")
     learned = learn(settings, problem, at, best)
-    models = _by_select(at, state, best, learned)
+    models = _by_select(problem, at, state, best, learned)
     compared = (state.null, best, learned)
     costs = [total_cost(at, one, 0.0) for one in compared]
     usual, typical = ([open_gaps(problem, at, one, measure) for one in compared] for measure in measures(at))
@@ -191,15 +192,23 @@ def _proved(
     return best, terms, {h.key: ablated.fit.vector for h, _, ablated in ranked}, tuple(dropped)
 
 
-def _by_select(at: Floor, state: State, best: Candidate, learned: Candidate) -> dict[str, np.ndarray]:
-    """Models by what they are, the one that costs least on `select` first."""
+def _by_select(problem: Problem, at: Floor, state: State, best: Candidate, learned: Candidate) -> dict[str, np.ndarray]:
+    """Models by what they are, the one that costs least on `select` first; last those that would be withdrawn there.
+
+    The worst signal alone may be a few segments' that nothing explains. And the cost counts a segment by the logarithm
+    of its misfit, so it hardly minds one that breaks.
+    """
     fits = {"null": state.null, "effects": best, "learned": learned}
     models = {"nominal": np.zeros_like(best.fit.vector)} | {name: one.fit.vector for name, one in fits.items()}
     residuals = {name: one.select for name, one in fits.items()}
     residuals["nominal"] = at.residuals["select"](models["nominal"][None])[0]
-    # That of the worst signal alone would be a few segments' where nothing explains these.
-    costs = {name: cost(at, (at.unflatten(one) ** 2).sum(axis=1)) for name, one in residuals.items()}
-    return {name: models[name] for name in sorted(models, key=lambda name: costs[name])}
+    gaps = {name: position_gap(problem, rms(at, one)) for name, one in residuals.items()}
+
+    def rank(name: str) -> tuple[bool, float]:
+        worse = is_worse({"before": gaps["nominal"], "null": gaps["null"], "after": gaps[name]})
+        return worse, cost(at, (at.unflatten(residuals[name]) ** 2).sum(axis=1))
+
+    return {name: models[name] for name in sorted(models, key=rank)}
 
 
 def _at_bounds(problem: Problem, fit: Fit, price: float) -> dict[int, float]:

@@ -1,10 +1,14 @@
 """Questions to a model: how far off it is on some splits, in floor units."""
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from jaxtune.discovery.candidate import Candidate
 from jaxtune.discovery.noise_floor import Floor
 from jaxtune.discovery.problem import Problem
+
+_WORSE, _WORSE_FLOORS = 1.1, 0.2  # on sealed: what withdraws a model
 
 
 def rms(at: Floor, residual: np.ndarray) -> np.ndarray:
@@ -26,3 +30,14 @@ def position_gap(problem: Problem, root_mean_squares: np.ndarray) -> float:
     """Picks the worst position of root mean squares [components]: the gap that is reported, in floor units."""
     positions = np.array([signal == "q" for signal, _ in problem.cells])
     return float(root_mean_squares[positions].max())
+
+
+def is_worse(gap: Mapping[str, float]) -> bool:
+    """Says whether a model is worse than the better of nominal and null, by more than a tenth and 0.2 floor units.
+
+    Args:
+      gap: of `before` (nominal), `null` and `after`, in floor units; one that is no number is the worst.
+    """
+    before, null, after = (float(np.nan_to_num(gap[name], nan=np.inf)) for name in ("before", "null", "after"))
+    better = min(before, null)
+    return after > _WORSE * better and after > better + _WORSE_FLOORS

@@ -1,18 +1,16 @@
 """The proof, on sealed segments, which are simulated once, after all decisions (step 10)."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
 from jaxtune.discovery.candidate import Candidate
 from jaxtune.discovery.conclude import Conclusion
-from jaxtune.discovery.evaluate import position_gap, rms
+from jaxtune.discovery.evaluate import is_worse, position_gap, rms
 from jaxtune.discovery.noise_floor import NoiseFloor
 from jaxtune.discovery.problem import Problem
 from jaxtune.discovery.result import Result
 from jaxtune.discovery.state import State
-
-_WORSE, _WORSE_FLOORS = 1.1, 0.2  # on sealed: what withdraws a model
 
 
 def prove(problem: Problem, floor: NoiseFloor, state: State, conclusion: Conclusion) -> Result:
@@ -76,17 +74,6 @@ def prove(problem: Problem, floor: NoiseFloor, state: State, conclusion: Conclus
         proof=proof,
         details=conclusion.details,
     )
-
-
-def is_worse(gap: Mapping[str, float]) -> bool:
-    """Says whether a model is worse than the better of nominal and null, by more than a tenth and 0.2 floor units.
-
-    Args:
-      gap: of `before` (nominal), `null` and `after`, in floor units; one that is no number is the worst.
-    """
-    before, null, after = (float(np.nan_to_num(gap[name], nan=np.inf)) for name in ("before", "null", "after"))
-    better = min(before, null)
-    return after > _WORSE * better and after > better + _WORSE_FLOORS
 
 
 def _placebos(state: State, conclusion: Conclusion) -> dict[str, np.ndarray]:

@@ -50,11 +50,13 @@ def run(
       tunings: of each such robot, one after another. Each measures a new set and starts from the distribution that the
         one before left; the policy stays as it is.
       lanes: robots of which whole tunings run side by side, in one program. More of them suit a GPU, on which a larger
-        batch costs little. All wait for the robot with the most gate calls, so one at a time is best on a CPU.
+        batch costs little. All wait for the robot with the most gate calls, so one at a time is best on a CPU. A last
+        group that is smaller is compiled by itself.
       others: cases by name, of coordinates that replace those drawn. `tuner.simulate` must know them; a coordinate that
         is not in the distribution is 0, that is nominal, in all other cases.
-      keep: given every part of the test, a gate or a robot's whole tunings, so that one that was interrupted goes on.
-      done: called after every gate and tuning with their number so far and in all.
+      keep: given every part of the test, a gate or the whole tunings of robots side by side, so that one that was
+        interrupted goes on.
+      done: called after every gate, and every tuning of robots side by side, with their number so far and in all.
 
     Raises:
       ValueError: fewer than two robots, no gate, tuning or lane, or a tuner whose `simulate` JAX cannot trace.

@@ -563,20 +563,25 @@ def test_stamps_that_jitter_where_positions_do_not_are_put_on_a_line():
     assert clock.evened([short]) == (short,)
 
 
-def test_a_few_rows_that_are_stamped_very_late_miss_no_tick():
-    time = times(2.0)
-    rng = np.random.default_rng(3)
-    late_s = np.minimum(rng.exponential(2e-4, len(time)), 4e-3)
+@pytest.mark.parametrize("mean", [2e-5, 2e-4])
+def test_rows_that_are_stamped_very_late_or_are_missing_miss_no_tick(mean):
+    time = times(10.0)
+    late_s = np.random.default_rng(3).exponential(mean, len(time))
     # By more than half of the 5 ms between rows.
-    late_s[17] = 4e-3
-    mine = run(time + late_s, target=np.arange(len(time))[:, None] * np.ones(2))
-    found = clock.clock_of(mine, DT)
-    np.testing.assert_allclose(np.diff(found.rows), 0.005, rtol=1e-3)
-    # Where rows are missing, gaps tell how many.
-    there = np.delete(np.arange(len(time)), [40, 41, 90])
-    stamps = (time + np.minimum(late_s, 1e-3))[there]
-    even = clock.clock_of(run(stamps, target=mine.signals["target"][there]), DT).rows
-    np.testing.assert_allclose(np.diff(even), 0.005 * np.diff(there), rtol=1e-3)
+    late_s[[1000, 1500]] = 3.5e-3
+    for missing in ([], [1003], [900, 1985, 1986, 1987]):
+        there = np.delete(np.arange(len(time)), missing)
+        found = clock.clock_of(run((time + late_s)[there], target=np.ones((len(there), 2))), DT)
+        assert np.abs(np.diff(found.rows) - 0.005 * np.diff(there)).max() < 1e-6
+        assert np.abs(found.rows - time[there]).max() < 2 * mean
+
+
+def test_a_clock_that_wanders_slowly_is_believed():
+    time = times(20.0)
+    wanders = time + 1e-3 * np.sin(time)
+    stamps, noise = late(wanders, 2e-4), 1e-5 * np.random.default_rng(1).standard_normal((len(time), 2))
+    mine = run(stamps, q=0.3 * np.sin(8.0 * wanders)[:, None] * [1.0, -1.0] + noise)
+    assert clock.evened([mine]) == (mine,)
 
 
 def test_stamps_off_an_even_clock_are_believed():

@@ -189,7 +189,13 @@ def test_a_model_that_lacks_nothing_and_is_far_off_somewhere_is_doubted():
 
 @pytest.mark.parametrize(
     ("verdict", "left", "doubted"),
-    [("named", 12.44, True), ("parameter_change", 5.0, True), ("named", 3.6, False), ("unnamed", 12.4, False)],
+    [
+        ("named", 12.44, True),
+        ("parameter_change", 5.0, True),
+        ("named", 3.6, False),
+        ("unnamed", 12.4, False),
+        ("no_missing_effect", 6.0, False),
+    ],
 )
 def test_a_name_that_leaves_much_is_doubted(verdict, left, doubted):
     said = report._doubt({"verdict": verdict, "far_off": None, "gap": {"after": left}})

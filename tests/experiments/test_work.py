@@ -37,6 +37,12 @@ def test_moving_numbers_computes_nothing():
     assert work.work(lambda x: x.T.reshape(-1)[::2], jnp.ones((4, 6))).flops == 0
 
 
+def test_numbers_that_are_added_in_places_count():
+    assert work.work(lambda x: jnp.zeros(3).at[:2].add(x), jnp.ones(2)).flops >= 2
+    rows = jnp.arange(1000) % 7
+    assert 1000 <= work.work(lambda x: jnp.zeros(7).at[rows].add(x), jnp.ones(1000)).flops < 20_000
+
+
 def test_the_peaks_of_this_machine_are_positive(monkeypatch):
     monkeypatch.setattr(work, "_SIDE", 64)
     monkeypatch.setattr(work, "_COPIED", 1024)

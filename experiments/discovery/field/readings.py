@@ -82,7 +82,7 @@ def draw(joints: int, rng: np.random.Generator) -> Sensors:
 
 
 def stamped_late(time: np.ndarray, late_s: float, rng: np.random.Generator) -> np.ndarray:
-    """Stamps rows as a program does that other programs delay: most by little, and a few by many times as much.
+    """Stamps rows as a program does that other programs delay: most by little, and one in 150 by five times the mean.
 
     Args:
       time: [rows] s, when they were read.

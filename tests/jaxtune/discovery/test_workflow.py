@@ -11,10 +11,10 @@ from slider import AXES, DIRECTION, HYPOTHESES, LEARNED, WARPED, WILD, problem
 from jaxtune.discovery import noise_floor, state, step, workflow
 from jaxtune.discovery.candidate import Candidate
 from jaxtune.discovery.conclude import _rivals
+from jaxtune.discovery.evaluate import is_worse
 from jaxtune.discovery.evidence import Evidence
 from jaxtune.discovery.fit import begin
 from jaxtune.discovery.naming import renamed, with_refinements
-from jaxtune.discovery.prove import is_worse
 from jaxtune.discovery.result import AcceptedTerm, Settings
 from jaxtune.discovery.screen import Lead
 from jaxtune.discovery.shares import explained, speak

@@ -1,0 +1,39 @@
+"""Which model is saved where no effect gets a name."""
+
+from dataclasses import replace
+
+import pytest
+from slider import problem
+
+from jaxtune.discovery import conclude, noise_floor, state, step
+from jaxtune.discovery.candidate import cost
+from jaxtune.discovery.result import Settings
+
+
+@pytest.fixture(scope="module")
+def stepped():
+    asked = problem({"coulomb": 0.5})
+    floor, begun = state.begin(asked, noise_floor.measure(asked, lambda text: None))
+    found, _ = step.step(Settings(), asked, floor, begun)
+    return asked, floor[asked.main_horizon], found
+
+
+def test_the_model_that_costs_least_on_validation_runs_is_saved(stepped):
+    asked, at, found = stepped
+    assert next(iter(conclude._by_select(asked, at, found, found.best, found.null))) == "effects"
+    # Worse in one segment, as all models would be that none explains, and better in all others.
+    odd = at.unflatten(found.best.select).copy()
+    odd[0] = 1.05 * at.unflatten(found.null.select)[0]
+    best = replace(found.best, select=odd.ravel())
+    assert next(iter(conclude._by_select(asked, at, found, best, found.null))) == "effects"
+
+
+def test_a_model_that_breaks_in_one_segment_is_not_saved(stepped):
+    asked, at, found = stepped
+    broken = at.unflatten(found.best.select).copy()
+    broken[0] *= 1e4
+    best = replace(found.best, select=broken.ravel())
+    costs = [cost(at, (at.unflatten(one.select) ** 2).sum(axis=1)) for one in (best, found.null)]
+    # The cost alone does not mind.
+    assert costs[0] < costs[1]
+    assert next(iter(conclude._by_select(asked, at, found, best, best))) in ("null", "nominal")
