@@ -25,6 +25,11 @@ def machine(config=CONFIG):
     return tuner, tuner.init(toys.policy(), toys.uniform(THREE, 0.2), knobs())
 
 
+def covers_all(*args):
+    """A gate that lets every set pass."""
+    return GateInfo(novelty=jnp.zeros(()), threshold=jnp.ones(()))
+
+
 def counted(parts, **options):
     """A self-test that keeps its parts, as a command writes and reads them."""
     tuner, state = machine()
@@ -99,7 +104,9 @@ def test_whole_tunings_say_how_they_end(report):
 
 
 def test_whole_tunings_side_by_side_end_as_one_after_another():
-    tuner, state = machine(toys.TINY)
+    # Of few episodes a regression is all rounding, and so are ranks of a model that hardly learnt.
+    tuner, state = machine(dataclasses.replace(toys.TINY, episodes=128))
+    tuner = dataclasses.replace(tuner, verify=covers_all)
     sizes = {"robots": 2, "whole": 3, "tunings": 2}
 
     def rows(lanes, calls):
@@ -115,18 +122,19 @@ def test_whole_tunings_side_by_side_end_as_one_after_another():
     # A gate call and six tunings, of two robots and then of one.
     assert calls == [(number, 7) for number in (1, 3, 5, 6, 7)]
     for one, other in zip(alone, together, strict=True):
-        assert (one["verdict"], one["held"], one["covered"]) == (other["verdict"], other["held"], other["covered"])
+        assert one["verdict"] == other["verdict"] == Verdict.ACCEPT
         np.testing.assert_allclose(one["errors"], other["errors"], atol=5e-3)
+    # Robots and tunings are not mixed up.
+    assert np.ptp([row["errors"] for row in together], axis=0).max() > 0.05
 
 
 def test_whole_tunings_may_end_with_measured_states():
     slider = toys.Slider(noise=0.0)
-    covered = lambda *args: GateInfo(novelty=jnp.zeros(()), threshold=jnp.ones(()))  # noqa: E731
     tuner = Tuner(
         config=dataclasses.replace(toys.TINY, held_out_sets=99, min_radius=0.01),
         train_policy=keep,
         simulate=slider.simulate,
-        verify=covered,
+        verify=covers_all,
         replay=slider.replay(),
     )
     state = tuner.init(toys.policy(), toys.uniform({"friction": 0.0, "mass": 0.0}, 0.2), knobs())
