@@ -21,7 +21,7 @@ _TIMES = 5
 # They move or choose numbers, and compute none.
 _MOVES = {
     *("broadcast_in_dim", "reshape", "transpose", "squeeze", "expand_dims", "slice", "dynamic_slice", "gather", "pad"),
-    *("dynamic_update_slice", "scatter", "concatenate", "rev", "copy", "copy_p", "convert_element_type", "iota"),
+    *("dynamic_update_slice", "concatenate", "rev", "copy", "convert_element_type", "iota"),
     *("bitcast_convert_type", "stop_gradient", "split", "select_n"),
 }
 

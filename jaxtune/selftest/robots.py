@@ -198,7 +198,7 @@ def _tune(
         now, rows = jax.tree.map(lambda leaf: jnp.stack([leaf] * len(group)), blank), []
         for index, (key_measure, key_tune) in enumerate(zip(keys[::2], keys[1::2], strict=True)):
             if index:
-                done(group.start * tunings + index * len(group) + number * whole)
+                done(group.start * tunings + index * len(group) + number * of_case)
             measured = jax.tree.map(lambda leaf: leaf[:, 0], measure(jnp.stack(key_measure), now, coords))
             # The state stays on its devices: from others the programs would be compiled anew.
             now, info = tune(jnp.stack(key_tune), now, measured)
@@ -206,13 +206,13 @@ def _tune(
             rows.append([_ended(*_lane(ended, lane), one) for lane, one in enumerate(drawn)])
         return {"robots": list(zip(*rows, strict=True))}
 
-    tuned, whole = {}, groups[-1].stop * tunings if groups else 0
+    tuned, of_case = {}, groups[-1].stop * tunings if groups else 0
     for number, (name, replaced) in enumerate(cases.items()):
         ended = []
         for group in groups:
             part = f"case_{number}_robots_{group.start}_to_{group.stop - 1}"
             ended += keep(part, partial(each, number, replaced, group))["robots"]
-            done(group.stop * tunings + number * whole)
+            done(group.stop * tunings + number * of_case)
         tuned[name] = tuple(_tuned(rows, dists.names(state.dist)) for rows in zip(*ended, strict=True))
     return tuned
 
