@@ -209,11 +209,29 @@ class Rig:
         Returns:
           Masses of the bodies, [bodies] kg, and the diagonal of the inertia matrix in this pose, [joints] kg m^2.
         """
-        data, dense = mujoco.MjData(self.mj_model), np.zeros((self.mj_model.nv, self.mj_model.nv))
+        dense = np.zeros((self.mj_model.nv, self.mj_model.nv))
+        mujoco.mj_fullM(self.mj_model, self._posed(pose), dense)
+        return self.mj_model.body_mass[self._bodies], np.diag(dense)[self.dof]
+
+    def levers(self, pose: np.ndarray) -> np.ndarray:
+        """Computes how fast each joint moves each body's centre of mass, from which scales of coordinates follow.
+
+        Args:
+          pose: of the joints, [joints] rad.
+
+        Returns:
+          Speed of the centre by speed of the joint, [bodies, joints] m; of a slide without unit.
+        """
+        data, jacobian = self._posed(pose), np.zeros((len(self._bodies), 3, self.mj_model.nv))
+        for body, mine in zip(self._bodies, jacobian, strict=True):
+            mujoco.mj_jacBodyCom(self.mj_model, data, mine, None, body)
+        return np.linalg.norm(jacobian, axis=1)[:, self.dof]
+
+    def _posed(self, pose: np.ndarray) -> mujoco.MjData:
+        data = mujoco.MjData(self.mj_model)
         data.qpos[self.qpos] = pose
         mujoco.mj_forward(self.mj_model, data)
-        mujoco.mj_fullM(self.mj_model, data, dense)
-        return self.mj_model.body_mass[self._bodies], np.diag(dense)[self.dof]
+        return data
 
     def moves(self, on: str, place: str) -> tuple[int, ...]:
         """Finds the joints whose motion an effect at a place changes directly.

@@ -15,6 +15,7 @@ from envs.rig import Rig
 from envs.segments import smoothed
 
 _PINION_M = 0.05
+_LEVER_M = 0.001  # a centre of mass on its joint's axis is not dragged
 _DRIVEN = 0.01  # least share of the torque that moves a joint's inertia; a passive joint gets none
 
 
@@ -29,7 +30,8 @@ def measure_scales(rig: Rig, runs: Sequence[Run]) -> dict[str, np.ndarray]:
         stiffness  torque / (0.02 angle)       Nm/rad
         inertia    diagonal of the joint-space inertia in the mean pose, kg m^2
         mass       mass of the body            kg
-        drag       9.81 mass                   N s/m
+        drag       least of torque / (lever rms(v)) over the joints that move the body, with the lever
+                   and the speed v of its centre of mass in the mean pose; 1 mm of lever at least   N s/m
         speed      rms(dq)                     rad/s
         slow       0.1 rms(dq)                 rad/s
         motor      largest limit / rms(dq)     Nm s/rad
@@ -54,11 +56,14 @@ def measure_scales(rig: Rig, runs: Sequence[Run]) -> dict[str, np.ndarray]:
         # An infinite limit is no limit; without any, `motor` is tiny.
         limit.append(np.where(np.isfinite(most), most, 0.0))
         pose.append(position)
-    mass, inertia = rig.inertias(np.concatenate(pose).mean(axis=0))
+    mean_pose = np.concatenate(pose).mean(axis=0)
+    mass, inertia = rig.inertias(mean_pose)
     moves = inertia * _rms(rise)
     torque = np.where(_rms(torque) > _DRIVEN * moves, _rms(torque), moves)
     turns = np.array([rig.mj_model.joint(name).type[0] == mujoco.mjtJoint.mjJNT_HINGE for name in rig.joints])
     angle = np.where(turns, 1.0, _PINION_M)
+    levers = np.maximum(rig.levers(mean_pose), _LEVER_M)
+    fast = np.linalg.norm(levers * _rms(speed), axis=1)
     return {
         "torque": torque,
         "damping": torque / _rms(speed),
@@ -66,7 +71,7 @@ def measure_scales(rig: Rig, runs: Sequence[Run]) -> dict[str, np.ndarray]:
         "stiffness": torque / (0.02 * angle),  # of a spring that winds up by 20 mrad under the rms torque
         "inertia": inertia,
         "mass": mass,
-        "drag": mass * 9.81,  # a drag that equals the link's weight at 1 m/s
+        "drag": (torque / levers).min(axis=1) / fast,
         "speed": _rms(speed),
         "slow": 0.1 * _rms(speed),
         "angle": angle,

@@ -12,7 +12,7 @@ from experiments.common import checkpoint, compiler
 from experiments.common.cli import bars, console, run
 from experiments.discovery import gate, report
 from experiments.discovery.investigate import investigate
-from experiments.discovery.setup import digest, read_logs
+from experiments.discovery.measured import digest, read_logs
 from jaxtune.discovery.workflow import share_done
 
 

@@ -20,7 +20,7 @@ from envs.segments import HISTORY_S
 from experiments.common import checkpoint
 from experiments.common.cli import bars, console, run
 from experiments.discovery import playback, sysid_fit, sysid_parameters
-from experiments.discovery.setup import read_logs
+from experiments.discovery.measured import read_logs
 
 SEGMENTS_S = (0.15, 0.45)
 """Lengths in s of the segments on which models are compared, beside free runs."""

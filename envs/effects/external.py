@@ -29,10 +29,10 @@ ROWS = (
         name="drag",
         on="body",
         parameters=(
-            Parameter(name="n_s_per_m", scale="drag", bounds=(0.0, 15.0), prior=0.3),
+            Parameter(name="n_s_per_m", scale="drag", bounds=(0.0, 5.0), prior=0.3),
             Parameter(name="n_s2_per_m2", scale="drag", bounds=(-15.0, 15.0), prior=0.3),
         ),
-        sizes=(0.05,),
+        sizes=(0.03,),
         forms=(Form("quadratic", "drag", "n_s2_per_m2"),),
         act=_drag,
         sentence="A cable or the air drags on the link in proportion to its speed.",

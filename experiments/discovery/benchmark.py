@@ -10,8 +10,8 @@ from experiments.common import checkpoint, plots
 from experiments.common.checkpoint import read_json, write_json, write_text
 from experiments.discovery import gate
 from experiments.discovery.investigate import investigate
+from experiments.discovery.measured import read_logs
 from experiments.discovery.scores import page, score, tally
-from experiments.discovery.setup import read_logs
 
 
 class Case(Protocol):

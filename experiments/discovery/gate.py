@@ -15,7 +15,7 @@ from envs.logs import Log, Run, splits
 from envs.readings import quantum_of
 from envs.smoothing import smoothed
 from experiments.discovery.cutting import fitting_horizons
-from experiments.discovery.setup import check_simulatable, without_sealed
+from experiments.discovery.measured import check_simulatable, without_sealed
 
 _LEAST_SEGMENTS = 3  # of the longest horizon in every split
 _REST = 2e-3  # rad or m, and in quanta: what a joint at rest may wander, averaged over a tenth of a second

@@ -9,7 +9,8 @@ from envs import corrected
 from envs.logs import Log
 from experiments.common import checkpoint
 from experiments.common.checkpoint import read_json, write_json
-from experiments.discovery.setup import Question, build_question, read_logs
+from experiments.discovery.measured import read_logs
+from experiments.discovery.question import Question, build_question
 from experiments.discovery.summary import details, free_runs, summarise
 from jaxtune.discovery import workflow
 from jaxtune.discovery.noise_floor import Say

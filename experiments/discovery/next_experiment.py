@@ -10,7 +10,7 @@ from envs import segments
 from envs.logs import Log, Run
 from envs.models import BUILT_IN
 from experiments.discovery.excitation import TargetRun, controller_of, deciding, passive, scaled, unlimited_slides
-from experiments.discovery.setup import Question
+from experiments.discovery.question import Question
 from experiments.discovery.whole_runs import simulate_runs
 from jaxtune.discovery.result import Result
 

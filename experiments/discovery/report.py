@@ -10,7 +10,7 @@ from rich.table import Table
 
 from envs.logs import Log
 from experiments.common import plots, report
-from experiments.discovery.setup import Question
+from experiments.discovery.question import Question
 from jaxtune.discovery.result import Result
 
 VERDICTS = {

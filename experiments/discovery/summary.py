@@ -10,7 +10,7 @@ from envs.logs import Log
 from envs.rig import Rig
 from experiments.discovery.hypotheses import hypotheses
 from experiments.discovery.next_experiment import deciding_experiment
-from experiments.discovery.setup import Question
+from experiments.discovery.question import Question
 from experiments.discovery.whole_runs import simulate_runs
 from jaxtune.discovery.fit import Fit
 from jaxtune.discovery.problem import Hypothesis, acts_within

@@ -10,7 +10,7 @@ import numpy as np
 from envs import segments
 from envs.effects.memory import LONGEST_S
 from envs.logs import Run
-from experiments.discovery.setup import Question
+from experiments.discovery.question import Question
 from jaxtune import devices
 
 _WIDTH = 16  # simulations side by side

@@ -12,7 +12,7 @@ from functools import cached_property
 
 import numpy as np
 
-from jaxtune.discovery.least_squares import Counts, Linear
+from jaxtune.discovery.least_squares import Counts, Linear, of_size
 from jaxtune.discovery.problem import Hypothesis
 from jaxtune.discovery.simulation import Evaluate
 
@@ -48,6 +48,18 @@ class Free:
         """Keeps the coordinates for which `kept` [coordinates] is True, such as all but an ablated effect's."""
         return Free(*(part[kept] for part in self.parts()))
 
+    def penalty(self, coordinates: np.ndarray) -> float:
+        """What the prior says against coordinates [coordinates] (`least_squares`)."""
+        z = coordinates / self.sd
+        return float(np.where(self.nominal, z**2, of_size(z)).sum())
+
+    def deviations(self, coordinates: np.ndarray) -> np.ndarray:
+        """Deviations [coordinates] of the Gaussian that stands for the prior around coordinates [coordinates].
+
+        It pulls as the prior does there and is nowhere below it, so a step that lowers it lowers the cost.
+        """
+        return self.sd * np.where(self.nominal, 1.0, np.sqrt(1.0 + (coordinates / self.sd) ** 2))
+
     def parts(self) -> tuple[np.ndarray, ...]:
         """Lists its arrays in the order of the fields; each has one row for each coordinate."""
         return self.directions, self.sd, self.bounds, self.nominal
@@ -79,8 +91,8 @@ class Fit:
 
     @property
     def penalty(self) -> float:
-        """What the prior says against the coordinates: |c / s|^2."""
-        return float(((self.coordinates / self.free.sd) ** 2).sum())
+        """What the prior says against the coordinates."""
+        return self.free.penalty(self.coordinates)
 
     @cached_property
     def cost(self) -> float:
@@ -100,7 +112,8 @@ class Fit:
     def linear(self) -> Linear:
         """The linear model of the residuals around this point, with the prior: r(c + u) = r + J u."""
         weight = self.counts.weights(self.residual)
-        return Linear(self.residual, self.jacobian, self.coordinates, self.free.sd, weight)
+        sd = self.free.deviations(self.coordinates)
+        return Linear(self.residual, self.jacobian, self.coordinates, sd, weight)
 
     def moved(self, scale: float) -> np.ndarray:
         """Coordinates after a share `scale` of the damped Gauss-Newton step; they never leave the bounds."""

@@ -1,4 +1,4 @@
-"""Least squares with Gaussian priors, on residuals in floor units, whose variance may exceed the floor's.
+"""Least squares with priors, on residuals in floor units, whose variance may exceed the floor's.
 
 Even the right effect, in another functional form than the library's, leaves more than the noise floor, and in a few
 segments much more than in the others: where a joint sticks or a state was estimated across a jump. So the residuals of
@@ -7,16 +7,22 @@ of them has a t distribution. With the mean square m of a component over a segme
 numbers, and f degrees of freedom, the cost of a model is twice the negative logarithm of its posterior, with v at its
 maximum:
 
-    C = sum over components and segments of n log v + (n + f) log(1 + n m / (f v)) + |c / s|^2,   v >= 1,
+    C = sum over components and segments of n log v + (n + f) log(1 + n m / (f v)) + sum of P(c / s),   v >= 1,
 
 with coordinates c, seen from the prior's centre, and prior deviations s. A component that nothing explains yet is thus
 weighed by its own misfit, and a segment that nothing explains counts by the logarithm of its own: neither can drown
-what the others and the prior say. Around a point the cost is least squares with weights w,
+what the others and the prior say.
 
-    L(u) = w |r + J u|^2 + |(c + u) / s|^2,   w = (n + f) / (f v + n m) a,
+The nominal parameters have a Gaussian prior, P(z) = z^2. How large an effect is, if it is there, nobody knows: up to
+its deviation all sizes are about as likely, and beyond it all orders of magnitude, P(z) = log(1 + z^2) (`of_size`). An
+encoder that is off by a tooth of its horn is ten deviations off; a Gaussian prior would let another effect have it.
 
-with the share a of rows that count as independent (`Counts`). They are computed anew after every step (iteratively
-reweighted least squares).
+Around a point the cost is least squares with weights w and deviations s',
+
+    L(u) = w |r + J u|^2 + |(c + u) / s'|^2,   w = (n + f) / (f v + n m) a,   s'^2 = s^2 (1 + z^2),
+
+with the share a of rows that count as independent (`Counts`), and s' = s for a Gaussian prior. Both are computed anew
+after every step (iteratively reweighted least squares).
 """
 
 from collections.abc import Callable
@@ -28,6 +34,11 @@ from scipy.optimize import lsq_linear
 _FREEDOM = 4.0  # degrees of freedom of the t distribution
 _RARE = 50  # one segment of so many, in every component, may be off for a reason that no model has
 _ROUNDS, _SETTLED = 60, 1e-3  # rounds of expectation and maximisation at most; change of a variance that ends them
+
+
+def of_size(z: np.ndarray) -> np.ndarray:
+    """What the prior says against sizes `z` of effects, in deviations: log(1 + z^2)."""
+    return np.log1p(z**2)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,7 +115,7 @@ class Linear:
     offset: np.ndarray
     """[coordinates]: where the point is, seen from the prior's centre."""
     sd: np.ndarray
-    """[coordinates]: standard deviation of the prior."""
+    """[coordinates]: standard deviation of the prior, or of the Gaussian that stands for it here."""
     weight: np.ndarray
     """[features]"""
 

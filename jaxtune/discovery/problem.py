@@ -43,7 +43,7 @@ class Hypothesis:
     bounds: np.ndarray
     """[parameters, 2]: least and largest coordinate."""
     prior: np.ndarray
-    """[parameters]: standard deviation of the coordinates before anything was measured."""
+    """[parameters]: coordinates up to which all sizes are about as likely before anything was measured."""
     joints: tuple[int, ...]
     """Joints that it acts at: its places, or for a link the joint that moves it; empty where it acts at none alone."""
     form: str = ""

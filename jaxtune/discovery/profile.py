@@ -163,6 +163,6 @@ def profile_of(fit: Fit, library: np.ndarray, shares: np.ndarray) -> Profile:
         of_slopes=total[:, slopes, changes],
         gram=total[:, changes, changes],
         offset=fit.coordinates,
-        precision=fit.free.sd**-2.0,
+        precision=fit.free.deviations(fit.coordinates) ** -2.0,
         bounds=fit.free.bounds,
     )

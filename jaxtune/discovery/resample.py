@@ -79,8 +79,8 @@ def in_units(values: np.ndarray, unit: np.ndarray) -> np.ndarray:
 def standard_errors(fit: Fit, unit: np.ndarray) -> np.ndarray:
     """Computes standard errors [coordinates] that allow for residuals that go together within a unit.
 
-    The sandwich covariance (White, 1980; clustered): with N = J'WJ + diag(1/sd^2), the curvature of the cost, and
-    g_b = sum_(s in b) J_s'W r_s,
+    The sandwich covariance (White, 1980; clustered): with N = J'WJ + diag(1/sd^2), the curvature of the cost
+    (`Linear`), and g_b = sum_(s in b) J_s'W r_s,
 
         Cov = N^-1 (n / (n - 1) sum_b g_b g_b' + diag(1/sd^2)) N^-1,   at least N^-1 itself.
 
@@ -88,8 +88,9 @@ def standard_errors(fit: Fit, unit: np.ndarray) -> np.ndarray:
       fit: residuals and slopes on `train`.
       unit: [segments] of `train`, from `units`.
     """
-    value, slope = fit.linear.rows()
-    prior = np.diag(1.0 / fit.free.sd**2)
+    linear = fit.linear
+    value, slope = linear.rows()
+    prior = np.diag(linear.sd**-2.0)
     inverse = np.linalg.pinv(slope.T @ slope, hermitian=True)
     rows = len(fit.residual)
     pull = (slope[:rows] * value[:rows, None]).reshape(len(unit), -1, slope.shape[1]).sum(axis=1)

@@ -14,6 +14,7 @@ import numpy as np
 
 from jaxtune.discovery.curves import Curves, Group, Library, on_segments, probes_of, simulate_library
 from jaxtune.discovery.fit import Fit, Free, taken_over
+from jaxtune.discovery.least_squares import of_size
 from jaxtune.discovery.noise_floor import Floor, Say
 from jaxtune.discovery.problem import Hypothesis, are_distinct
 from jaxtune.discovery.profile import Changes, Profile, profile_of
@@ -196,9 +197,14 @@ def _best(
     """The point, of some or of all that are worth a look, at which a group costs least beside a model."""
     points = _points(profile, group, curves) if points is None else points
     costs, starts = profile.costs(curves.at(group, points), reweighted)
-    costs = costs + ((points / np.concatenate([one.prior for one in group])) ** 2).sum(axis=1)
+    costs = costs + _of_sizes(points, group)
     best = int(np.argmin(costs))
     return Lead(group, points[best], starts[best], float(costs[best]))
+
+
+def _of_sizes(points: np.ndarray, group: Group) -> np.ndarray:
+    """What the prior says against points [..., parameters] of a group, [...]."""
+    return of_size(points / np.concatenate([one.prior for one in group])).sum(axis=-1)
 
 
 def _points(profile: Profile, group: Group, curves: Curves) -> np.ndarray:
@@ -231,6 +237,6 @@ def _pairs_with(profile: Profile, lead: Lead, groups: Sequence[Group], curves: C
     found = []
     for best in (_best(beside, other, curves) for other in rough[: 3 * _PARTNERS]):
         point, start = np.concatenate([lead.point, best.point]), best.start[: len(profile.offset)]
-        cost = best.cost + ((lead.point / np.concatenate([one.prior for one in first])) ** 2).sum()
+        cost = best.cost + float(_of_sizes(lead.point, first))
         found.append(Lead((*first, *best.hypotheses), point, start, cost))
     return _once(found)[:_PARTNERS]

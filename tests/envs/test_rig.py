@@ -244,7 +244,7 @@ def test_a_segment_begins_as_the_effect_has_left_the_robot(arm, name, value, mos
     ("name", "value"), [("sensor_lag", {"seconds": 0.008, "velocity_faster": 1.0}), ("velocity_lag", {"seconds": 0.02})]
 )
 def test_a_segment_begins_right_where_one_signal_alone_is_filtered(arm, name, value):
-    # Velocities that do not agree with positions are not used (`experiments.discovery.setup.drop_filtered`).
+    # Velocities that do not agree with positions are not used (`experiments.discovery.measured.drop_filtered`).
     effect = {name: dict.fromkeys(rigs.ARM_JOINTS, value)}
     cut = recut(arm, np.repeat(SWING[::5], 5, axis=0), signals=("q",), **effect)
     error, without = (np.sqrt((one**2).mean()) for one in (errors(arm, cut, **effect), errors(arm, cut)))
@@ -521,6 +521,12 @@ def test_a_bent_arm_has_less_inertia_at_its_shoulder(arm):
 
     # The lower link's centre is 0.125 m from the elbow, that 0.3 m from the shoulder: 2 x 0.6 x 0.3 x 0.125 x cos.
     np.testing.assert_allclose(shoulder(0.0) - shoulder(np.pi / 2), 0.045, rtol=1e-6)
+
+
+def test_levers_are_how_fast_joints_move_centres_of_mass(arm):
+    straight, bent = (arm.rig.levers(np.array([0.3, elbow])) for elbow in (0.0, np.pi / 2))
+    np.testing.assert_allclose(straight, [[0.15, 0.0], [0.425, 0.125]], atol=1e-6)
+    np.testing.assert_allclose(bent[1], [np.hypot(0.3, 0.125), 0.125], rtol=1e-6)
 
 
 # Parameters.

@@ -14,7 +14,8 @@ from envs.models import suspended
 from envs.null_logs import Robot, as_recorded, play
 from experiments.discovery.blind_cases import ARM
 from experiments.discovery.cutting import HORIZONS_S, cut_log, fitting_horizons, split_in_time
-from experiments.discovery.setup import build_question, drop_filtered, read_logs
+from experiments.discovery.measured import drop_filtered, read_logs
+from experiments.discovery.question import build_question
 
 MEASURED = Path(__file__).parents[3] / "shared" / "data"
 JOINTS = ("shoulder", "elbow")

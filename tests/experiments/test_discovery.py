@@ -18,7 +18,8 @@ from experiments.discovery.blind_cases import ARM, SIZE_BOUNDS, SIZES
 from experiments.discovery.blind_robots import OUTSIDE, Truth, record
 from experiments.discovery.excitation import excitation
 from experiments.discovery.hypotheses import forms, hypotheses, place_sets, unknown_directions
-from experiments.discovery.setup import build_question, drop_filtered, read_logs
+from experiments.discovery.measured import drop_filtered, read_logs
+from experiments.discovery.question import build_question
 from jaxtune.discovery.problem import are_distinct
 
 JOINTS = ("shoulder", "elbow")

@@ -16,7 +16,7 @@ from experiments.discovery import gate
 from experiments.discovery.blind_cases import ARM
 from experiments.discovery.blind_robots import Truth, record
 from experiments.discovery.excitation import excitation
-from experiments.discovery.setup import digest, read_logs
+from experiments.discovery.measured import digest, read_logs
 
 JOINTS = ("shoulder", "elbow")
 GAINS = {"kp": np.array([40.0, 20.0]), "kd": np.array([2.0, 0.8]), "torque_limit_nm": np.array([15.0, 15.0])}

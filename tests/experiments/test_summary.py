@@ -14,7 +14,7 @@ from experiments.discovery import next_experiment, report
 from experiments.discovery.blind_cases import ARM
 from experiments.discovery.blind_robots import Truth, record
 from experiments.discovery.excitation import excitation
-from experiments.discovery.setup import build_question
+from experiments.discovery.question import build_question
 from experiments.discovery.summary import _far_off, details, free_runs, summarise
 from jaxtune.discovery.evidence import Evidence, Thresholds, passes
 from jaxtune.discovery.fit import Fit, Free

@@ -17,7 +17,7 @@ from experiments.discovery.blind_cases import ARM
 from experiments.discovery.blind_robots import Truth, record
 from experiments.discovery.excitation import excitation
 from experiments.discovery.next_experiment import deciding_experiment
-from experiments.discovery.setup import _Simulator
+from experiments.discovery.question import _Simulator
 from experiments.discovery.whole_runs import simulate_runs
 
 JOINTS = ("shoulder", "elbow")

@@ -1,78 +1,22 @@
-"""Turns measured logs and a nominal model into the problem that discovery works on."""
+"""The measured log that discovery works on: several folders as one, checked, and without what was filtered."""
 
 import hashlib
-from collections.abc import Hashable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from operator import itemgetter
 from pathlib import Path
 
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 
 from envs import models, readings, segments
 from envs.clock import evened
-from envs.effects import LEARNED, LIBRARY
-from envs.logs import Log, Run, read_any, splits, with_halves_swapped, with_splits
-from envs.null_logs import simulate_null_logs
-from envs.regimes import REGIMES
-from envs.rig import Rig
-from envs.scales import measure_scales
-from experiments.discovery.cutting import (
-    BIN_S,
-    HORIZONS_S,
-    cut_log,
-    fitting_horizons,
-    row_rate,
-    split_in_time,
-    told_alike,
-)
-from experiments.discovery.hypotheses import forms, hypotheses, learned_torque, unknown_directions
-from jaxtune.discovery.problem import Problem
-
-__all__ = [
-    "HORIZONS_S",
-    "Question",
-    "build_question",
-    "check_simulatable",
-    "drop_filtered",
-    "read_logs",
-    "without_sealed",
-]
+from envs.logs import Log, Run, read_any, splits, with_halves_swapped
+from experiments.discovery.cutting import row_rate, split_in_time
 
 _LEAST_STALE = 0.02  # share of readings
 _RATES = 1.8  # largest ratio of two runs' rates: all segments have one number of rows. A servo's logs differed by 1.5
 _LATE_S = 0.001  # where velocity and position are further apart, states would follow neither
-
-
-@dataclass(frozen=True)
-class Question:
-    """A discovery problem together with the robot and the runs that its numbers refer to."""
-
-    problem: Problem
-    """What `jaxtune.discovery` works on; it knows numbers, but no robot."""
-    spec: mujoco.MjSpec
-    """The nominal model."""
-    rig: Rig
-    """The simulator with every effect built in, which gives coordinates their names and units."""
-    splits: Mapping[str, tuple[str, ...]]
-    """Names of the runs by split: train, select (validation) and sealed (held-out test)."""
-    notes: tuple[str, ...]
-    """Sentences about what was made of the log: signals that are not used, and why, and how it was split."""
-
-
-@dataclass(frozen=True)
-class _Simulator:
-    """Simulates some signals of a rig. Two of equal layout and signals are equal, so they share compiled programs."""
-
-    rig: Rig = field(compare=False)
-    layout: Hashable
-    signals: tuple[str, ...]
-
-    def __call__(self, system, values, inputs, steps):
-        read = self.rig.on(system).simulate(self.rig.tree(values), inputs, steps)
-        read = read | {"abs_tau": jnp.abs(read["tau"])}
-        return {name: read[name] for name in self.signals}
 
 
 def read_logs(
@@ -149,92 +93,6 @@ def digest(log: Log, spec: mujoco.MjSpec) -> str:
     return found.hexdigest()
 
 
-def build_question(
-    log: Log,
-    spec: mujoco.MjSpec,
-    horizons: Sequence[float] | None = None,
-    null_logs: int = 20,
-    seed: int = 0,
-    plain: Rig | None = None,
-) -> Question:
-    """Turns a log and a nominal model into a problem: hypotheses, measured segments and simulated null logs.
-
-    It checks that the log can be simulated, before anything is compiled.
-
-    Args:
-      log: what was measured.
-      spec: the nominal model.
-      horizons: lengths of the segments in s; None takes those that fit the rows (`fitting_horizons`).
-      null_logs: number of simulated null logs, which set the noise floor and the thresholds.
-      seed: of the null logs.
-      plain: a rig of the same robot and controller rate, from an earlier question, to reuse its compiled programs.
-
-    Returns:
-      The question.
-
-    Raises:
-      ValueError: the runs cannot be split, are too short for a horizon, or lack what discovery needs.
-    """
-    horizons = fitting_horizons(log, horizons)
-    rate = check_simulatable(log, spec, horizons)
-    log, notes = drop_filtered(with_splits(log))
-    log = replace(log, runs=readings.with_noise(log.runs, without_sealed(log).runs))
-    unsealed = without_sealed(log).runs
-    plain = plain or Rig(spec, log.joints, rate)
-    plain.check_matches(log.joints, rate)
-    rig = plain.scaled(measure_scales(plain, unsealed))
-    # A signal that some runs lack is not compared, since segments of all runs share one layout.
-    signals = tuple(name for name in sorted(segments.COMPARED) if all(name in run.signals for run in log.runs))
-    partly = [
-        name for name in segments.COMPARED if name not in signals and any(name in run.signals for run in log.runs)
-    ]
-    notes = (*notes, *(f"{name} is not in all runs, and is not used" for name in partly))
-    if not all("target" in run.signals for run in log.runs):
-        signals = tuple(name for name in signals if name != "tau")  # sent, not measured
-    axes = {(axis.effect, axis.place): number for number, axis in enumerate(rig.axes)}
-    library = {name: row for name, row in rig.effects.items() if name in LIBRARY}
-    every = hypotheses(rig.axes, rig.places, library)
-    unknowns, unknown_bounds = unknown_directions(rig.axes, rig.control_hz, signals)
-    bin_rows = segments.rows_together(1.0 / log.rate_hz, BIN_S)
-    measured = cut_log(log, rig.dt, signals, horizons)
-    simulated = simulate_null_logs(log, spec, null_logs, seed)
-    nulls = [told_alike(cut_log(one, rig.dt, signals, horizons), measured) for one in simulated]
-    problem = Problem(
-        simulate=_Simulator(plain, plain.layout, signals),
-        system=plain.system,
-        values=rig.inner,
-        axes=len(rig.axes),
-        hypotheses=every,
-        prior=np.array([axis.prior_sd for axis in rig.axes]),
-        unknowns=unknowns,
-        unknown_bounds=unknown_bounds,
-        trees=rig.trees,
-        axis_trees=np.array([_one_tree(rig.trees[list(axis.joints)]) for axis in rig.axes]),
-        data=measured,
-        null_logs=nulls,
-        bin_rows=bin_rows,
-        regimes=REGIMES,
-        components={name: tuple("xyz") if name == "gravity" else rig.joints for name in signals},
-        least_floor=_least_floor(unsealed[0], signals, bin_rows),
-        push={joint: axes["constant_push", joint] for joint in rig.joints},
-        forms=forms(rig.axes, rig.effects, every),
-        residual=learned_torque(rig.axes, LEARNED),
-    )
-    names = {split: tuple(run.name for run in runs) for split, runs in splits(log).items()}
-    return Question(problem, spec, rig, names, (*log.notes, *notes, *_stale_notes(unsealed)))
-
-
-def _least_floor(run: Run, signals: Sequence[str], bin_rows: int) -> np.ndarray:
-    """What the noise of the readings leaves in the mean of a bin, [cells] in the order of `Problem.cells`."""
-    # One estimate for all runs (`readings.with_noise`).
-    return np.concatenate([readings.noise_of(run, name) for name in sorted(signals)]) / np.sqrt(bin_rows)
-
-
-def _one_tree(trees: np.ndarray) -> int:
-    """The kinematic tree of some joints, or -1 where they are of several or none are given."""
-    return int(trees[0]) if len(set(trees.tolist())) == 1 else -1
-
-
 def check_simulatable(log: Log, spec: mujoco.MjSpec, horizons: Sequence[float]) -> float:
     """Checks that the runs of a log can be simulated, and that it says something of every joint that may move.
 
@@ -274,17 +132,6 @@ def check_simulatable(log: Log, spec: mujoco.MjSpec, horizons: Sequence[float]) 
         if run.time[-1] - run.time[0] < least_s:
             raise ValueError(f"{run.name}: got {run.time[-1] - run.time[0]:.3g} s, expected {least_s:.3g} s or more")
     return rate
-
-
-def _stale_notes(runs: Sequence[Run]) -> list[str]:
-    """Says which signals repeat readings that a slow bus had not renewed."""
-    notes = []
-    for name in segments.COMPARED:
-        found = [readings.stale(run, name).ravel() for run in runs if name in run.signals]
-        share = np.concatenate(found).mean() if found else 0.0
-        if share > _LEAST_STALE:
-            notes.append(f"{share:.0%} of the readings of {name} repeat an older one; they are interpolated")
-    return notes
 
 
 def without_sealed(log: Log) -> Log:
@@ -341,3 +188,14 @@ def _drop_declared(log: Log) -> tuple[Log, list[str]]:
 def _without(log: Log, signal: str) -> Log:
     runs = [replace(run, signals={k: v for k, v in run.signals.items() if k != signal}) for run in log.runs]
     return replace(log, runs=tuple(runs))
+
+
+def stale_notes(runs: Sequence[Run]) -> list[str]:
+    """Says which signals repeat readings that a slow bus had not renewed."""
+    notes = []
+    for name in segments.COMPARED:
+        found = [readings.stale(run, name).ravel() for run in runs if name in run.signals]
+        share = np.concatenate(found).mean() if found else 0.0
+        if share > _LEAST_STALE:
+            notes.append(f"{share:.0%} of the readings of {name} repeat an older one; they are interpolated")
+    return notes
