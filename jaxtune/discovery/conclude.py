@@ -71,22 +71,12 @@ def conclude(settings: Settings, problem: Problem, floor: NoiseFloor, state: Sta
     say("learned torque")
     learned = learn(settings, problem, at, best)
     models = _by_select(problem, at, state, best, learned)
-    compared = (state.null, best, learned)
-    costs = [total_cost(at, one, 0.0) for one in compared]
-    usual, typical = ([open_gaps(problem, at, one, measure) for one in compared] for measure in measures(at))
-    speaking = speak(usual, typical, settings.at_floor)
-    share, whole = max(explained_shares([energy(one) for one in gaps], costs) for gaps in speaking)
+    usual, share, whole = _shares(settings, problem, at, (state.null, best, learned))
     explains = usual[1].max() <= settings.at_floor or (
         bool(terms) and share >= settings.share and whole >= settings.least
     )
     changed = _at_bounds(problem, best.fit, state.price) if explains else {}
-    if not explains:
-        verdict = "unnamed"
-    elif any(not problem.is_nominal(term.hypothesis) for term in terms if term.refines is None):
-        # A term about a nominal parameter is a change, however large: the model has the parameter.
-        verdict = "named"
-    else:
-        verdict = "parameter_change" if changed or terms else "no_missing_effect"
+    verdict = _verdict(problem, terms, changed) if explains else "unnamed"
     unit = units_of(problem, at, squares(at, best))[: len(problem.data["train"][at.horizon].run)]
     errors = standard_errors(best.fit, unit)
     terms = tuple(
@@ -114,6 +104,28 @@ def conclude(settings: Settings, problem: Problem, floor: NoiseFloor, state: Sta
             for one, probability in zip(candidates, probabilities, strict=True)
         },
     )
+
+
+def _shares(
+    settings: Settings, problem: Problem, at: Floor, compared: Sequence[Candidate]
+) -> tuple[list[np.ndarray], float, float]:
+    """Gaps of the null, the best model and that with a learned torque, and which shares of them effects explain.
+
+    Returns:
+      Gaps [positions] of each, and `explained_shares` of those gaps that speak for the effects most.
+    """
+    costs = [total_cost(at, one, 0.0) for one in compared]
+    usual, typical = ([open_gaps(problem, at, one, measure) for one in compared] for measure in measures(at))
+    speaking = speak(usual, typical, settings.at_floor)
+    return usual, *max(explained_shares([energy(one) for one in gaps], costs) for gaps in speaking)
+
+
+def _verdict(problem: Problem, terms: Sequence[AcceptedTerm], changed: Mapping[int, float]) -> str:
+    """The verdict of a model that explains what there is."""
+    if any(not problem.is_nominal(term.hypothesis) for term in terms if term.refines is None):
+        # A term about a nominal parameter is a change, however large: the model has the parameter.
+        return "named"
+    return "parameter_change" if changed or terms else "no_missing_effect"
 
 
 def _rivals(candidates: Sequence[Candidate], probabilities: np.ndarray) -> tuple[tuple[str, np.ndarray], ...]:
