@@ -101,8 +101,10 @@ class Chain:
           The robot and the memories after the step, and what was read before it: `q`, `dq` and `tau`, [joints] each.
         """
         joint, within = self.joints(data), self._within(model, x)
-        motor, running = self._seen(joint, memory, within)
+        motor, running = self._seen(values, joint, memory, within)
         memory, torque, readings = self._control(values, memory | {"within": within}, motor, x)
+        # The controller answers a motor that runs ahead only as far as it sees it.
+        within = self.seen(values, within)
         gains = {name: within * x[name] for name in ("stiffness", "damping")}
         torque = torque - x["emf"] * joint[1]
         data, memory, torque = self._move(model, data, memory, values, torque, x | gains)
@@ -133,28 +135,33 @@ class Chain:
         Each rotor is held to its measured motion by a controller of its own, in addition to the motor's torque. It is
         no stiffer than the rotor is heavy, or a twentieth of the joint where it is lighter, so where the rotor meets
         its link again, both feel it. Sensors remember the motors as the controller would have seen them (`_within`).
+        Where the encoder is at the joint, its link is held so instead, and the rotor follows the motor's torque.
 
         Args:
           model: of the robot, effects on its fields included.
           data: the robot before the step.
           memory: before the step.
           values: of the effects.
-          motor: measured positions and velocities of the motors, sensors' errors undone, [2, joints].
+          motor: measured positions and velocities where the encoders are, sensors' errors undone, [2, joints].
           torque: of the motors, as `remember` returns it, [joints] Nm.
           x: the controller's inputs.
 
         Returns:
           The robot and the memories after the step.
         """
-        joint, (far, fast), within = self.joints(data), self.ahead(memory), self._within(model, x)
+        joint, within = self.joints(data), self._within(model, x)
+        far, fast = self.seen(values, self.ahead(memory))
         seen = motor.at[1].add(-within * fast)
         _, memory = self.stage("sensor", values, seen, self._now(x, seen), memory | {"within": within})
-        held = jnp.maximum(model.dof_armature[self.dof], _LIGHT / model.dof_invweight0[self.dof])
-        hold = {"stiffness": held * _HOLD_RAD_S**2, "damping": 2.0 * held * _HOLD_RAD_S}
-        # How fast it runs ahead acts within the step (`envs.effects.transmission`).
+        rotor, inertia = model.dof_armature[self.dof], 1.0 / model.dof_invweight0[self.dof]
+        at_motor = self.seen(values, jnp.ones_like(torque))
+        held = at_motor * jnp.maximum(rotor, _LIGHT * inertia)
+        hold = {"stiffness": held * _HOLD_RAD_S**2, "damping": 2.0 * held * _HOLD_RAD_S, "emf": jnp.zeros_like(torque)}
+        # How fast a rotor runs ahead acts within the step (`envs.effects.transmission`).
         position, speed = motor - joint.at[0].add(far)
-        torque = torque + hold["stiffness"] * position + hold["damping"] * speed
-        return self._move(model, data, memory, values, torque, x | hold | {"emf": jnp.zeros_like(torque)})[:2]
+        pull = _HOLD_RAD_S**2 * position + 2.0 * _HOLD_RAD_S * speed
+        on_links = (1.0 - at_motor) * jnp.maximum(inertia - rotor, _LIGHTEST * inertia) * pull
+        return self._move(model, data, memory, values, torque + held * pull, x | hold, on_links)[:2]
 
     def _within(self, model, x) -> jax.Array:
         """Share of the controller's gains that acts within the step, [joints].
@@ -165,10 +172,15 @@ class Chain:
         gain = (x["stiffness"] * self.period_s + x["damping"]) * self.period_s
         return jnp.clip(gain / jnp.maximum(model.dof_armature[self.dof], 1e-9) - 1.0, 0.0, 1.0)
 
-    def _seen(self, joint, memory, within) -> tuple[jax.Array, jax.Array]:
-        """What encoders and controller see of the motors, on which they sit.
+    def seen(self, values, ahead: jax.Array) -> jax.Array:
+        """What encoders see of how motors run ahead [..., joints]: all of it where they sit on the motors."""
+        return self.stage("encoder", values, ahead, None, {})[0]
+
+    def _seen(self, values, joint, memory, within) -> tuple[jax.Array, jax.Array]:
+        """What encoders and controller see of the motors.
 
         Args:
+          values: of the effects.
           joint: positions and velocities of the joints, [2, joints].
           memory: of the effects.
           within: share of the controller's gains that acts within the step, [joints].
@@ -177,11 +189,14 @@ class Chain:
           Positions and velocities [2, joints], and the part of the motors' velocities [joints] that is not in them,
           because it acts within the step.
         """
-        far, fast = self.ahead(memory)
+        far, fast = self.seen(values, self.ahead(memory))
         return joint + jnp.stack([far, (1.0 - within) * fast]), within * fast
 
-    def _move(self, model, data, memory, values, torque, x) -> tuple[mjx.Data, dict, jax.Array]:
-        """Moves the robot by the torques of its motors, [joints] Nm; the third value is what they gave in the step."""
+    def _move(self, model, data, memory, values, torque, x, on_links=0.0) -> tuple[mjx.Data, dict, jax.Array]:
+        """Moves the robot by the torques of its motors and others on its links, [joints] Nm each.
+
+        The third value is what the motors gave in the step.
+        """
         joint, (before, fast) = self.joints(data), self.ahead(memory)
         given = torque - (x["damping"] + x["emf"]) * fast
         now = self._now(x, joint).replace(
@@ -200,7 +215,7 @@ class Chain:
         # What its controller gave while the motor ran ahead within the step.
         far, fast = self.ahead(memory)
         torque = torque - now.stiffness * (far - before) - now.damping * fast
-        calm = Wrench(torque=jnp.zeros(len(self.dof)), force=jnp.zeros((len(self.bodies), 3)))
+        calm = Wrench(torque=none + on_links, force=jnp.zeros((len(self.bodies), 3)))
         wrench, _ = self.stage("wrench", values, calm, now, memory)
         (friction, rubbing), memory = self.stage("bristle", values, jnp.stack([friction, wrench.torque]), now, memory)
         friction = jnp.maximum(friction, MIN_FRICTION_NM)
@@ -247,7 +262,7 @@ class Chain:
         Returns:
           Read positions and velocities, [2, joints].
         """
-        motor, running = self._seen(joint, memory, memory["within"])
+        motor, running = self._seen(values, joint, memory, memory["within"])
         return self.stage("sensor", values, motor, self._now(x, motor), memory)[0].at[1].add(running)
 
     def joints(self, data: mjx.Data) -> jax.Array:

@@ -367,8 +367,8 @@ class Rig:
         first = first | chain.pressed(values, pressing[: round(_PRESSED_S / self.dt)])
 
         def at(index, data, memory, speeding):
-            """The robot at a step of the history, with accelerations [joints]; encoders sit on the motors."""
-            state = truth[index] - chain.ahead(memory)
+            """The robot at a step of the history, with accelerations [joints]."""
+            state = truth[index] - chain.seen(values, chain.ahead(memory))
             return data.replace(
                 qpos=self._data.qpos.at[self.qpos].set(state[0] + chain.lead_s * state[1]),
                 qvel=self._data.qvel.at[self.dof].set(state[1]),

@@ -300,6 +300,7 @@ class Effect:
         "speed",
         "torque",
         "transmission",
+        "encoder",
         "friction",
         "bristle",
         "wrench",

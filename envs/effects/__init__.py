@@ -9,6 +9,7 @@ of their rows:
     target -command-> -error-> controller -torque-> motor -transmission-> joint -sensor-> readings
                                           friction, bristle, wrench --^
 
+    motor ahead of its joint -encoder-> what sensors see of that
     motor -torque_reading-> recorded torque
 
 The stage `transmission` may take friction and damping from the joint, for they may be the motor's.
@@ -23,6 +24,7 @@ name, or in units of its `scale` where it has one; logarithms for ratios, recipr
 from envs.effects import actuator, contact, external, inertia, joint_friction, nominal, sensing, transmission
 from envs.effects.learned import LEARNED
 from envs.effects.presliding import PRESLIDING
+from envs.effects.transmission import JOINT_ENCODER
 
 LIBRARY = {
     row.name: row
@@ -34,5 +36,5 @@ LIBRARY = {
 NOMINAL = {row.name: row for row in nominal.ROWS}
 """Rows that are fitted under every hypothesis and cannot be named as missing, by name."""
 
-EVERY = {**NOMINAL, **LIBRARY, PRESLIDING.name: PRESLIDING, LEARNED.name: LEARNED}
+EVERY = {**NOMINAL, **LIBRARY, **{row.name: row for row in (PRESLIDING, JOINT_ENCODER, LEARNED)}}
 """All rows, in the order in which they act."""

@@ -14,6 +14,8 @@ _JOINT_FRICTION = {"family": "joint_friction", "on": "joint"}
 _PRESLIDING = Form("presliding", "presliding", "travel_rad", screened=True)
 # While a joint slides, friction that differs between directions is symmetric friction and a constant torque.
 _DIRECTION = Form("direction_dependent", "constant_push", "nm")
+# A joint may stick harder and slide with the rest. The larger part gives the name.
+_STICTION, _SLIDING = Form("stiction", "stribeck"), Form("sliding", "coulomb", "torque_nm")
 
 
 def _coulomb(values, bound, now, memory):
@@ -39,7 +41,7 @@ ROWS = (
         parameters=(Parameter(name="torque_nm", scale="torque", bounds=(-0.5, 5.0), prior=0.3),),
         sizes=(0.03, 0.3),
         act=_coulomb,
-        forms=(_PRESLIDING, _DIRECTION),
+        forms=(_PRESLIDING, _DIRECTION, _STICTION),
         sentence="The joint needs a fixed torque to start moving and loses the same torque while it moves.",
         excited_by="slow triangular reversals",
         **_JOINT_FRICTION,
@@ -65,7 +67,7 @@ ROWS = (
         ),
         sizes=(0.05, 0.3),
         act=_stribeck,
-        forms=(_PRESLIDING, _DIRECTION),
+        forms=(_PRESLIDING, _DIRECTION, _SLIDING),
         sentence="The joint sticks harder than it slides: friction falls as it starts to move.",
         excited_by="slow triangular reversals at several speeds",
         **_JOINT_FRICTION,

@@ -1,7 +1,8 @@
 """Effects between the motor and the joint: backlash, compliance, and the rotor's inertia.
 
-Encoders sit on the motor. Backlash and compliance let the motor run ahead of its joint by an offset o. Only the
-joint is a body of the model; the rotor's inertia J is part of its armature. The offset follows from the balance of
+Backlash and compliance let the motor run ahead of its joint by an offset o. Encoders sit on the motor, or on the joint
+(`JOINT_ENCODER`), where they and the controller see nothing of o: then kp and kd below are zero. Only the joint is a
+body of the model; the rotor's inertia J is part of its armature. The offset follows from the balance of
 torques on the rotor over one step of length dt. If o changes by d within the step, then
 
 - a controller that acts within the step gives kp d + kd d / dt less torque (stiffness kp, damping kd);
@@ -142,6 +143,24 @@ def _root(linear, cubic, value):
     return jnp.where(cubic > 0, root, value / linear)
 
 
+def _joint_encoder(values, ahead, now, memory):
+    """seen = (1 - share) ahead: what encoders see of how far motors run ahead, [..., joints] rad."""
+    del now
+    return (1.0 - values["at_joint"]) * ahead, memory
+
+
+JOINT_ENCODER = Effect(
+    name="joint_encoder",
+    enters="encoder",
+    parameters=(Parameter(name="at_joint", bounds=(0.0, 1.0), prior=0.5),),
+    sizes=(1.0,),
+    act=_joint_encoder,
+    sentence="The encoder sits on the joint, behind the gears.",
+    excited_by="slow triangular reversals",
+    **_TRANSMISSION,
+)
+"""A form of backlash, and no effect of its own."""
+
 ROWS = (
     Effect(
         name="backlash",
@@ -150,7 +169,12 @@ ROWS = (
         sizes=(0.003, 0.02),
         act=_backlash,
         start=_taken_up,
-        forms=(Form("compliant", "compliance", "nm_per_rad"), Form("motor_friction", "backlash", "at_motor")),
+        forms=(
+            Form("compliant", "compliance", "nm_per_rad"),
+            Form("motor_friction", "backlash", "at_motor"),
+            # All that shows then is that the joint is not driven for a moment.
+            Form("joint_encoder", "joint_encoder", "at_joint", screened=True),
+        ),
         sentence="The gears have backlash: the motor turns a little before the joint does.",
         excited_by="slow triangular reversals through the posture without gravity torque",
         **_TRANSMISSION,

@@ -33,10 +33,15 @@ def renamed(problem: Problem, candidate: Candidate) -> Candidate:
                 for other in problem.forms
                 if np.array_equal(other.directions, effect.directions) and any(other.shapes(twin) for twin in twins)
             ]
-            sizes = [np.abs(candidate.fit.coordinates[candidate.fit.along(one)]).max() for one in (effect, form)]
-            if shapes and sizes[1] > sizes[0]:
+            if shapes and _size(candidate, form) > _size(candidate, effect):
                 other_names |= {effect.key: twins[0], form.key: shapes[0]}
     return replace(candidate, hypotheses=tuple(other_names.get(one.key, one) for one in candidate.hypotheses))
+
+
+def _size(candidate: Candidate, part: Hypothesis) -> float:
+    """The largest coordinate of a part of a model; one that only shapes it, such as a speed, is no size."""
+    sized = (part.probes != 0).any(axis=0)
+    return float(np.abs(candidate.fit.coordinates[candidate.fit.along(part)])[sized].max())
 
 
 def with_refinements(terms: Sequence[AcceptedTerm], own: float) -> list[AcceptedTerm]:

@@ -262,6 +262,16 @@ def test_a_segment_begins_where_gears_have_left_light_and_heavy_rotors(rotor):
         assert without > 1.5 * error
 
 
+@pytest.mark.parametrize("rotor", [0.0001, 0.02])
+def test_a_segment_begins_where_its_encoders_saw_nothing_of_the_play(rotor):
+    arm = rigs.Player(Rig(with_rotor(rotor, damping=0.5), rigs.ARM_JOINTS, rigs.CONTROL_HZ))
+    effect = {"backlash": {"elbow": {"rad": 0.04, "at_motor": 1.0}}, "joint_encoder": {"elbow": {"at_joint": 1.0}}}
+    cut = recut(arm, np.repeat(SWING[::5], 5, axis=0), **effect)
+    error, without = (np.sqrt((one**2).mean()) for one in (errors(arm, cut, **effect), errors(arm, cut)))
+    assert error < 2e-3
+    assert without > 2.0 * error
+
+
 GEARS = {"backlash": {"rad": 0.04}, "compliance": {"nm_per_rad": 60.0}}
 
 
@@ -345,6 +355,21 @@ def test_bristles_of_a_link_behind_its_gears_rub_as_those_of_two_bodies():
         assert np.abs(arm.run(read_and_true, arm.vector(**effects), segment) - expected).max() < 5e-3
 
 
+@pytest.mark.parametrize(("rotor", "damping", "period"), [(0.02, 0.3, 2e-3), (0.2, 0.5, 5e-3)])
+def test_an_encoder_at_the_joint_sees_nothing_of_the_gears(rotor, damping, period):
+    arm = rigs.Player(Rig(with_rotor(rotor, damping=damping), rigs.ARM_JOINTS, 1.0 / period))
+    for effect in GEARS:
+        model = of_two_bodies(effect, with_rotor(rotor, damping=damping), 1.0)
+        expected, segment = pushed(arm, model, effect, period, at_joint=True)
+        gears = {effect: {"elbow": GEARS[effect] | {"at_motor": 1.0}}}
+        right, wrong = (
+            np.abs(arm.run(read_and_true, arm.vector(**gears, **encoder), segment) - expected).max(axis=0)
+            for encoder in ({"joint_encoder": {"elbow": {"at_joint": 1.0}}}, {})
+        )
+        assert right.max() < 5e-3
+        assert wrong[:2].max() > 10 * right.max()
+
+
 def bristles(bound, travel):
     """Torque of bristles in Nm, step by step of 0.1 ms, of a speed in rad/s."""
     wound = 0.0
@@ -357,7 +382,7 @@ def bristles(bound, travel):
     return torque
 
 
-def pushed(arm, model, effect, period, rub=lambda speed: 0.0):
+def pushed(arm, model, effect, period, rub=lambda speed: 0.0, at_joint=False):
     """Sends the forearm there and back.
 
     Args:
@@ -366,9 +391,10 @@ def pushed(arm, model, effect, period, rub=lambda speed: 0.0):
       effect: of its gears.
       period: of the controller in s.
       rub: torque on the link in Nm at its speed in rad/s, beside the friction of the model.
+      at_joint: whether the encoder is at the link, not on the motor.
 
     Returns:
-      Motors and links [steps, joints] in MuJoCo C, and the segment for the rig.
+      Encoders and links [steps, joints] in MuJoCo C, and the segment for the rig.
     """
     data, start = mujoco.MjData(model), np.array([0.4, -0.9])
     data.qpos[:2] = start
@@ -378,16 +404,19 @@ def pushed(arm, model, effect, period, rub=lambda speed: 0.0):
     ahead = np.sign(gravity[1]) * 0.02 if effect == "backlash" else gravity[1] / GEARS[effect]["nm_per_rad"]
     motor, kp, kd = start + np.array([0.0, ahead]), np.array([60.0, 20.0]), np.array([2.0, 0.4])
     data.qpos[:] = [*motor, -ahead]
+    if at_joint:
+        motor = start
     target = np.tile(motor + np.array([0.1, 0.4]), (rigs.STEPS, 1))
     target[0] = motor + gravity / kp
     target[70:] = motor - np.array([0.1, 0.4])
+    linked = lambda joints: np.array([joints[0], joints[1] + joints[2]])  # noqa: E731
+    read = linked if at_joint else lambda joints: joints[:2]
     expected = []
     for step in range(10 * rigs.STEPS):
         if step % 10 == 0:
-            shoulder, elbow, ahead = data.qpos
-            expected.append([shoulder, elbow, shoulder, elbow + ahead])
+            expected.append([*read(data.qpos), *linked(data.qpos)])
         if step % round(period / model.opt.timestep) == 0:
-            torque = kp * (target[step // 10] - data.qpos[:2]) - kd * data.qvel[:2]
+            torque = kp * (target[step // 10] - read(data.qpos)) - kd * read(data.qvel)
         data.qfrc_applied[:] = np.array([*torque, 0.0]) + rub(data.qvel[1] + data.qvel[2]) * np.array([0.0, 1.0, 1.0])
         mujoco.mj_step(model, data)
     return np.array(expected), rigs.segment(arm.rig, motor, target, kp, kd)
