@@ -153,7 +153,7 @@ JOINT_ENCODER = Effect(
     name="joint_encoder",
     enters="encoder",
     parameters=(Parameter(name="at_joint", bounds=(0.0, 1.0), prior=0.5),),
-    sizes=(1.0,),
+    sizes=(0.9,),
     act=_joint_encoder,
     sentence="The encoder sits on the joint, behind the gears.",
     excited_by="slow triangular reversals",
