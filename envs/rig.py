@@ -302,9 +302,9 @@ class Rig:
         """Simulates a segment of a log under one hypothesis.
 
         First the measured history before the segment fills the memories of the effects. Where gears give way, the
-        history is simulated as well, with rotors held to their measured motion, to know where their links are. Then the
-        robot starts from its measured state, with the errors of its sensors undone, and is simulated to the segment's
-        end.
+        history is simulated as well, to know where their links are, with rotors held to their measured motion. Where
+        encoders are at joints, it is to know where rotors are, with links held. Then the robot starts from its measured
+        state, with the errors of its sensors undone, and is simulated to the segment's end.
 
         Args:
           values: of all effects, as `values` returns them.

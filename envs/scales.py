@@ -30,8 +30,9 @@ def measure_scales(rig: Rig, runs: Sequence[Run]) -> dict[str, np.ndarray]:
         stiffness  torque / (0.02 angle)       Nm/rad
         inertia    diagonal of the joint-space inertia in the mean pose, kg m^2
         mass       mass of the body            kg
-        drag       least of torque / (lever rms(v)) over the joints that move the body, with the lever
-                   and the speed v of its centre of mass in the mean pose; 1 mm of lever at least   N s/m
+        drag       least of torque / (lever v) over the joints that move the body's centre of mass by 1 mm a
+                   rad or more (else the joint next to it), with the rms v of the centre in the mean pose   N s/m
+        air        drag / v                    N s^2/m^2
         speed      rms(dq)                     rad/s
         slow       0.1 rms(dq)                 rad/s
         motor      largest limit / rms(dq)     Nm s/rad
@@ -62,8 +63,7 @@ def measure_scales(rig: Rig, runs: Sequence[Run]) -> dict[str, np.ndarray]:
     torque = np.where(_rms(torque) > _DRIVEN * moves, _rms(torque), moves)
     turns = np.array([rig.mj_model.joint(name).type[0] == mujoco.mjtJoint.mjJNT_HINGE for name in rig.joints])
     angle = np.where(turns, 1.0, _PINION_M)
-    levers = np.maximum(rig.levers(mean_pose), _LEVER_M)
-    fast = np.linalg.norm(levers * _rms(speed), axis=1)
+    drag, fast = _drag(rig, mean_pose, torque, _rms(speed))
     return {
         "torque": torque,
         "damping": torque / _rms(speed),
@@ -71,12 +71,26 @@ def measure_scales(rig: Rig, runs: Sequence[Run]) -> dict[str, np.ndarray]:
         "stiffness": torque / (0.02 * angle),  # of a spring that winds up by 20 mrad under the rms torque
         "inertia": inertia,
         "mass": mass,
-        "drag": (torque / levers).min(axis=1) / fast,
+        "drag": drag,
+        "air": drag / fast,
         "speed": _rms(speed),
         "slow": 0.1 * _rms(speed),
         "angle": angle,
         "motor": np.maximum(np.concatenate(limit).max(axis=0), 1e-6) / _rms(speed),
     }
+
+
+def _drag(rig: Rig, pose: np.ndarray, torque: np.ndarray, speed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The drag of every body that takes all of a joint's torque, [bodies] N s/m, and its speed, [bodies] m/s."""
+    levers = rig.levers(pose)
+    for mine, name in zip(levers, rig.places["body"], strict=True):
+        # On the axes of all its joints nothing drags, so any size will do.
+        if mine.max() < _LEVER_M:
+            mine[rig.moves("body", name)[0]] = _LEVER_M
+    moved = levers >= _LEVER_M
+    fast = np.sqrt((np.where(moved, levers * speed, 0.0) ** 2).sum(axis=1))
+    share = np.divide(torque, levers, out=np.full_like(levers, np.inf), where=moved)
+    return share.min(axis=1) / fast, fast
 
 
 def _rms(values: Sequence[np.ndarray]) -> np.ndarray:

@@ -183,7 +183,19 @@ class Verdict(enum.IntEnum):
 
 
 Scale = Literal[
-    "one", "torque", "damping", "stiffness", "inertia", "mass", "drag", "speed", "slow", "angle", "motor", "quadratic"
+    "one",
+    "torque",
+    "damping",
+    "quadratic",
+    "stiffness",
+    "inertia",
+    "mass",
+    "drag",
+    "air",
+    "speed",
+    "slow",
+    "angle",
+    "motor",
 ]
 """Quantity that one unit of a discovery coordinate stands for.
 
@@ -191,7 +203,7 @@ Except for `one`, its size depends on the robot and on how it moved in the log; 
 `torque` is the rms torque (Nm), `speed` the rms speed (rad/s), `slow` a tenth of it, `damping` torque / speed,
 `quadratic` torque / speed^2, `angle` 1 rad of a hinge or 0.05 m of a slide, `stiffness` torque / (0.02 angle), `motor`
 the largest torque limit / speed, `inertia` the diagonal of the joint-space inertia (kg m^2). Per body: `mass` (kg), and
-`drag`, a drag of the centre of mass that takes the rms torque of a joint (N s/m).
+`drag`, a drag of the centre of mass that takes the rms torque of a joint (N s/m), and `air`, drag / speed.
 """
 
 
@@ -221,8 +233,7 @@ class Parameter:
     scale: Scale = "one"
     """What one unit of the coordinate stands for."""
     prior: float = 1.0
-    """Coordinate that discovery expects before it sees a log: the standard deviation of a nominal parameter, and the
-    size of an effect up to which all are about as likely (`jaxtune.discovery.least_squares`)."""
+    """Coordinate up to which, before a log is seen, all are about as likely (`jaxtune.discovery.least_squares`)."""
     shape: bool = False
     """True for a parameter that only shapes its effect, such as the speed at which friction falls off. It has no
     influence while the effect's other parameters are zero, and its coordinate starts at zero like theirs."""

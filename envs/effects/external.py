@@ -30,7 +30,7 @@ ROWS = (
         on="body",
         parameters=(
             Parameter(name="n_s_per_m", scale="drag", bounds=(0.0, 5.0), prior=0.3),
-            Parameter(name="n_s2_per_m2", scale="drag", bounds=(-15.0, 15.0), prior=0.3),
+            Parameter(name="n_s2_per_m2", scale="air", bounds=(-5.0, 5.0), prior=0.3),
         ),
         sizes=(0.03,),
         forms=(Form("quadratic", "drag", "n_s2_per_m2"),),

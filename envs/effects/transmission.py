@@ -87,12 +87,15 @@ def _backlash(values, signal, now, memory):
 
 
 def _compliance(values, signal, now, memory):
-    """A spring of stiffness k that may harden: k o' (1 + h o'^2) = M / (M + J) (pressing - f + R (o - o')).
+    """A spring that may harden, and a damper beside it:
 
-    Without the factor M / (M + J) where friction stops the link.
+        k o' (1 + h o'^2) + c (o' - o) / dt = M / (M + J) (pressing - f + R (o - o'))
+
+    without the factor M / (M + J) where friction stops the link.
     """
     offset, rate = memory
     softness, hardening = values["nm_per_rad"], values["hardening_per_rad2"]
+    loss = softness * values["nm_s_per_rad"] / now.dt
     torque, joint, motor = _shared(values, softness > 0, signal)
     bound, slows = jnp.where(softness > 0, motor, 0.0)
     torque, resistance = torque + now.rotor * rate / now.dt - slows * now.speed, _resistance(now, slows)
@@ -105,9 +108,10 @@ def _compliance(values, signal, now, memory):
         """
         soft = softness * link
         pressing = torque - now.rotor * acceleration + resistance * offset
-        wound = still * (1.0 + hardening * still**2) / jnp.maximum(soft, 1e-9)
+        wound = (still * (1.0 + hardening * still**2) + loss * (still - offset)) / jnp.maximum(soft, 1e-9)
         friction = _stopping(pressing - resistance * still - wound, bound)
-        return jnp.stack([_root(1.0 + soft * resistance, hardening, soft * (pressing - friction)), friction])
+        pushed = soft * (pressing - friction) + loss * offset
+        return jnp.stack([_root(1.0 + loss + soft * resistance, hardening, pushed), friction])
 
     following, friction = beside(1.0, now.stopped)
     pressing = torque - now.rotor * now.stopped - resistance * (following - offset) - friction
@@ -185,6 +189,7 @@ ROWS = (
         parameters=(
             Parameter(name="nm_per_rad", form="reciprocal", scale="stiffness", bounds=(0.0, 20.0), prior=1.0),
             Parameter(name="hardening_per_rad2", bounds=(0.0, 200.0), prior=30.0),
+            Parameter(name="nm_s_per_rad", scale="damping", bounds=(0.0, 5.0), prior=0.3),
             _AT_MOTOR,
         ),
         sizes=(0.2, 2.0),
@@ -192,6 +197,7 @@ ROWS = (
         start=_wound_up,
         forms=(
             Form("hardening", "compliance", "hardening_per_rad2"),
+            Form("damped", "compliance", "nm_s_per_rad"),
             Form("motor_friction", "compliance", "at_motor"),
         ),
         sentence="A spring sits between motor and joint.",

@@ -52,9 +52,7 @@ def forms(axes: Sequence[Axis], rows: Mapping[str, Effect], every: Sequence[Hypo
 
 
 def _as_form(shape: Hypothesis, effect: Hypothesis, form: Form) -> Hypothesis:
-    # Where two effects may each be a form of the other, the larger part gives the name.
-    prior = 0.5 * shape.prior
-    return replace(shape, name=effect.name, family=effect.family, form=form.name, screened=form.screened, prior=prior)
+    return replace(shape, name=effect.name, family=effect.family, form=form.name, screened=form.screened)
 
 
 _RIGHT = {"left": "right", "l": "r", "fl": "fr", "rl": "rr", "hl": "hr", "bl": "br"}
@@ -199,7 +197,8 @@ def _probes(sizes: Sequence[float], parameters: Sequence[Parameter], least: floa
     if len(free) > 1:
         return np.concatenate([size * np.eye(len(parameters))[free] for size in sizes])
     most, bends = parameters[free[0]].bounds[1], len(sizes) > 1
-    sizes = np.geomspace(sizes[0], _LARGE * most, _BENT if bends else _STRAIGHT)
+    largest = max(_LARGE * most, sizes[-1])
+    sizes = np.unique(np.geomspace(sizes[0], largest, _BENT if bends else _STRAIGHT))
     below = [-size for size in sizes if -size >= _LARGE * least - 1e-9]
     # Armature and damping can be lowered by less than their smallest size of interest.
     below = below or ([0.5 * least] if least < 0 else [])

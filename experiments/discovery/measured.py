@@ -170,6 +170,17 @@ def drop_filtered(log: Log) -> tuple[Log, tuple[str, ...]]:
     return replace(log, rate_hz=row_rate(log)), tuple(notes)
 
 
+def stale_notes(runs: Sequence[Run]) -> list[str]:
+    """Says which signals repeat readings that a slow bus had not renewed."""
+    notes = []
+    for name in segments.COMPARED:
+        found = [readings.stale(run, name).ravel() for run in runs if name in run.signals]
+        share = np.concatenate(found).mean() if found else 0.0
+        if share > _LEAST_STALE:
+            notes.append(f"{share:.0%} of the readings of {name} repeat an older one; they are interpolated")
+    return notes
+
+
 def _drop_declared(log: Log) -> tuple[Log, list[str]]:
     """Leaves out signals of which the log says that they were filtered; notes say which."""
     notes = []
@@ -188,14 +199,3 @@ def _drop_declared(log: Log) -> tuple[Log, list[str]]:
 def _without(log: Log, signal: str) -> Log:
     runs = [replace(run, signals={k: v for k, v in run.signals.items() if k != signal}) for run in log.runs]
     return replace(log, runs=tuple(runs))
-
-
-def stale_notes(runs: Sequence[Run]) -> list[str]:
-    """Says which signals repeat readings that a slow bus had not renewed."""
-    notes = []
-    for name in segments.COMPARED:
-        found = [readings.stale(run, name).ravel() for run in runs if name in run.signals]
-        share = np.concatenate(found).mean() if found else 0.0
-        if share > _LEAST_STALE:
-            notes.append(f"{share:.0%} of the readings of {name} repeat an older one; they are interpolated")
-    return notes

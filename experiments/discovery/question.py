@@ -120,14 +120,14 @@ def build_question(
 
 def _compared(log: Log) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Names of the signals that are compared, and a note for each that is not, since only some runs have it."""
-    have = {name: sum(name in run.signals for run in log.runs) for name in (*sorted(segments.COMPARED), "target")}
+    counts = {name: sum(name in run.signals for run in log.runs) for name in (*sorted(segments.COMPARED), "target")}
     # Segments of all runs share one layout.
-    everywhere = [name for name in have if have[name] == len(log.runs)]
-    partly = [name for name in segments.COMPARED if 0 < have[name] < len(log.runs)]
+    everywhere = [name for name, count in counts.items() if count == len(log.runs)]
+    partly = [name for name in segments.COMPARED if 0 < counts[name] < len(log.runs)]
     # Without targets the torque is what was sent, not measured.
-    no_reading = {"target"} if "target" in everywhere else {"target", "tau"}
+    left_out = {"target"} if "target" in everywhere else {"target", "tau"}
     notes = tuple(f"{name} is not in all runs, and is not used" for name in partly)
-    return tuple(name for name in everywhere if name not in no_reading), notes
+    return tuple(name for name in everywhere if name not in left_out), notes
 
 
 def _least_floor(run: Run, signals: Sequence[str], bin_rows: int) -> np.ndarray:

@@ -39,7 +39,7 @@ def summarise(question: Question, log: Log, folder: Path, result: Result) -> dic
         effect = _effect(question.rig, term, result.fit, result.errors)
         if term.refines is not None or result.verdict == "unnamed":
             not_named.append(effect | {"refines": term.refines})
-        elif question.problem.is_nominal(term.hypothesis):
+        elif question.problem.is_change(term.hypothesis, term.forms):
             changes.append(effect)
         else:
             effects.append(effect)

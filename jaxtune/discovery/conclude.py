@@ -122,7 +122,7 @@ def _shares(
 
 def _verdict(problem: Problem, terms: Sequence[AcceptedTerm], changed: Mapping[int, float]) -> str:
     """The verdict of a model that explains what there is."""
-    if any(not problem.is_nominal(term.hypothesis) for term in terms if term.refines is None):
+    if any(not problem.is_change(term.hypothesis, term.forms) for term in terms if term.refines is None):
         # A term about a nominal parameter is a change, however large: the model has the parameter.
         return "named"
     return "parameter_change" if changed or terms else "no_missing_effect"

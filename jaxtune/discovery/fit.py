@@ -34,7 +34,7 @@ class Free:
     directions: np.ndarray
     """[coordinates, axes]: a standard deviation of the prior, or a typical size, along each."""
     sd: np.ndarray
-    """[coordinates]: standard deviation of the prior, in units of the directions."""
+    """[coordinates]: scale s of the prior (`least_squares`), in units of the directions."""
     bounds: np.ndarray
     """[coordinates, 2]: least and largest value."""
     nominal: np.ndarray

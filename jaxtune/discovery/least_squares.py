@@ -16,6 +16,7 @@ what the others and the prior say.
 The nominal parameters have a Gaussian prior, P(z) = z^2. How large an effect is, if it is there, nobody knows: up to
 its deviation all sizes are about as likely, and beyond it all orders of magnitude, P(z) = log(1 + z^2) (`of_size`). An
 encoder that is off by a tooth of its horn is ten deviations off; a Gaussian prior would let another effect have it.
+What only shapes an effect, such as a share, has the same prior within its bounds.
 
 Around a point the cost is least squares with weights w and deviations s',
 

@@ -25,17 +25,20 @@ def renamed(problem: Problem, candidate: Candidate) -> Candidate:
     """
     other_names: dict[str, Hypothesis] = {}
     for effect in candidate.effects:
-        # A further form would be one of the old name.
-        for form in candidate.forms_of(effect) if len(candidate.forms_of(effect)) == 1 else ():
-            twins = [h for h in problem.hypotheses if np.array_equal(h.directions, form.directions)]
-            shapes = [
-                other
-                for other in problem.forms
-                if np.array_equal(other.directions, effect.directions) and any(other.shapes(twin) for twin in twins)
-            ]
-            if shapes and _size(candidate, form) > _size(candidate, effect):
-                other_names |= {effect.key: twins[0], form.key: shapes[0]}
+        forms = candidate.forms_of(effect)
+        for form in (one for one in forms if _size(candidate, one) > _size(candidate, effect)):
+            for twin in (h for h in problem.hypotheses if np.array_equal(h.directions, form.directions)):
+                # What it is then a form of has to have all of its forms.
+                theirs = {one.key: _like(problem, twin, effect if one is form else one) for one in forms}
+                if all(theirs.values()):
+                    other_names |= {effect.key: twin} | theirs
     return replace(candidate, hypotheses=tuple(other_names.get(one.key, one) for one in candidate.hypotheses))
+
+
+def _like(problem: Problem, effect: Hypothesis, part: Hypothesis) -> Hypothesis | None:
+    """The form of an effect that moves what a part of a model moves."""
+    forms = (one for one in problem.forms if one.shapes(effect))
+    return next((one for one in forms if np.array_equal(one.directions, part.directions)), None)
 
 
 def _size(candidate: Candidate, part: Hypothesis) -> float:
@@ -73,6 +76,10 @@ def _share_of_joints(few: Hypothesis, many: Hypothesis) -> float:
 
 
 def moved_forms(problem: Problem, fit: Fit, errors: np.ndarray, effect: Hypothesis) -> list[Hypothesis]:
-    """Forms of an effect that are free under every hypothesis, and clear of zero in the fit."""
+    """Forms of an effect that are free under every hypothesis, and clear of zero in the fit.
+
+    Nominal parameters are none: they are never quite what the model says.
+    """
     clear = np.abs(fit.coordinates) > _CLEAR * errors
-    return [form for form in problem.forms if form.shapes(effect) and (taken_over(fit.free, form) & clear).any()]
+    mine = [form for form in problem.forms if form.shapes(effect) and not problem.is_nominal(form)]
+    return [form for form in mine if (taken_over(fit.free, form) & clear).any()]

@@ -170,8 +170,13 @@ class Problem:
         return np.array([self.trees[joints.index(part)] if part in joints else -1 for _, part in self.cells])
 
     def is_nominal(self, hypothesis: Hypothesis) -> bool:
-        """Says whether a hypothesis is about parameters that the nominal model has.
-
-        Such a hypothesis, for instance a link's mass, is reported as a parameter change and not as a missing effect.
-        """
+        """Says whether a hypothesis is about parameters that the nominal model has, for instance a link's mass."""
         return bool((self.prior[(hypothesis.directions != 0).any(axis=0)] > 0).all())
+
+    def is_change(self, effect: Hypothesis, forms: Sequence[Hypothesis]) -> bool:
+        """Says whether an effect in some forms is reported as a parameter change and not as missing.
+
+        It is about parameters that the nominal model has, and forms are about such or what is free in every model.
+        """
+        free = (self.unknowns != 0).any(axis=0) | (self.prior > 0)
+        return self.is_nominal(effect) and all(free[(one.directions != 0).any(axis=0)].all() for one in forms)

@@ -6,10 +6,12 @@ coordinates that answers it is
 
     u = argmin C(r + D'w + J u),
 
-with the cost C of `least_squares`, prior included. How far each segment counts is known roughly: those that are far off
-under the best model so far have little say in u, as few segments should not move a parameter. With that settled, u
-needs no more than the products of r, J and D with each other, which are summed once. The cost at u is computed from the
-residuals there, so that a change which explains the segments that are far off gets the credit for that.
+with the cost C of `least_squares`, prior included. For the sizes of effects that the model has, a Gaussian stands for
+the prior (`Free.deviations`), so costs are compared within one profile only. How far each segment counts is known
+roughly: those that are far off under the best model so far have little say in u, as few segments should not move a
+parameter. With that settled, u needs no more than the products of r, J and D with each other, which are summed once.
+The cost at u is computed from the residuals there, so that a change which explains the segments that are far off gets
+the credit for that.
 """
 
 from dataclasses import dataclass, replace

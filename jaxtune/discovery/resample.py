@@ -79,8 +79,8 @@ def in_units(values: np.ndarray, unit: np.ndarray) -> np.ndarray:
 def standard_errors(fit: Fit, unit: np.ndarray) -> np.ndarray:
     """Computes standard errors [coordinates] that allow for residuals that go together within a unit.
 
-    The sandwich covariance (White, 1980; clustered): with N = J'WJ + diag(1/sd^2), the curvature of the cost
-    (`Linear`), and g_b = sum_(s in b) J_s'W r_s,
+    The sandwich covariance (White, 1980; clustered): with N = J'WJ + diag(1/sd^2), the normal matrix of a
+    step (`Linear`), and g_b = sum_(s in b) J_s'W r_s,
 
         Cov = N^-1 (n / (n - 1) sum_b g_b g_b' + diag(1/sd^2)) N^-1,   at least N^-1 itself.
 

@@ -196,7 +196,7 @@ def shaped(forms: Sequence[Hypothesis], free: Sequence[Hypothesis], leads: Seque
         there = {one.key for one in others}
         for form in (form for form in forms if form.shapes(effect) and form.key not in there):
             # The least size may be too small to have a slope.
-            point = form.probes[1]
+            point = form.probes[:2][-1]
             found.append(Lead((*lead.hypotheses, form), np.concatenate([lead.point, point]), lead.start, lead.cost))
             alone = [h for h in free if h.key not in known and np.array_equal(h.directions, form.directions)]
             found += [Lead((h,), point, lead.start, lead.cost) for h in alone]

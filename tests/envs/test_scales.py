@@ -46,6 +46,31 @@ def test_a_torque_of_one_is_what_moves_the_joint(kp):
     assert found["drag"][0] * 0.15**2 == pytest.approx(found["damping"][0], rel=1e-4)
 
 
+def test_joints_that_do_not_move_a_link_say_nothing_of_its_drag():
+    # A wrist that turns about the hand's long axis, at rest and without torque.
+    hand = '<body name="hand" pos="0 0 -0.25"><joint name="roll" axis="0 0 1"/>'
+    hand += '<geom type="capsule" size="0.02" fromto="0 0 0 0 0 -0.1" mass="0.2"/></body>'
+    whole = ARM.replace('mass="0.6"/>', f'mass="0.6"/>{hand}')
+    time = np.arange(400) / 200.0
+    moved = 0.2 * np.sin(2 * np.pi * time)[:, None]
+    gains = {"kp": np.full(3, 40.0), "kd": np.full(3, 2.0), "torque_limit_nm": np.full(3, 15.0)}
+    signals = {"q": moved * [1.0, 0.5, 0.0], "target": 1.2 * moved * [1.0, 0.5, 0.0]}
+    run = Run(
+        name="run_000",
+        condition="a",
+        split=None,
+        controller=Controller(kind="pd", rate_hz=500.0, gains=gains),
+        time=time,
+        signals=signals,
+    )
+    found = measure_scales(Rig(mujoco.MjSpec.from_string(whole), (*ARM_JOINTS, "roll"), 500.0), [run])
+    assert found["drag"][0] * 0.15**2 == pytest.approx(found["damping"][0], rel=1e-4)
+    # The elbow is the weaker one: 0.3 m from the hand's centre, which both joints move.
+    speed = np.hypot(0.6 * found["speed"][0], 0.3 * found["speed"][1])
+    assert found["drag"][2] == pytest.approx(found["torque"][1] / 0.3 / speed, rel=1e-4)
+    assert found["air"][2] == pytest.approx(found["drag"][2] / speed, rel=1e-4)
+
+
 def test_a_slide_has_no_angles():
     xml = ARM.replace('name="elbow"', 'name="elbow" type="slide"')
     time = np.arange(400) / 200.0

@@ -20,7 +20,7 @@ from experiments.discovery.excitation import excitation
 from experiments.discovery.hypotheses import forms, hypotheses, place_sets, unknown_directions
 from experiments.discovery.measured import drop_filtered, read_logs
 from experiments.discovery.question import build_question
-from jaxtune.discovery.problem import are_distinct
+from jaxtune.discovery.problem import Problem, are_distinct
 
 JOINTS = ("shoulder", "elbow")
 GAINS = {"kp": np.array([40.0, 20.0]), "kd": np.array([2.0, 0.8]), "torque_limit_nm": np.array([15.0, 15.0])}
@@ -243,6 +243,28 @@ def test_the_travel_of_friction_is_unknown_where_the_model_has_friction(spec):
     np.testing.assert_array_equal(more[:4], directions)
     places = [rig.axes[number] for row in more[4:] for number in np.flatnonzero(row)]
     assert [(axis.effect, axis.place) for axis in places] == [("torque_reading", joint) for joint in JOINTS]
+
+
+def test_more_friction_is_a_change_of_the_model_and_stiction_is_missing_in_it(spec):
+    from envs.effects import LIBRARY
+    from envs.rig import Rig
+
+    spec = spec.copy()
+    spec.joint("elbow").frictionloss = 0.1
+    rig = Rig(spec, JOINTS, 1000.0)
+    every = hypotheses(rig.axes, rig.places, {name: LIBRARY[name] for name in ("coulomb", "stribeck")})
+    shapes = {one.key: one for one in forms(rig.axes, rig.effects, every)}
+    unknowns, _ = unknown_directions(rig.axes, 1000.0)
+    ask = lambda effect, *names: Problem.is_change(  # noqa: E731
+        asked, next(one for one in every if one.key == effect), [shapes[name] for name in names]
+    )
+    asked = SimpleNamespace(prior=np.array([axis.prior_sd for axis in rig.axes]), unknowns=unknowns)
+    asked.is_nominal = lambda hypothesis: Problem.is_nominal(asked, hypothesis)
+    assert ask("coulomb@elbow")
+    assert ask("coulomb@elbow", "coulomb(presliding)@elbow")
+    assert not ask("coulomb@elbow", "coulomb(stiction)@elbow")
+    assert not ask("coulomb@shoulder")
+    assert not ask("stribeck@elbow", "stribeck(sliding)@elbow")
 
 
 def test_every_form_moves_the_axes_of_its_parameter_at_the_places_of_its_effect(spec):

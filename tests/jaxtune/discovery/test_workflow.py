@@ -14,7 +14,7 @@ from jaxtune.discovery.conclude import _rivals
 from jaxtune.discovery.evaluate import is_worse
 from jaxtune.discovery.evidence import Evidence
 from jaxtune.discovery.fit import begin
-from jaxtune.discovery.naming import renamed, with_refinements
+from jaxtune.discovery.naming import moved_forms, renamed, with_refinements
 from jaxtune.discovery.result import AcceptedTerm, Settings
 from jaxtune.discovery.screen import Lead
 from jaxtune.discovery.shares import explained, speak
@@ -401,6 +401,17 @@ def test_a_form_that_is_an_effect_of_its_own_is_fitted_alone_too():
     assert plain.point == pytest.approx([0.8])
 
 
+def test_a_nominal_parameter_that_moved_is_no_form_of_an_effect():
+    free = replace(HYPOTHESES[1], name="coulomb", form="sliding")
+    asked = problem({"damping": 0.3}, forms=(free,))
+    _, begun = state.begin(asked, measured_floor(asked))
+    errors = np.full(2, 0.1)
+    assert np.abs(begun.null.fit.coordinates[1]) > 1.0
+    assert moved_forms(asked, begun.null.fit, errors, HYPOTHESES[2]) == []
+    unknown = replace(asked, prior=asked.prior * np.array([axis != "damping" for axis in AXES]))
+    assert moved_forms(unknown, begun.null.fit, errors, HYPOTHESES[2]) == [free]
+
+
 def test_the_larger_part_gives_the_name_where_two_effects_are_forms_of_each_other():
     coulomb, push = HYPOTHESES[2:4]
     other = replace(coulomb, name="push", family="external", form="with_friction")
@@ -408,19 +419,43 @@ def test_the_larger_part_gives_the_name_where_two_effects_are_forms_of_each_othe
     floor, begun = state.begin(asked, measured_floor(asked))
     evaluate = floor[asked.main_horizon].residuals["train"]
 
-    def model(sizes):
-        (fit,) = begin(
-            begun.null.fit, [(coulomb, DIRECTION)], [np.array(sizes)], [begun.null.fit.coordinates], evaluate
-        )
-        return Candidate((coulomb, DIRECTION), fit, begun.null.select)
+    def model(sizes, *more):
+        group = (coulomb, DIRECTION, *more)
+        (fit,) = begin(begun.null.fit, [group], [np.array(sizes)], [begun.null.fit.coordinates], evaluate)
+        return Candidate(group, fit, begun.null.select)
 
     assert [h.key for h in renamed(asked, model([0.8, 0.4])).hypotheses] == [coulomb.key, DIRECTION.key]
     swapped = renamed(asked, model([0.4, -0.8]))
     assert [h.key for h in swapped.hypotheses] == ["push@slider", "push(with_friction)@slider"]
     assert [h.key for h in swapped.effects] == [push.key]
-    # A further form would have no effect to be a form of.
-    warped = replace(model([0.4, -0.8]), hypotheses=(coulomb, DIRECTION, WARPED))
+    # A further form would have no effect to be a form of, unless the other effect has it too.
+    warped = model([0.4, -0.8, 0.1], WARPED)
     assert [h.key for h in renamed(asked, warped).hypotheses] == [coulomb.key, DIRECTION.key, WARPED.key]
+    both = replace(asked, forms=(*asked.forms, WARPED, replace(WARPED, name="push", family="external")))
+    keys = ["push@slider", "push(with_friction)@slider", "push(warped)@slider"]
+    assert [h.key for h in renamed(both, warped).hypotheses] == keys
+    # A parameter that only shapes an effect is no size: the sweep of this form's second one is not compared.
+    pair = replace(
+        DIRECTION,
+        directions=np.concatenate([DIRECTION.directions, WARPED.directions]),
+        probes=np.pad(DIRECTION.probes, ((0, 0), (0, 1))),
+        bounds=np.concatenate([DIRECTION.bounds, WARPED.bounds]),
+        prior=np.concatenate([DIRECTION.prior, WARPED.prior]),
+    )
+    shaped = replace(
+        push,
+        directions=pair.directions,
+        probes=np.pad(push.probes, ((0, 0), (0, 1))),
+        bounds=pair.bounds,
+        prior=pair.prior,
+    )
+    asked = replace(asked, hypotheses=(coulomb, shaped), forms=(pair, other))
+    (fit,) = begin(
+        begun.null.fit, [(coulomb, pair)], [np.array([0.4, 0.2, 3.0])], [begun.null.fit.coordinates], evaluate
+    )
+    kept = Candidate((coulomb, pair), fit, begun.null.select)
+    assert [h.key for h in renamed(asked, kept).effects] == [coulomb.key]
+    asked = replace(asked, hypotheses=HYPOTHESES, forms=(DIRECTION, other))
     # A form that is no effect with the other one as its form changes no name.
     alone = replace(asked, forms=(DIRECTION,))
     assert [h.key for h in renamed(alone, model([0.4, -0.8])).effects] == [coulomb.key]
