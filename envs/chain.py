@@ -104,7 +104,7 @@ class Chain:
         motor, running = self._seen(values, joint, memory, within)
         memory, torque, readings = self._control(values, memory | {"within": within}, motor, x)
         # The controller answers a motor that runs ahead only as far as it sees it.
-        within = self.seen(values, within)
+        within = self.at_encoders(values, within)
         gains = {name: within * x[name] for name in ("stiffness", "damping")}
         torque = torque - x["emf"] * joint[1]
         data, memory, torque = self._move(model, data, memory, values, torque, x | gains)
@@ -150,11 +150,11 @@ class Chain:
           The robot and the memories after the step.
         """
         joint, within = self.joints(data), self._within(model, x)
-        far, fast = self.seen(values, self.ahead(memory))
+        far, fast = self.at_encoders(values, self.ahead(memory))
         seen = motor.at[1].add(-within * fast)
         _, memory = self.stage("sensor", values, seen, self._now(x, seen), memory | {"within": within})
         rotor, inertia = model.dof_armature[self.dof], 1.0 / model.dof_invweight0[self.dof]
-        at_motor = self.seen(values, jnp.ones_like(torque))
+        at_motor = self.at_encoders(values, jnp.ones_like(torque))
         held = at_motor * jnp.maximum(rotor, _LIGHT * inertia)
         hold = {"stiffness": held * _HOLD_RAD_S**2, "damping": 2.0 * held * _HOLD_RAD_S, "emf": jnp.zeros_like(torque)}
         # How fast a rotor runs ahead acts within the step (`envs.effects.transmission`).
@@ -172,7 +172,7 @@ class Chain:
         gain = (x["stiffness"] * self.period_s + x["damping"]) * self.period_s
         return jnp.clip(gain / jnp.maximum(model.dof_armature[self.dof], 1e-9) - 1.0, 0.0, 1.0)
 
-    def seen(self, values, ahead: jax.Array) -> jax.Array:
+    def at_encoders(self, values, ahead: jax.Array) -> jax.Array:
         """What encoders see of how motors run ahead [..., joints]: all of it where they sit on the motors."""
         return self.stage("encoder", values, ahead, None, {})[0]
 
@@ -189,7 +189,7 @@ class Chain:
           Positions and velocities [2, joints], and the part of the motors' velocities [joints] that is not in them,
           because it acts within the step.
         """
-        far, fast = self.seen(values, self.ahead(memory))
+        far, fast = self.at_encoders(values, self.ahead(memory))
         return joint + jnp.stack([far, (1.0 - within) * fast]), within * fast
 
     def _move(self, model, data, memory, values, torque, x, on_links=0.0) -> tuple[mjx.Data, dict, jax.Array]:

@@ -368,7 +368,7 @@ class Rig:
 
         def at(index, data, memory, speeding):
             """The robot at a step of the history, with accelerations [joints]."""
-            state = truth[index] - chain.seen(values, chain.ahead(memory))
+            state = truth[index] - chain.at_encoders(values, chain.ahead(memory))
             return data.replace(
                 qpos=self._data.qpos.at[self.qpos].set(state[0] + chain.lead_s * state[1]),
                 qvel=self._data.qvel.at[self.dof].set(state[1]),
