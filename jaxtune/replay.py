@@ -37,6 +37,7 @@ _EXACT = 1e-3  # least error of a feature, as a share of what the distribution's
 # Radii: of the first secants, and of the shortest. Whether a foot slips or sticks changes in steps, across which a
 # short secant is steep and wrong.
 _SECANT, _SHORTEST = 0.5, 0.03
+_ROUNDING = 0.01  # |z|^2 / k up to which pieces end where they were measured: misfits are a tenth of the least error
 _CLOSEST = 0.002  # radii: least error; where nothing is noisy a fit ends before it is exact
 _FURTHEST = 1.0  # radii that one step may move
 _SHORTER = 0.3  # share of a step that is tried after one that did not lower the cost
@@ -208,6 +209,8 @@ def _fit_until_exceeded(
         mine = jax.tree.map(lambda leaf: leaf[rows], pieces)
         fits = _fit(config, replay, mine, others, truth, dist)
         logs = jnp.where(mine.valid, jnp.log1p(fits.energy), 0.0).sum(axis=-1) / jnp.maximum(mine.valid.sum(axis=-1), 1)
+        # Or rounding would tell which of two exact fits is the worse one.
+        logs = jnp.maximum(logs, jnp.log1p(_ROUNDING))
         # A set without a piece says nothing, and counts as one that is fitted badly.
         logs = jnp.where(mine.valid.any(axis=-1), logs, jnp.inf)
         some = fits.best, fits.normal, logs
