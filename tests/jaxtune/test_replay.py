@@ -56,6 +56,13 @@ def test_exact_states_give_exact_coordinates(dist, friction, mass):
     assert (found.interval < 0.05).all()
 
 
+def test_rounding_does_not_rank_exact_fits(dist):
+    # Of 20 robots one would be the worst of 20 by chance, and its estimate would not be taken.
+    robots, _ = calibration(EXACT, dist, 29, 20)
+    found = [estimate(EXACT, dist, jax.tree.map(lambda leaf, k=k: leaf[k], robots)).p_value for k in range(20)]
+    np.testing.assert_array_equal(found, 1.0)
+
+
 def test_a_truth_outside_the_distribution_is_found(dist):
     found = estimate(EXACT, dist, measured(EXACT, friction=-0.5, mass=0.6))
     np.testing.assert_allclose(0.2 * found.estimate, [-0.5, 0.6], atol=2e-3)
