@@ -63,20 +63,21 @@ def measure_scales(rig: Rig, runs: Sequence[Run]) -> dict[str, np.ndarray]:
     torque = np.where(_rms(torque) > _DRIVEN * moves, _rms(torque), moves)
     turns = np.array([rig.mj_model.joint(name).type[0] == mujoco.mjtJoint.mjJNT_HINGE for name in rig.joints])
     angle = np.where(turns, 1.0, _PINION_M)
-    drag, fast = _drag(rig, mean_pose, torque, _rms(speed))
+    pace = _rms(speed)
+    drag, fast = _drag(rig, mean_pose, torque, pace)
     return {
         "torque": torque,
-        "damping": torque / _rms(speed),
-        "quadratic": torque / _rms(speed) ** 2,
+        "damping": torque / pace,
+        "quadratic": torque / pace**2,
         "stiffness": torque / (0.02 * angle),  # of a spring that winds up by 20 mrad under the rms torque
         "inertia": inertia,
         "mass": mass,
         "drag": drag,
         "air": drag / fast,
-        "speed": _rms(speed),
-        "slow": 0.1 * _rms(speed),
+        "speed": pace,
+        "slow": 0.1 * pace,
         "angle": angle,
-        "motor": np.maximum(np.concatenate(limit).max(axis=0), 1e-6) / _rms(speed),
+        "motor": np.maximum(np.concatenate(limit).max(axis=0), 1e-6) / pace,
     }
 
 

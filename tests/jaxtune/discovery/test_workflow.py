@@ -412,6 +412,17 @@ def test_a_nominal_parameter_that_moved_is_no_form_of_an_effect():
     assert moved_forms(unknown, begun.null.fit, errors, HYPOTHESES[2]) == [free]
 
 
+def with_shape(one):
+    """The same hypothesis with a further parameter that no probe has a size of."""
+    return replace(
+        one,
+        directions=np.concatenate([one.directions, WARPED.directions]),
+        probes=np.pad(one.probes, ((0, 0), (0, 1))),
+        bounds=np.concatenate([one.bounds, WARPED.bounds]),
+        prior=np.concatenate([one.prior, WARPED.prior]),
+    )
+
+
 def test_the_larger_part_gives_the_name_where_two_effects_are_forms_of_each_other():
     coulomb, push = HYPOTHESES[2:4]
     other = replace(coulomb, name="push", family="external", form="with_friction")
@@ -434,28 +445,14 @@ def test_the_larger_part_gives_the_name_where_two_effects_are_forms_of_each_othe
     both = replace(asked, forms=(*asked.forms, WARPED, replace(WARPED, name="push", family="external")))
     keys = ["push@slider", "push(with_friction)@slider", "push(warped)@slider"]
     assert [h.key for h in renamed(both, warped).hypotheses] == keys
-    # A parameter that only shapes an effect is no size: the sweep of this form's second one is not compared.
-    pair = replace(
-        DIRECTION,
-        directions=np.concatenate([DIRECTION.directions, WARPED.directions]),
-        probes=np.pad(DIRECTION.probes, ((0, 0), (0, 1))),
-        bounds=np.concatenate([DIRECTION.bounds, WARPED.bounds]),
-        prior=np.concatenate([DIRECTION.prior, WARPED.prior]),
-    )
-    shaped = replace(
-        push,
-        directions=pair.directions,
-        probes=np.pad(push.probes, ((0, 0), (0, 1))),
-        bounds=pair.bounds,
-        prior=pair.prior,
-    )
-    asked = replace(asked, hypotheses=(coulomb, shaped), forms=(pair, other))
+    # A parameter that only shapes an effect is no size.
+    pair, twin = with_shape(DIRECTION), with_shape(push)
     (fit,) = begin(
         begun.null.fit, [(coulomb, pair)], [np.array([0.4, 0.2, 3.0])], [begun.null.fit.coordinates], evaluate
     )
     kept = Candidate((coulomb, pair), fit, begun.null.select)
-    assert [h.key for h in renamed(asked, kept).effects] == [coulomb.key]
-    asked = replace(asked, hypotheses=HYPOTHESES, forms=(DIRECTION, other))
+    shaping = replace(asked, hypotheses=(coulomb, twin), forms=(pair, other))
+    assert [h.key for h in renamed(shaping, kept).effects] == [coulomb.key]
     # A form that is no effect with the other one as its form changes no name.
     alone = replace(asked, forms=(DIRECTION,))
     assert [h.key for h in renamed(alone, model([0.4, -0.8])).effects] == [coulomb.key]
