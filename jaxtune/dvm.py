@@ -55,10 +55,11 @@ class DVMConfig:
     """Channels of every hidden convolution."""
     train_steps: int = 800
     """Gradient steps."""
-    batch: int = 128
+    batch: int = 32
     """Windows in a gradient step."""
-    learning_rate: float = 2e-3
-    """Peak of a one-cycle cosine schedule."""
+    learning_rate: float = 4e-3
+    """Peak of a one-cycle cosine schedule. On two CPU cores, batches of 32 with this rate take a quarter of the time of
+    batches of 128 with half of it, and reach a higher ELBO on episodes of a walking robot."""
     references: int = 2048
     """Simulated windows that are kept as candidates for Q."""
     neighbours: int = 10

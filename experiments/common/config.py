@@ -64,7 +64,7 @@ class Preset:
             held_out_sets=19,
             max_widenings=4,
             spm=SPMConfig(hidden=(64, 64, 64), head=16, train_steps=400, batch=64),
-            dvm=DVMConfig(channels=32, train_steps=300, batch=64, references=512),
+            dvm=DVMConfig(channels=32, train_steps=300, references=512),
         )
     )
     """Sizes of a tuning in a sweep. They are smaller, because many tunings run side by side in one program."""
@@ -126,7 +126,7 @@ _LARGE = TunerConfig(
     episodes=4000,
     held_out_sets=199,
     spm=SPMConfig(hidden=(512, 256, 256), train_steps=6000, batch=1024),
-    dvm=DVMConfig(channels=128, train_steps=4000, batch=512, references=8192),
+    dvm=DVMConfig(channels=128, train_steps=4000, batch=512, learning_rate=2e-3, references=8192),
 )
 
 _GPU = Preset(
