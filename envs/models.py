@@ -11,7 +11,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from envs import go2, pendulum
+from envs import go2, held, pendulum
 from envs.biteno import constants
 
 _OTHER_FILES = re.compile(r"<include\b|\bfile\w*\s*=")
@@ -170,7 +170,7 @@ def check_flags(spec: mujoco.MjSpec, clear: bool = False) -> tuple[str, ...]:
     return off
 
 
-def suspended(spec: mujoco.MjSpec) -> mujoco.MjModel:
+def suspended(spec: mujoco.MjSpec, joints: Sequence[str] | None = None) -> mujoco.MjModel:
     """Compiles a robot as it is on a test rig: without its free joints, and with contacts switched off.
 
     Its own actuators, sensors and keyframes are left out, and its choice of a solver, an integrator and diagnostics:
@@ -178,10 +178,12 @@ def suspended(spec: mujoco.MjSpec) -> mujoco.MjModel:
 
     Args:
       spec: of the robot; it is copied, not changed.
+      joints: those that are read. Others are held where the model puts them (`envs.held`); None if all are read.
     """
     spec = without_files(spec.copy())
+    still = [] if joints is None else [element for elements in held.elements(spec, joints) for element in elements]
     free = [joint for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_FREE]
-    for element in (*free, *spec.keys, *spec.actuators, *spec.sensors):
+    for element in (*spec.keys, *spec.actuators, *spec.sensors, *still, *free):
         spec.delete(element)
     for joint in spec.joints:
         joint.actgravcomp = False

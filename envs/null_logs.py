@@ -46,7 +46,7 @@ def simulate_null_logs(log: Log, spec: mujoco.MjSpec, count: int, seed: int) -> 
       Logs of the same runs, joints and signals. Signals of the controller (targets, supply, enabling) are copied,
       signals of sensors are simulated.
     """
-    robots = [Robot.drawn(spec, np.random.default_rng(seed + number)) for number in range(count)]
+    robots = [Robot.drawn(spec, log.joints, np.random.default_rng(seed + number)) for number in range(count)]
     pairs = [(robot, run) for robot in robots for run in log.runs]
     played = play(pairs, log.joints) if pairs else []
     runs = [as_recorded(robot, run, motion) for (robot, run), motion in zip(pairs, played, strict=True)]
@@ -63,9 +63,9 @@ class Robot:
     rng: np.random.Generator
 
     @staticmethod
-    def drawn(spec: mujoco.MjSpec, rng: np.random.Generator) -> "Robot":
+    def drawn(spec: mujoco.MjSpec, joints: Sequence[str], rng: np.random.Generator) -> "Robot":
         """Draws a robot from the prior. Where a log does not say how targets go on, half of all robots go straight."""
-        return Robot(_drawn(spec, rng), bool(rng.integers(0, 2)), rng)
+        return Robot(_drawn(spec, joints, rng), bool(rng.integers(0, 2)), rng)
 
     def goes_straight(self, run: Run) -> bool:
         """Whether targets, or torques that were sent, move to the next row in a straight line; else they are held."""
@@ -82,9 +82,9 @@ class Motion:
     torques: np.ndarray
 
 
-def _drawn(spec: mujoco.MjSpec, rng: np.random.Generator) -> mujoco.MjModel:
+def _drawn(spec: mujoco.MjSpec, joints: Sequence[str], rng: np.random.Generator) -> mujoco.MjModel:
     """Compiles the nominal model with its parameters drawn from the prior, suspended and without actuators."""
-    model = suspended(spec)
+    model = suspended(spec, joints)
     model.opt.timestep = _STEP_S
     model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     # The controller's torque is applied to the joints directly, so the model's own actuators are switched off.

@@ -53,7 +53,8 @@ class Rig:
         read = rig.simulate(values, segment)
 
     Args:
-      spec: of the robot; free joints are removed, contacts and its own actuators switched off.
+      spec: of the robot; free joints are removed, contacts and its own actuators switched off, and joints that are not
+        read are held where they can be (`envs.held`).
       joints: names of the joints that are controlled and read, in the log's order.
       control_hz: rate of the controller. The simulation's step is the longest that divides the controller's period and
         is no longer than 1 ms.
@@ -68,7 +69,7 @@ class Rig:
         joints: Sequence[str],
         control_hz: float,
     ):
-        model = suspended(spec)
+        model = suspended(spec, joints)
         self.control_hz = control_hz
         self.dt = 1.0 / control_hz / np.ceil(1.0 / control_hz / _LONGEST_STEP_S - 1e-9)
         model.opt.timestep = self.dt
@@ -94,7 +95,7 @@ class Rig:
         )
         # Another copy for MJX, which solves for friction only in joints that had some when the model was put on the
         # device. `mj_model` keeps the nominal friction, from which priors and saved models are computed.
-        device = suspended(spec)
+        device = suspended(spec, joints)
         device.opt.timestep, device.opt.disableflags = self.dt, model.opt.disableflags
         device.opt.iterations = _ITERATIONS
         device.dof_frictionloss[self.dof] = np.maximum(model.dof_frictionloss[self.dof], MIN_FRICTION_NM)

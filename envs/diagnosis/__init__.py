@@ -46,7 +46,7 @@ def diagnose_log(log: Log, spec: mujoco.MjSpec | None = None) -> dict[str, list[
     """
     spec = models.spec(log.robot) if spec is None else spec
     # On a free base the model's dynamics are not compared, so the base may stay.
-    model = suspended(spec) if log.base == "fixed" else spec.compile()
+    model = suspended(spec, log.joints) if log.base == "fixed" else spec.compile()
     found = {run.name: diagnose(run, log.joints, model, log.base) for run in log.runs}
     for name, alike in clipped_alike(log.runs, log.joints).items():
         found[name] += alike

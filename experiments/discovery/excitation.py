@@ -177,7 +177,7 @@ def excitation(
             f"part of '{motion}'"
         )
     rng = np.random.default_rng(seed)
-    low, high, home = _ranges(suspended(spec), joints)
+    low, high, home = _ranges(suspended(spec, joints), joints)
     blocked = _Blocked(spec, joints)
     splits = ("train", "select", "train", "sealed")
     motions = []

@@ -98,11 +98,11 @@ def unknown_directions(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Returns directions in the rig's coordinates along what neither log nor model says, and their bounds.
 
-    They are a delay of all readings, a delay of all targets, the share in which targets move on between two rows, the
-    travel over which the dry friction of the nominal model sets in, and the scale of recorded torques. A log does not
-    say when within its period the controller read and acted, and no model says what friction does at a reversal. So
-    discovery leaves these free under every hypothesis; otherwise a delay, a friction or a weak motor would be named for
-    a robot that has none.
+    They are a delay of all readings, of all targets, and of velocities beside positions, the share in which targets
+    move on between two rows, the travel over which the dry friction of the nominal model sets in, and the scale of
+    recorded torques. A log does not say when within its period the controller read and acted, and no model says what
+    friction does at a reversal. So discovery leaves these free under every hypothesis; otherwise a delay, a friction or
+    a weak motor would be named for a robot that has none.
 
     Args:
       axes: coordinates of the rig.
@@ -115,6 +115,8 @@ def unknown_directions(
     """
     # Nothing acts before it is time, and nothing is later than a whole period.
     common = {"sensor_delay": 0.5 / control_hz, "command_delay": 0.5 / control_hz, "target_between_rows": 0.5}
+    # Velocities of positions that were read before and now are those of half of the time in between.
+    common |= {"velocity_lag": 0.5 / control_hz} if "dq" in signals else {}
     found = [([size * (axis.effect == effect) for axis in axes], (0.0, 2.0)) for effect, size in common.items()]
     rubbing = {axis.place for axis in axes if axis.effect == "coulomb" and axis.prior_sd > 0}
     recorded = {axis.place for axis in axes if {"tau", "abs_tau"} & set(signals)}

@@ -11,6 +11,7 @@ import numpy as np
 
 from envs import models, readings, segments
 from envs.clock import evened
+from envs.held import held_joints
 from envs.logs import Log, Run, read_any, splits, with_halves_swapped
 from experiments.discovery.cutting import row_rate, split_in_time
 
@@ -54,6 +55,8 @@ def read_logs(
     spec = models.spec(first.robot)
     cleared = models.check_flags(spec, clear_flags)
     notes = (f"flags of the model that disabled {', '.join(cleared)} were cleared",) if cleared else ()
+    if still := held_joints(spec, first.joints):
+        notes += (f"not logged, so taken to be held where the model puts them: {', '.join(still)}",)
     runs = first.runs
     if len(logs) > 1:
         runs = tuple(_numbered(run, number) for number, log in enumerate(logs) for run in log.runs)
@@ -107,13 +110,13 @@ def check_simulatable(log: Log, spec: mujoco.MjSpec, horizons: Sequence[float]) 
     Raises:
       ValueError: names the run or the joints, and what is expected.
     """
-    model, least_s = models.suspended(spec), segments.HISTORY_S + min(horizons)
+    model, least_s = models.suspended(spec, log.joints), segments.HISTORY_S + min(horizons)
     names = [model.joint(i).name or f"joint {i}" for i in range(model.njnt)]
     others = [name for name in names if name not in log.joints]
     if others:
         raise ValueError(
-            f"joints: got a log without {', '.join(others)}, expected all joints that may move: log these too, or "
-            "fix them by taking their <joint> out of the MJCF"
+            f"joints: got a log without {', '.join(others)}, expected all joints that may move: log these too. If they "
+            "are held, take their <joint> out of the MJCF, or give it actuators for them"
         )
     rate = log.runs[0].controller.rate_hz
     rows = [1.0 / np.median(np.diff(run.time)) for run in log.runs]

@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 from mujoco import rollout
 
-from envs import segments
+from envs import held, segments
 from envs.logs import Log, Run
 
 CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -88,12 +88,14 @@ def playable(spec: mujoco.MjSpec, log: Log) -> mujoco.MjSpec:
     actuator acts on the joint. A servo's limit follows its supply; here it is the median over all runs.
 
     Args:
-      spec: of the robot, which is copied; free joints, contacts and its own actuators and sensors are left out.
+      spec: of the robot, which is copied; free joints and those that are held, contacts, and its own
+        actuators, sensors and keyframes are left out.
       log: of a suspended or clamped robot.
     """
     spec = spec.copy()
+    still = [element for elements in held.elements(spec, log.joints) for element in elements]
     free = [joint for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_FREE]
-    for element in (*free, *(spec.keys if free else ()), *spec.actuators, *spec.sensors):
+    for element in (*spec.keys, *spec.actuators, *spec.sensors, *still, *free):
         spec.delete(element)
     spec.option.timestep = step_s(log)
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
