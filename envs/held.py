@@ -23,6 +23,18 @@ def held_joints(spec: mujoco.MjSpec, joints: Sequence[str]) -> tuple[str, ...]:
     return tuple(joint.name or f"joint {joint.id}" for joint in still)
 
 
+def independent_joints(spec: mujoco.MjSpec) -> tuple[str, ...]:
+    """Names the hinges and slides that no equality and no tendon ties to others; fingers of a gripper often are."""
+    model = spec.copy().compile()
+    tied = set().union(*_ties(model))
+    kinds = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+    return tuple(
+        model.joint(number).name
+        for number, kind in enumerate(model.jnt_type.tolist())
+        if kind in kinds and number not in tied
+    )
+
+
 def elements(spec: mujoco.MjSpec, joints: Sequence[str]) -> tuple[list, list, list]:
     """Lists equalities, tendons and joints of a spec that are still because joints are held (`held_joints`).
 
@@ -39,12 +51,7 @@ def elements(spec: mujoco.MjSpec, joints: Sequence[str]) -> tuple[list, list, li
     known = {joint.id for joint in spec.joints if joint.name in read}
     # A free joint is left out of a test rig in any case.
     unread = {joint.id for joint in spec.joints if joint.type != mujoco.mjtJoint.mjJNT_FREE} - known
-    driven, equalities = _driven(model), _tied(model)
-    tendons = [_joints_of_tendon(model, number) for number in range(model.ntendon)]
-    pulls = (model.tendon_stiffness, model.tendon_damping, model.tendon_frictionloss, model.tendon_limited)
-    strong = np.any([np.asarray(one, float) != 0 for one in pulls], axis=0)
-    ties = equalities + [tied for tied, pulls in zip(tendons, strong, strict=True) if pulls]
-    held = set()
+    driven, ties, held = _driven(model), _ties(model), set()
     while unread:
         tied = {unread.pop()}
         while more := [tie for tie in ties if tie & tied and not tie <= tied]:
@@ -57,9 +64,10 @@ def elements(spec: mujoco.MjSpec, joints: Sequence[str]) -> tuple[list, list, li
         moves = sum(3 if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_BALL else 1 for joint in mine)
         if model.body_parentid[body] == 0 and moves >= _BASE_MOVES and not mine & known:
             held |= mine
+    equalities = _tied(model)
     return (
         [one for one in spec.equalities if equalities[one.id] & held],
-        [one for one in spec.tendons if tendons[one.id] & held],
+        [one for one in spec.tendons if _joints_of_tendon(model, one.id) & held],
         [one for one in spec.joints if one.id in held],
     )
 
@@ -73,6 +81,13 @@ def _driven(model: mujoco.MjModel) -> set[int]:
         elif kind == kinds.mjTRN_TENDON:
             found |= _joints_of_tendon(model, number)
     return found
+
+
+def _ties(model: mujoco.MjModel) -> list[set[int]]:
+    """Numbers of the joints that cannot move independently, by what ties them; a tendon does if it pulls by itself."""
+    pulls = (model.tendon_stiffness, model.tendon_damping, model.tendon_frictionloss, model.tendon_limited)
+    strong = np.any([np.asarray(one, float) != 0 for one in pulls], axis=0)
+    return _tied(model) + [_joints_of_tendon(model, number) for number in np.flatnonzero(strong)]
 
 
 def _tied(model: mujoco.MjModel) -> list[set[int]]:

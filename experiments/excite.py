@@ -4,17 +4,20 @@ The result is a log without measurements. Play its targets on the robot, suspend
 columns; `experiments.discover` then reads the log. The motion is described in `experiments.discovery.excitation`.
 """
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-import mujoco
 import numpy as np
 
 from envs import models
+from envs.held import independent_joints
 from envs.logs import Controller, Convention, Log, Run, read_any, write
+from envs.null_logs import Robot, play
 from experiments.common.cli import console, run
-from experiments.discovery.excitation import MOTIONS, controller_of, excitation, passive, scaled
+from experiments.discovery.excitation import MOTIONS, TargetRun, controller_of, excitation, passive, scaled
 
+_ROBOTS = 4  # drawn from the prior, whose motions are looked at for contacts
 _MOST = {"seconds": 3600.0, "rate_hz": 1e5, "kp": 1e6, "torque_limit_nm": 1e5, "control_hz": 1e5}
 """Largest values of options: what a robot can be, and what fits into memory."""
 
@@ -29,7 +32,7 @@ class Args:
     robot: str | None = None
     """Robot: biteno (the default), pendulum, or the path of an MJCF file."""
     like: Path | None = None
-    """Folder of a log of the robot. Its joints and controller are taken, in the place of kp, kd,
+    """Folder of a log of the robot. Its joints and controller are taken, in the place of joints, kp, kd,
     torque_limit_nm and control_hz, and its model unless robot is given. Targets are written in its units and signs."""
     runs: int = 6
     """Number of runs; 4 or more, so that they can be split into train, select and sealed."""
@@ -37,19 +40,25 @@ class Args:
     """Length of a run in s."""
     rate_hz: float = 500.0
     """Rows per second of the log."""
-    kp: float = 60.0
-    """Proportional gain of the joint controllers in Nm/rad. Half of the runs use half of kp and kd."""
-    kd: float = 2.0
-    """Derivative gain of the joint controllers in Nm s/rad."""
-    torque_limit_nm: float = 60.0
-    """Torque limit of the joint controllers in Nm."""
+    joints: tuple[str, ...] = ()
+    """Joints that move, in the order of the log's columns; others are taken to be held. If not given, all hinges and
+    slides that no equality or tendon ties to others, as it does the fingers of a gripper."""
+    kp: tuple[float, ...] = (60.0,)
+    """Proportional gain of the joint controllers in Nm/rad: one, or one for each joint. Half of the runs use half of kp
+    and kd."""
+    kd: tuple[float, ...] = (2.0,)
+    """Derivative gain of the joint controllers in Nm s/rad: one, or one for each joint."""
+    torque_limit_nm: tuple[float, ...] = (60.0,)
+    """Torque limit of the joint controllers in Nm: one, or one for each joint."""
     control_hz: float = 1000.0
     """Rate of the joint controllers in Hz."""
     seed: int = 0
     """Random seed of postures, paces and steps."""
     motion: str = "medley"
-    """What the robot does: medley, or one that distinguishes certain effects best: slow_triangles, small_steps,
-    large_steps, chirp, soft_chirp, swing or holds."""
+    """What the robot does: medley, powered_medley (the same with the motors always on), or one that distinguishes
+    certain effects best: slow_triangles, small_steps, large_steps, chirp, soft_chirp, swing or holds."""
+    max_speed: float = math.inf
+    """Largest speed of the targets in rad/s (m/s for slides). Without it targets jump, as torque limits need it."""
 
 
 def main(args: Args) -> None:
@@ -64,17 +73,23 @@ def main(args: Args) -> None:
     if held.all():
         raise ValueError("kp: got 0 for every joint, expected a joint that follows its target")
     spec = models.spec(robot)
-    runs = tuple(
-        Run(
-            name=one.name,
-            condition=one.condition,
-            split=one.split,
-            controller=scaled(controller, one.gain),
-            time=one.time,
-            signals={"target": one.target, "enabled": one.enabled},
-        )
-        for one in excitation(spec, joints, args.runs, args.seconds, args.rate_hz, args.seed, args.motion, held)
-    )
+
+    def follow(one: TargetRun) -> np.ndarray:
+        run = _run(one, controller)
+        begun = replace(run, signals=run.signals | {"q": one.target})
+        # The model is not exact, and a swing least of all.
+        robots = [Robot.drawn(spec, joints, np.random.default_rng(seed)) for seed in range(_ROBOTS)]
+        motions = play([(robot, begun) for robot in robots], joints)
+        positions = np.stack([motion.states[:, 0] for motion in motions])
+        # By more than a radian from one tick to the next.
+        if not (np.abs(np.diff(positions, axis=1)) < 1.0).all():
+            raise ValueError("kp, kd: got gains with which the simulated robot flies apart, expected smaller ones")
+        return positions.swapaxes(0, 1).reshape(-1, len(joints))
+
+    sizes = (args.runs, args.seconds, args.rate_hz, args.seed, args.motion, held, args.max_speed)
+    # A servo's torque depends on its supply, which is not known before it was measured.
+    found = excitation(spec, joints, *sizes, follow if controller.kind == "pd" else None)
+    runs = tuple(_run(one, controller) for one in found)
     log = Log(
         robot=robot,
         base="fixed",
@@ -86,22 +101,41 @@ def main(args: Args) -> None:
     )
     write(log, args.out)
     console.print(
-        f"wrote {len(runs)} runs of {args.seconds:g} s for {', '.join(joints)} to {args.out}. Play each run's targets "
-        "on the robot, and add the measured columns to its file or a copy of it: q.*, and dq.* if there is a sensor.",
+        f"wrote {len(runs)} runs of {args.seconds:g} s for {', '.join(joints)} to {args.out}. For each run, move the "
+        "robot to the first targets slowly, wait until it is still, and play the rest. Add the measured columns to the "
+        "run's file or a copy of it: q.*, and dq.* if there is a sensor.",
         markup=False,
+    )
+
+
+def _run(one: TargetRun, controller: Controller) -> Run:
+    return Run(
+        name=one.name,
+        condition=one.condition,
+        split=one.split,
+        controller=scaled(controller, one.gain),
+        time=one.time,
+        signals={"target": one.target, "enabled": one.enabled},
     )
 
 
 def _described(args: Args) -> tuple[str, tuple[str, ...], Controller, Convention]:
     """Robot, joints and controller as the options say, in the model's units and signs."""
-    # A free joint is the base, which is held, and a ball joint has no scalar target.
-    kinds = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
     robot = args.robot or "biteno"
-    joints = tuple(joint.name for joint in models.spec(robot).joints if joint.type in kinds)
+    spec = models.spec(robot)
+    independent = independent_joints(spec)
+    joints = args.joints or independent
     if not joints or not all(joints):
         raise ValueError(f"robot: got '{robot}' with joints {joints}, expected hinges or slides that have names")
-    gains = {"kp": args.kp, "kd": args.kd, "torque_limit_nm": args.torque_limit_nm}
-    every = {name: np.full(len(joints), value) for name, value in gains.items()}
+    known = {joint.name for joint in spec.joints}
+    if unknown := [name for name in joints if name not in known]:
+        raise ValueError(f"joints: got {', '.join(unknown)}, expected some of {', '.join(sorted(known - {''}))}")
+    every = {}
+    for name in ("kp", "kd", "torque_limit_nm"):
+        values = getattr(args, name)
+        if len(values) not in (1, len(joints)):
+            raise ValueError(f"{name}: got {len(values)} values, expected one, or {len(joints)}: {', '.join(joints)}")
+        every[name] = np.resize(np.array(values, float), len(joints))
     return robot, joints, Controller(kind="pd", rate_hz=args.control_hz, gains=every), Convention()
 
 
@@ -114,10 +148,14 @@ def _alike(folder: Path, robot: str | None) -> tuple[str, tuple[str, ...], Contr
 def _check(args: Args) -> None:
     """Checks every number, before the model is read."""
     for name, most in _MOST.items():
-        if not 0 < getattr(args, name) <= most:
-            raise ValueError(f"{name}: got {getattr(args, name)}, expected more than 0 and at most {most:g}")
-    if not 0 <= args.kd <= _MOST["kp"]:
-        raise ValueError(f"kd: got {args.kd}, expected 0 to {_MOST['kp']:g}")
+        for value in np.atleast_1d(getattr(args, name)):
+            if not 0 < value <= most:
+                raise ValueError(f"{name}: got {value:g}, expected more than 0 and at most {most:g}")
+    for value in args.kd:
+        if not 0 <= value <= _MOST["kp"]:
+            raise ValueError(f"kd: got {value:g}, expected 0 to {_MOST['kp']:g}")
+    if not args.max_speed > 0:
+        raise ValueError(f"max_speed: got {args.max_speed:g}, expected more than 0")
     if args.seed < 0:
         raise ValueError(f"seed: got {args.seed}, expected a number that is not negative")
     if args.runs < 4:

@@ -50,8 +50,7 @@ def diagnose_log(log: Log, spec: mujoco.MjSpec | None = None) -> dict[str, list[
     found = {run.name: diagnose(run, log.joints, model, log.base) for run in log.runs}
     for name, alike in clipped_alike(log.runs, log.joints).items():
         found[name] += alike
-    # Where a rig holds a free base is not known, so neither is what the robot would touch.
-    if log.base == "fixed" and not any(joint.type == mujoco.mjtJoint.mjJNT_FREE for joint in spec.joints):
+    if log.base == "fixed":
         touching = spec.compile()
         for run in log.runs:
             # Positions of the wrong joints or units touch anything.

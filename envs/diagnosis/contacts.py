@@ -19,7 +19,7 @@ def contacts(run: Run, joints: tuple[str, ...], model: mujoco.MjModel) -> list[F
     Args:
       run: as it was read.
       joints: names of the joints, in the log's order.
-      model: of the robot with contacts and a fixed base.
+      model: of the robot with contacts.
     """
     shares = touching(model, joints, run.signals["q"])
     return [
@@ -41,8 +41,10 @@ def touching(
 ) -> dict[tuple[str, str], float]:
     """Finds pairs of bodies that go into each other by more than 2 mm.
 
+    Where a rig holds a free base is not known, so what such a robot touches beside itself is left out.
+
     Args:
-      model: of the robot with contacts and a fixed base.
+      model: of the robot with contacts.
       joints: names of the joints, in the columns' order.
       positions: [rows, joints] rad or m.
       most: number of rows that are looked at, at even distances.
@@ -50,7 +52,7 @@ def touching(
     Returns:
       Share of these rows by the bodies' names.
     """
-    data = mujoco.MjData(model)
+    data, free = mujoco.MjData(model), (model.jnt_type == mujoco.mjtJoint.mjJNT_FREE).any()
     address = [int(model.joint(name).qposadr[0]) for name in joints]
     rows = np.unique(np.linspace(0, len(positions) - 1, most).astype(int))
     touched: dict[tuple[str, str], int] = {}
@@ -58,7 +60,9 @@ def touching(
         data.qpos[address] = positions[row]
         mujoco.mj_fwdPosition(model, data)
         deep = data.contact.geom[data.contact.dist < -_DEEP_M]
-        pairs = {tuple(sorted(model.body(body).name for body in model.geom_bodyid[pair])) for pair in deep}
+        bodies = model.geom_bodyid[deep]
+        bodies = bodies[(bodies > 0).all(axis=1)] if free else bodies
+        pairs = {tuple(sorted(model.body(body).name for body in pair)) for pair in bodies}
         for pair in pairs:
             touched[pair] = touched.get(pair, 0) + 1
     return {pair: count / len(rows) for pair, count in touched.items()}

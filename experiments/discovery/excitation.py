@@ -22,6 +22,7 @@ from envs.models import suspended
 _CHIRP_HZ = (0.5, 10.0)
 _LEAST_ROWS = 10  # of a piece
 _LOOK_S = 0.02  # between targets that are tested for contacts
+_SIMULATED = 4  # times as many positions of simulated robots
 _TRIES, _SMALLER = 40, 0.95  # motions that are drawn until none touches, and by how much each is smaller
 
 
@@ -48,6 +49,10 @@ MOTIONS = {
         shares={"triangle": 0.35, "chirp": 0.3, "steps": 0.2, "swing": 0.15},
         shows="a little of everything, for a first log",
     ),
+    "powered_medley": Motion(
+        shares={"triangle": 0.4, "chirp": 0.35, "steps": 0.25},
+        shows="the same without the swing, for a robot whose brakes close when its motors are off",
+    ),
     "slow_triangles": Motion(shares={"triangle": 1.0}, shows="friction and backlash, at slow reversals"),
     "small_steps": Motion(shares={"steps": 1.0}, size=0.25, shows="deadband, backlash and delay, below all limits"),
     "large_steps": Motion(shares={"steps": 1.0}, shows="limits of torque and speed"),
@@ -56,7 +61,7 @@ MOTIONS = {
     "swing": Motion(shares={"steps": 0.3, "swing": 0.7}, shows="mass and friction without the motors"),
     "holds": Motion(shares={"holds": 1.0}, shows="gravity, bias and scale of torque, in two postures a run"),
 }
-"""Motions by name: what `excite --motion` writes, and what `deciding` chooses among (all but the medley)."""
+"""Motions by name: what `excite --motion` writes, and what `deciding` chooses among (all but the medleys)."""
 
 
 @dataclass(frozen=True)
@@ -101,7 +106,7 @@ def deciding(
     seed: int = 0,
     held: np.ndarray | bool = False,
 ) -> Decision | None:
-    """Chooses the motion with the largest score, of all but the medley.
+    """Chooses the motion with the largest score, of all but the medleys.
 
     Args:
       spec: the robot.
@@ -119,7 +124,7 @@ def deciding(
     Raises:
       ValueError: fewer runs than can be split.
     """
-    candidates = [name for name in MOTIONS if name != "medley"]
+    candidates = [name for name in MOTIONS if not name.endswith("medley")]
     motions = {}
     for name in candidates:
         with suppress(Touching):
@@ -142,11 +147,13 @@ def excitation(
     seed: int = 0,
     motion: str = "medley",
     held: np.ndarray | bool = False,
+    max_speed: float = np.inf,
+    follow: Callable[[TargetRun], np.ndarray] | None = None,
 ) -> list[TargetRun]:
     """Makes the target runs of a log in which effects are distinguishable.
 
-    A posture in which bodies would touch is drawn again, and again with smaller motions. What a robot on a free base
-    touches is not known.
+    A motion in which bodies would touch is drawn again, and again smaller. What a robot on a free base touches beside
+    itself is not known.
 
     Args:
       spec: the robot; postures are drawn within its joint ranges.
@@ -157,6 +164,8 @@ def excitation(
       seed: of postures, paces and steps.
       motion: a name of `MOTIONS`.
       held: [joints] true for those whose targets stay where they begin, as passive ones cannot follow any.
+      max_speed: of targets, in rad/s (m/s for a slide); faster ones are cut to it.
+      follow: where a run leads robots, [n, joints] rad, which is looked at for contacts beside the targets.
 
     Returns:
       Runs, split into train, select and sealed so that every split has both of the motion's gains.
@@ -182,53 +191,54 @@ def excitation(
     splits = ("train", "select", "train", "sealed")
     motions = []
     for number in range(runs):
-        for tried in range(_TRIES):
-            posture = home + 0.25 * (high - low) * rng.uniform(-1, 1, len(joints))
-            room = np.minimum(np.minimum(high - posture, posture - low), 0.6 * _SMALLER**tried)
-            target, enabled = _targets(chosen, posture, room, seconds, rate_hz, rng)
-            target = np.where(held, target[0], target)
-            if not (pairs := blocked.at(target, round(seconds / _LOOK_S))):
-                break
-        else:
-            raise Touching(
-                f"robot: {' and '.join(pairs[0])} touch in every motion that was drawn, by the model's geometry: "
-                "narrow the joints' ranges, correct the geometry, or mount the robot away from it"
-            )
         split = splits[number % len(splits)]
         # The gain alternates within every split. Of four runs one is for select, and it has the lower gain.
         earlier = sum(one.split == split for one in motions)
         gain = chosen.gains[(earlier + (split == "select")) % 2]
-        motions.append(
-            TargetRun(
-                f"run_{number:03d}",
-                f"posture{number}_gain{gain:g}",
-                gain,
-                split,
-                np.arange(len(target)) / rate_hz,
-                target,
-                enabled,
+        for tried in range(_TRIES):
+            posture = home + 0.25 * (high - low) * rng.uniform(-1, 1, len(joints))
+            room = np.minimum(np.minimum(high - posture, posture - low), 0.6 * _SMALLER**tried)
+            target, enabled = _targets(chosen, posture, room, seconds, rate_hz, rng)
+            target = _slowed(np.where(held, target[0], target), max_speed / rate_hz)
+            times = np.arange(len(target)) / rate_hz
+            name, condition = f"run_{number:03d}", f"posture{number}_gain{gain:g}"
+            drawn = TargetRun(name, condition, gain, split, times, target, enabled)
+            looks, where = round(seconds / _LOOK_S), "the targets"
+            if not (pairs := blocked.at(target, looks)) and follow is not None:
+                pairs, where = blocked.at(follow(drawn), _SIMULATED * looks), "the simulated motion"
+            if not pairs:
+                break
+        else:
+            raise Touching(
+                f"robot: {' and '.join(pairs[0])} touch in {where} of every run that was drawn, by the model's "
+                "geometry: narrow the joints' ranges, correct the geometry, mount the robot away from it, or choose a "
+                "motion without a swing"
             )
-        )
+        motions.append(drawn)
     return motions
 
 
+def _slowed(target: np.ndarray, most: float) -> np.ndarray:
+    """Cuts the steps between rows of targets [rows, joints] to a largest size."""
+    if not np.isfinite(most):
+        return target
+    slow = target.copy()
+    for row in range(1, len(slow)):
+        slow[row] = slow[row - 1] + np.clip(target[row] - slow[row - 1], -most, most)
+    return slow
+
+
 class _Blocked:
-    """Tells which bodies targets would drive into each other, beside those that overlap as the model is drawn."""
+    """Tells which bodies would be driven into each other, beside those that overlap as the model is drawn."""
 
     def __init__(self, spec: mujoco.MjSpec, joints: Sequence[str]):
-        # Where a rig holds a free base is not known, so neither is what the robot would touch.
-        free = any(joint.type == mujoco.mjtJoint.mjJNT_FREE for joint in spec.joints)
-        self._model, self._joints = None if free else spec.copy().compile(), joints
-        self._drawn = set() if free else set(touching(self._model, joints, self._model.qpos0[None, self._columns()]))
+        self._model, self._joints = spec.copy().compile(), joints
+        columns = [int(self._model.joint(name).qposadr[0]) for name in joints]
+        self._drawn = set(touching(self._model, joints, self._model.qpos0[None, columns]))
 
-    def at(self, targets: np.ndarray, most: int) -> list[tuple[str, str]]:
-        """Lists pairs of bodies that touch in some of the targets [rows, joints], of which `most` are looked at."""
-        if self._model is None:
-            return []
-        return sorted(set(touching(self._model, self._joints, targets, most)) - self._drawn)
-
-    def _columns(self) -> list[int]:
-        return [int(self._model.joint(name).qposadr[0]) for name in self._joints]
+    def at(self, positions: np.ndarray, most: int) -> list[tuple[str, str]]:
+        """Lists pairs of bodies that touch in some of the positions [rows, joints], of which `most` are looked at."""
+        return sorted(set(touching(self._model, self._joints, positions, most)) - self._drawn)
 
 
 def controller_of(log: Log) -> Controller:

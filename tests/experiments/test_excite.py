@@ -89,7 +89,7 @@ def test_the_motion_with_the_largest_score_is_chosen(spec):
 
     slow = deciding(spec, JOINTS, lambda motion: -speed(motion), seconds=2.0, rate_hz=200.0)
     assert slow.name == "holds"
-    assert set(slow.scores) == set(MOTIONS) - {"medley"}
+    assert set(slow.scores) == set(MOTIONS) - {"medley", "powered_medley"}
     quick = deciding(spec, JOINTS, speed, seconds=2.0, rate_hz=200.0)
     assert quick.scores[quick.name] == max(quick.scores.values())
     assert quick.name in ("chirp", "soft_chirp", "large_steps")
@@ -112,7 +112,7 @@ def test_the_command_writes_the_motion_that_was_chosen(tmp_path, spec):
 
 
 def test_targets_for_the_robot_of_a_log_have_its_model_joints_and_controller(tmp_path):
-    excite.main(excite.Args(out=tmp_path / "targets", robot=str(ARM), seconds=2.0, kp=33.0, control_hz=500.0))
+    excite.main(excite.Args(out=tmp_path / "targets", robot=str(ARM), seconds=2.0, kp=(33.0,), control_hz=500.0))
     log = read(tmp_path / "targets", measured=False)
     order = JOINTS[::-1]
     runs = [replace(run, signals={"q": run.signals["target"], **run.signals}) for run in log.runs]
@@ -174,18 +174,25 @@ def test_a_model_of_several_files_becomes_one_with_the_same_masses(tmp_path, com
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"kd": -1.0}, r"kd: got -1.0, expected 0 to 1e\+06"),
-        ({"seconds": 1e9}, r"seconds: got 1000000000.0, expected more than 0 and at most 3600"),
+        ({"kd": (2.0, -1.0)}, r"kd: got -1, expected 0 to 1e\+06"),
+        ({"seconds": 1e9}, r"seconds: got 1e\+09, expected more than 0 and at most 3600"),
         ({"rate_hz": float("inf")}, "rate_hz: got inf, expected more than 0 and at most 100000"),
-        ({"kd": float("nan")}, "kd: got nan"),
-        ({"kp": 0.0}, "kp: got 0.0, expected more than 0 and at most"),
+        ({"kd": (float("nan"),)}, "kd: got nan"),
+        ({"kp": (0.0,)}, "kp: got 0, expected more than 0 and at most"),
+        ({"kp": (60.0, 50.0, 40.0)}, "kp: got 3 values, expected one, or 2: shoulder, elbow"),
+        (
+            {"kp": (1e5,), "kd": (1e4,), "torque_limit_nm": (1e5,)},
+            "kp, kd: got gains with which the simulated robot flies apart",
+        ),
+        ({"max_speed": 0.0}, "max_speed: got 0, expected more than 0"),
+        ({"joints": ("elbow", "wrist")}, "joints: got wrist, expected some of elbow, shoulder"),
         ({"seconds": float("inf")}, "seconds: got inf"),
-        ({"rate_hz": -5.0}, "rate_hz: got -5.0"),
-        ({"control_hz": 0.0}, "control_hz: got 0.0"),
-        ({"torque_limit_nm": -1.0}, "torque_limit_nm: got -1.0"),
+        ({"rate_hz": -5.0}, "rate_hz: got -5,"),
+        ({"control_hz": 0.0}, "control_hz: got 0,"),
+        ({"torque_limit_nm": (-1.0,)}, "torque_limit_nm: got -1,"),
         ({"runs": 3}, "runs: got 3, expected 4 or more"),
         ({"seed": -1}, "seed: got -1, expected a number that is not negative"),
-        ({"motion": "dance"}, "motion: got 'dance', expected one of medley, slow_triangles"),
+        ({"motion": "dance"}, "motion: got 'dance', expected one of medley, powered_medley, slow_triangles"),
         ({"seconds": 0.01}, "seconds: got 0.01 s at 500 rows a second, expected 10 rows"),
         ({"robot": "nobody.xml"}, "robot: got 'nobody.xml'"),
     ],
@@ -257,10 +264,103 @@ def test_a_robot_that_touches_wherever_it_moves_is_named(tmp_path):
     # A forearm of 3 m that points down, 50 mm above a table.
     low = TABLE.format(3.0).replace('pos="0 0 0.3"', 'pos="0 0 0.05"').replace("-1.4 1.4", "0.2 1.4")
     (tmp_path / "low.xml").write_text(low)
-    with pytest.raises(ValueError, match="lower and world touch in every motion that was drawn"):
+    with pytest.raises(ValueError, match="lower and world touch in the targets of every run that was drawn"):
         excite.main(excite.Args(out=tmp_path / "log", robot=str(tmp_path / "low.xml"), seconds=2.0))
     assert not (tmp_path / "log").exists()
     assert deciding(models.spec(str(tmp_path / "low.xml")), JOINTS, lambda motion: 1.0, seconds=2.0) is None
+
+
+def deepest_touch(model, joints, positions, ignored=()):
+    """How far bodies go into each other at positions [rows, joints], in m; negative."""
+    data, deepest = mujoco.MjData(model), 0.0
+    columns = [int(model.joint(name).qposadr[0]) for name in joints]
+    for row in positions:
+        data.qpos[columns] = row
+        mujoco.mj_fwdPosition(model, data)
+        for contact in data.contact:
+            if not {model.body(body).name for body in model.geom_bodyid[contact.geom]} & set(ignored):
+                deepest = min(deepest, contact.dist)
+    return deepest
+
+
+def played(run, model, joints):
+    """Positions to which targets lead a robot, by a simulation of the test's own in MuJoCo C."""
+    gains, rows, data = run.controller.gains, (run.time * 1000).round().astype(int), mujoco.MjData(model)
+    data.qpos[:], positions = run.signals["target"][0], []
+    for step in range(rows[-1]):
+        row = np.searchsorted(rows, step, side="right") - 1
+        torque = gains["kp"] * (run.signals["target"][row] - data.qpos) - gains["kd"] * data.qvel
+        limit = gains["torque_limit_nm"] * run.signals["enabled"][row]
+        data.qfrc_applied[:] = np.clip(torque, -limit, limit)
+        positions.append(data.qpos.copy())
+        mujoco.mj_step(model, data)
+    return np.array(positions)
+
+
+def test_an_arm_whose_motors_are_off_does_not_fall_onto_a_table(tmp_path):
+    (tmp_path / "arm.xml").write_text(TABLE.format(0.25).replace('pos="0 0 0.3"', 'pos="0 0 0.45"'))
+    spec = models.spec(str(tmp_path / "arm.xml"))
+    model, rig = spec.compile(), models.suspended(spec)
+    rig.opt.timestep = 0.001
+    gains = {"kp": (200.0,), "kd": (8.0,), "seconds": 2.0, "runs": 4}
+    excite.main(excite.Args(out=tmp_path / "log", robot=str(tmp_path / "arm.xml"), **gains))
+    log = read(tmp_path / "log", measured=False)
+    for run in log.runs:
+        assert deepest_touch(model, JOINTS, played(run, rig, JOINTS)[::10]) > -0.01
+    # Targets alone do not tell.
+    blind = excitation(spec, JOINTS, 4, 2.0, 500.0)
+    falls = [
+        replace(run, signals={"target": one.target, "enabled": one.enabled})
+        for run, one in zip(log.runs, blind, strict=True)
+    ]
+    assert min(deepest_touch(model, JOINTS, played(run, rig, JOINTS)[::10]) for run in falls) < -0.03
+
+
+def test_a_robot_on_a_free_base_does_not_strike_itself():
+    text = """<mujoco>
+      <compiler angle="radian"/>
+      <worldbody>
+        <geom type="plane" size="2 2 0.1"/>
+        <body name="trunk" pos="0 0 0.1"><freejoint/><geom size="0.02"/>
+          <body name="shield" pos="0 0 -0.25"><geom size="0.05" pos="0.16 0 0"/>
+            <geom size="0.05" pos="-0.16 0 0"/></body>
+          <body name="thigh"><joint name="hip" axis="0 1 0" range="-1 1" limited="true"/><geom size="0.01"/>
+            <body name="shin"><joint name="knee" axis="0 1 0" range="-0.2 0.2" limited="true"/>
+              <geom type="capsule" fromto="0 0 -0.05 0 0 -0.3" size="0.02"/></body></body>
+        </body>
+      </worldbody>
+    </mujoco>"""
+    spec, joints = mujoco.MjSpec.from_string(text), ("hip", "knee")
+    ignored = ("world",)  # where a rig holds the base is not known
+    reached = [np.concatenate([one.target for one in excitation(spec, joints, 4, 2.0, 200.0)])]
+    shield = next(body for body in spec.bodies if body.name == "shield")
+    spec.delete(shield)
+    reached.append(np.concatenate([one.target for one in excitation(spec, joints, 4, 2.0, 200.0)]))
+    whole = mujoco.MjSpec.from_string(text).compile()
+    kept, free = (deepest_touch(whole, joints, positions[::5], ignored) for positions in reached)
+    assert free < -0.02 < -0.005 < kept
+
+
+def test_the_medley_with_motors_on_has_no_swing(spec):
+    for run in excitation(spec, JOINTS, 4, 3.0, 200.0, motion="powered_medley"):
+        assert run.enabled.all()
+
+
+def test_targets_are_as_slow_as_a_robot_must_be(tmp_path):
+    excite.main(excite.Args(out=tmp_path / "log", robot=str(ARM), seconds=2.0, max_speed=1.5))
+    for run in read(tmp_path / "log", measured=False).runs:
+        speed = np.abs(np.diff(run.signals["target"], axis=0)) * 500.0
+        assert 1.4 < speed.max() <= 1.5 + 1e-6
+
+
+def test_joints_are_chosen_and_have_gains_of_their_own(tmp_path):
+    excite.main(
+        excite.Args(out=tmp_path / "log", robot=str(ARM), seconds=2.0, joints=("elbow", "shoulder"), kp=(20.0, 70.0))
+    )
+    log = read(tmp_path / "log", measured=False)
+    assert log.joints == ("elbow", "shoulder")
+    np.testing.assert_allclose(log.runs[0].controller.gains["kp"], [20.0, 70.0])
+    np.testing.assert_allclose(log.runs[0].controller.gains["kd"], [2.0, 2.0])
 
 
 def like(tmp_path, kp, **options):
