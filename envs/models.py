@@ -142,6 +142,7 @@ def _write_inertia(body: mujoco.MjsBody, model: mujoco.MjModel, number: int) -> 
     body.fullinertia = np.full(6, np.nan)
 
 
+_SMALL = 0.1  # of the mass of the largest body that a body is fixed to
 _PHYSICS = ("constraint", "equality", "frictionloss", "limit", "spring", "damper", "gravity")
 
 
@@ -183,7 +184,7 @@ def suspended(spec: mujoco.MjSpec, joints: Sequence[str] | None = None) -> mujoc
     spec = without_files(spec.copy())
     still = [] if joints is None else [element for elements in held.elements(spec, joints) for element in elements]
     free = [joint for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_FREE]
-    for element in (*spec.keys, *spec.actuators, *spec.sensors, *still, *free):
+    for element in (*spec.keys, *spec.actuators, *spec.sensors, *spec.pairs, *still, *free):
         spec.delete(element)
     for joint in spec.joints:
         joint.actgravcomp = False
@@ -193,3 +194,18 @@ def suspended(spec: mujoco.MjSpec, joints: Sequence[str] | None = None) -> mujoc
     model = spec.compile()
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
     return model
+
+
+def links(model: mujoco.MjModel) -> np.ndarray:
+    """Numbers of the bodies of a suspended robot that effects may have as places.
+
+    They move, and have a mass and a name. Of bodies that are fixed to each other, those with a tenth of the largest
+    one's mass or less are left out: what changes in a fingertip could as well be in the hand. So is what has no joint
+    but moves all the same, since a simulation puts it anywhere (a mocap body).
+    """
+    group, mass = model.body_weldid, model.body_mass
+    largest = np.zeros(model.nbody)
+    np.maximum.at(largest, group, mass)
+    moves = (group > 0) & (model.body_mocapid[group] < 0)
+    named = np.array([bool(model.body(number).name) for number in range(model.nbody)])
+    return np.flatnonzero(moves & named & (mass > _SMALL * largest[group]))

@@ -22,7 +22,7 @@ from envs.axes import Axis, describe_axis
 from envs.chain import MIN_FRICTION_NM, Chain
 from envs.effects import EVERY
 from envs.effects.memory import LONGEST_S
-from envs.models import suspended
+from envs.models import links, suspended
 from envs.segments import Segment
 from jaxtune.mjx import parameters
 from jaxtune.types import Effect, Parameter
@@ -79,15 +79,10 @@ class Rig:
         found = [model.joint(name) for name in joints]
         self.qpos = np.array([joint.qposadr[0] for joint in found])
         self.dof = np.array([joint.dofadr[0] for joint in found])
-        moving = [
-            i
-            for i in range(1, model.nbody)
-            if model.body_weldid[i] > 0 and model.body_mass[i] > 0 and model.body(i).name
-        ]
-        self._bodies = np.array(moving)
+        self._bodies = links(model)
         # Equality constraints and tendons may couple what is apart as kinematic trees.
         self.trees = np.zeros_like(self.dof) if model.neq or model.ntendon else model.dof_treeid[self.dof].copy()
-        self.bodies = tuple(model.body(i).name for i in moving)
+        self.bodies = tuple(model.body(i).name for i in self._bodies)
         self.mj_model = model
         # Joints that move but are neither controlled nor read; `check_matches` refuses a model that has some.
         self.others = tuple(
@@ -97,6 +92,8 @@ class Rig:
         # device. `mj_model` keeps the nominal friction, from which priors and saved models are computed.
         device = suspended(spec, joints)
         device.opt.timestep, device.opt.disableflags = self.dt, model.opt.disableflags
+        # MJX refuses shapes whose contacts it does not know, though nothing touches here.
+        device.geom_contype[:] = device.geom_conaffinity[:] = 0
         device.opt.iterations = _ITERATIONS
         device.dof_frictionloss[self.dof] = np.maximum(model.dof_frictionloss[self.dof], MIN_FRICTION_NM)
         try:

@@ -222,3 +222,27 @@ def test_flags_that_switch_physics_off_are_named_or_cleared(robot, name):
 def test_built_in_robots_have_nothing_switched_off():
     for name in models.BUILT_IN:
         assert models.check_flags(models.spec(name)) == ()
+
+
+def test_shapes_whose_contacts_mjx_lacks_hang_on_a_rig():
+    """Published robots have cylinders beside boxes, and pairs of geoms of their own; nothing touches on a rig."""
+    spec = mujoco.MjSpec.from_string("""<mujoco>
+      <worldbody>
+        <geom type="box" size="0.1 0.1 0.1" pos="0 0 0.5"/>
+        <body name="hand" mocap="true"><inertial mass="1" pos="0 0 0" diaginertia="0.1 0.1 0.1"/><geom size="0.01"/></body>
+        <body name="thigh">
+          <joint name="hip" axis="0 1 0"/>
+          <geom name="rod" type="cylinder" size="0.02 0.1" mass="1"/>
+          <body name="foot" pos="0 0 -0.2"><geom name="ball" size="0.03" mass="0.06"/></body>
+          <body name="tool" pos="0 0 -0.2"><geom size="0.03" mass="0.2" contype="0" conaffinity="0"/></body>
+        </body>
+        <body name="block" pos="1 0 0">
+          <joint name="turn" axis="0 1 0"/>
+          <geom name="cube" type="box" size="0.1 0.1 0.1" mass="2"/>
+        </body>
+      </worldbody>
+      <contact><pair geom1="rod" geom2="cube"/></contact>
+    </mujoco>""")
+    rig = Rig(spec, ("hip", "turn"), 500.0)
+    # Neither the foot, a sixteenth of the link that it is fixed to, nor what a simulation moves without a joint.
+    assert rig.bodies == ("thigh", "tool", "block")
