@@ -5,15 +5,16 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-_BASE_MOVES = 3  # directions in which a body on the world moves at least, if it is a base
+_BASE_FREEDOMS = 3  # degrees of freedom of a body on the world, from which on it is a base
 
 
 def held_joints(spec: mujoco.MjSpec, joints: Sequence[str]) -> tuple[str, ...]:
     """Names the joints that are held still while others are read: a gripper, the other arm, or a base of slides.
 
-    A joint that is not read counts as held if the model has an actuator for it, or for one that it is tied to by an
-    equality or a tendon. So does a body on the world that may move in three directions or more, none of which is read:
-    it is the base. Joints that are tied to one that is read are not held, nor is one without a motor, which may swing.
+    Joints are coupled by equalities, and by tendons that pull by themselves. Coupled ones of which none is read are
+    held if an actuator moves one of them, directly or through a tendon that moves none but them. A base is held
+    without an actuator: a body on the world with three degrees of freedom or more that carries joints that are read.
+    All other joints that are not read may swing.
 
     Args:
       spec: of the robot.
@@ -24,21 +25,23 @@ def held_joints(spec: mujoco.MjSpec, joints: Sequence[str]) -> tuple[str, ...]:
 
 
 def independent_joints(spec: mujoco.MjSpec) -> tuple[str, ...]:
-    """Names the hinges and slides that no equality and no tendon ties to others; fingers of a gripper often are."""
+    """Names the hinges and slides that are not coupled to others, as fingers of a gripper often are."""
     model = spec.copy().compile()
-    tied = set().union(*_ties(model))
+    coupled = set().union(*(pair for pair in _couplings(model) if len(pair) > 1))
     kinds = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
     return tuple(
         model.joint(number).name
         for number, kind in enumerate(model.jnt_type.tolist())
-        if kind in kinds and number not in tied
+        if kind in kinds and number not in coupled
     )
 
 
-def elements(spec: mujoco.MjSpec, joints: Sequence[str]) -> tuple[list, list, list]:
+def elements(
+    spec: mujoco.MjSpec, joints: Sequence[str]
+) -> tuple[list[mujoco.MjsEquality], list[mujoco.MjsTendon], list[mujoco.MjsJoint]]:
     """Lists equalities, tendons and joints of a spec that are still because joints are held (`held_joints`).
 
-    Deleted in this order, they leave the robot with these joints held where the model puts them.
+    Deleted in this order, they leave the robot with these joints at zero, where the model is drawn.
 
     Args:
       spec: of the robot, without the files of its meshes; it is compiled, which numbers its elements.
@@ -51,47 +54,59 @@ def elements(spec: mujoco.MjSpec, joints: Sequence[str]) -> tuple[list, list, li
     known = {joint.id for joint in spec.joints if joint.name in read}
     # A free joint is left out of a test rig in any case.
     unread = {joint.id for joint in spec.joints if joint.type != mujoco.mjtJoint.mjJNT_FREE} - known
-    driven, ties, held = _driven(model), _ties(model), set()
+    bases, actuated = _bases(model, known), _actuated(model)
+    couplings, held = _couplings(model) + bases, set()
     while unread:
-        tied = {unread.pop()}
-        while more := [tie for tie in ties if tie & tied and not tie <= tied]:
-            tied |= set().union(*more)
-        unread -= tied
-        if not tied & known and tied & driven:
-            held |= tied
-    for body in range(1, model.nbody):
-        mine = _joints_of(model, body)
-        moves = sum(3 if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_BALL else 1 for joint in mine)
-        if model.body_parentid[body] == 0 and moves >= _BASE_MOVES and not mine & known:
-            held |= mine
-    equalities = _tied(model)
+        group = {unread.pop()}
+        while more := [pair for pair in couplings if pair & group and not pair <= group]:
+            group |= set().union(*more)
+        unread -= group
+        if not group & known and any(one <= group for one in actuated + bases):
+            held |= group
+    # What also holds on to a joint that is read does nothing: an equality that is off, or a tendon without a spring.
+    equalities = _of_equalities(model)
     return (
         [one for one in spec.equalities if equalities[one.id] & held],
-        [one for one in spec.tendons if _joints_of_tendon(model, one.id) & held],
+        [one for one in spec.tendons if _of_tendon(model, one.id) & held],
         [one for one in spec.joints if one.id in held],
     )
 
 
-def _driven(model: mujoco.MjModel) -> set[int]:
-    """Numbers of the joints that some actuator moves, directly or through a tendon."""
-    kinds, found = mujoco.mjtTrn, set()
+def _bases(model: mujoco.MjModel, known: set[int]) -> list[set[int]]:
+    """Numbers of the joints of each base."""
+    carrying = set()
+    for joint in known:
+        body = int(model.jnt_bodyid[joint])
+        while body := int(model.body_parentid[body]):
+            carrying.add(body)
+    on_world = [_of_body(model, body) for body in carrying if model.body_parentid[body] == 0]
+    ball = mujoco.mjtJoint.mjJNT_BALL
+    freedoms = [sum(3 if model.jnt_type[joint] == ball else 1 for joint in joints) for joints in on_world]
+    return [joints for joints, number in zip(on_world, freedoms, strict=True) if number >= _BASE_FREEDOMS]
+
+
+def _actuated(model: mujoco.MjModel) -> list[set[int]]:
+    """Numbers of the joints that each actuator moves, of those that act on joints or on tendons."""
+    kinds, found = mujoco.mjtTrn, []
     for kind, (number, _) in zip(model.actuator_trntype.tolist(), model.actuator_trnid, strict=True):
         if kind in (kinds.mjTRN_JOINT, kinds.mjTRN_JOINTINPARENT):
-            found.add(int(number))
+            found.append({int(number)})
         elif kind == kinds.mjTRN_TENDON:
-            found |= _joints_of_tendon(model, number)
-    return found
+            found.append(_of_tendon(model, number))
+    return [joints for joints in found if joints]
 
 
-def _ties(model: mujoco.MjModel) -> list[set[int]]:
-    """Numbers of the joints that cannot move independently, by what ties them; a tendon does if it pulls by itself."""
-    pulls = (model.tendon_stiffness, model.tendon_damping, model.tendon_frictionloss, model.tendon_limited)
-    strong = np.any([np.asarray(one, float) != 0 for one in pulls], axis=0)
-    return _tied(model) + [_joints_of_tendon(model, number) for number in np.flatnonzero(strong)]
+def _couplings(model: mujoco.MjModel) -> list[set[int]]:
+    """Numbers of the joints that do not move independently, by what couples them."""
+    names = ("stiffness", "damping", "frictionloss", "limited", "armature", "stiffnesspoly", "dampingpoly")
+    pulls = [np.asarray(getattr(model, f"tendon_{name}", np.zeros(model.ntendon)), float) for name in names]
+    strong = np.any([one.any(axis=tuple(range(1, one.ndim))) for one in pulls], axis=0)
+    active = [joints for joints, on in zip(_of_equalities(model), model.eq_active0, strict=True) if on]
+    return active + [_of_tendon(model, number) for number in np.flatnonzero(strong)]
 
 
-def _tied(model: mujoco.MjModel) -> list[set[int]]:
-    """Numbers of the joints that each equality ties to each other."""
+def _of_equalities(model: mujoco.MjModel) -> list[set[int]]:
+    """Numbers of the joints that each equality couples."""
     kinds, found = mujoco.mjtEq, []
     columns = (model.eq_type, model.eq_objtype, model.eq_obj1id, model.eq_obj2id)
     for kind, of, *pair in np.transpose(columns).tolist():
@@ -99,7 +114,7 @@ def _tied(model: mujoco.MjModel) -> list[set[int]]:
         if kind == kinds.mjEQ_JOINT:
             found.append(set(pair))
         elif kind == kinds.mjEQ_TENDON:
-            found.append(set().union(*(_joints_of_tendon(model, number) for number in pair)))
+            found.append(set().union(*(_of_tendon(model, number) for number in pair)))
         elif kind in (kinds.mjEQ_CONNECT, kinds.mjEQ_WELD):
             site = of == mujoco.mjtObj.mjOBJ_SITE
             found.append(_between(model, *(model.site_bodyid[pair] if site else pair)))
@@ -108,13 +123,21 @@ def _tied(model: mujoco.MjModel) -> list[set[int]]:
     return found
 
 
-def _joints_of_tendon(model: mujoco.MjModel, number: int) -> set[int]:
+def _of_tendon(model: mujoco.MjModel, number: int) -> set[int]:
+    """Numbers of the joints that change the length of a tendon."""
+    kinds, joints, branch = mujoco.mjtWrap, set(), []
     first = model.tendon_adr[number]
     wraps = slice(first, first + model.tendon_num[number])
-    kinds, numbers = model.wrap_type[wraps], model.wrap_objid[wraps]
-    joints = {int(one) for one in numbers[kinds == mujoco.mjtWrap.mjWRAP_JOINT]}
-    bodies = model.site_bodyid[numbers[kinds == mujoco.mjtWrap.mjWRAP_SITE]]
-    return joints.union(*(_between(model, bodies[0], body) for body in bodies[1:]))
+    for kind, index in zip(model.wrap_type[wraps].tolist(), model.wrap_objid[wraps], strict=True):
+        if kind == kinds.mjWRAP_JOINT:
+            joints.add(int(index))
+        elif kind == kinds.mjWRAP_PULLEY:
+            branch = []
+        else:
+            of_body = model.site_bodyid if kind == kinds.mjWRAP_SITE else model.geom_bodyid
+            branch.append(int(of_body[index]))
+            joints |= _between(model, branch[0], branch[-1])
+    return joints
 
 
 def _between(model: mujoco.MjModel, one: int, other: int) -> set[int]:
@@ -123,13 +146,13 @@ def _between(model: mujoco.MjModel, one: int, other: int) -> set[int]:
     def above(body: int) -> set[int]:
         found = set()
         while body:
-            found |= _joints_of(model, body)
+            found |= _of_body(model, body)
             body = int(model.body_parentid[body])
         return found
 
     return above(int(one)) ^ above(int(other))
 
 
-def _joints_of(model: mujoco.MjModel, body: int) -> set[int]:
+def _of_body(model: mujoco.MjModel, body: int) -> set[int]:
     first = int(model.body_jntadr[body])
     return set(range(first, first + int(model.body_jntnum[body]))) if first >= 0 else set()

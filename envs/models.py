@@ -184,7 +184,7 @@ def suspended(spec: mujoco.MjSpec, joints: Sequence[str] | None = None) -> mujoc
     spec = without_files(spec.copy())
     still = [] if joints is None else [element for elements in held.elements(spec, joints) for element in elements]
     free = [joint for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_FREE]
-    for element in (*spec.keys, *spec.actuators, *spec.sensors, *spec.pairs, *still, *free):
+    for element in (*spec.keys, *spec.actuators, *spec.sensors, *spec.pairs, *spec.tuples, *still, *free):
         spec.delete(element)
     for joint in spec.joints:
         joint.actgravcomp = False

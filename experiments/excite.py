@@ -5,19 +5,19 @@ columns; `experiments.discover` then reads the log. The motion is described in `
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
+import mujoco
 import numpy as np
 
 from envs import models
-from envs.held import independent_joints
-from envs.logs import Controller, Convention, Log, Run, read_any, write
-from envs.null_logs import Robot, play
+from envs.held import held_joints, independent_joints
+from envs.logs import Controller, Convention, Log, read_any, write
 from experiments.common.cli import console, run
-from experiments.discovery.excitation import MOTIONS, TargetRun, controller_of, excitation, passive, scaled
+from experiments.discovery.excitation import MOTIONS, controller_of, excitation, passive
+from experiments.discovery.rehearsal import rehearsal, run_of
 
-_ROBOTS = 4  # drawn from the prior, whose motions are looked at for contacts
 _MOST = {"seconds": 3600.0, "rate_hz": 1e5, "kp": 1e6, "torque_limit_nm": 1e5, "control_hz": 1e5}
 """Largest values of options: what a robot can be, and what fits into memory."""
 
@@ -41,8 +41,8 @@ class Args:
     rate_hz: float = 500.0
     """Rows per second of the log."""
     joints: tuple[str, ...] = ()
-    """Joints that move, in the order of the log's columns; others are taken to be held. If not given, all hinges and
-    slides that no equality or tendon ties to others, as it does the fingers of a gripper."""
+    """Joints that move, in the order of the log's columns; all others must be held. If not given, all hinges and slides
+    that no equality or tendon couples to others, as it does the fingers of a gripper."""
     kp: tuple[float, ...] = (60.0,)
     """Proportional gain of the joint controllers in Nm/rad: one, or one for each joint. Half of the runs use half of kp
     and kd."""
@@ -69,27 +69,16 @@ def main(args: Args) -> None:
     """
     _check(args)
     robot, joints, controller, convention = _described(args) if args.like is None else _alike(args.like, args.robot)
-    held = passive(controller)
-    if held.all():
+    still = passive(controller)
+    if still.all():
         raise ValueError("kp: got 0 for every joint, expected a joint that follows its target")
     spec = models.spec(robot)
-
-    def follow(one: TargetRun) -> np.ndarray:
-        run = _run(one, controller)
-        begun = replace(run, signals=run.signals | {"q": one.target})
-        # The model is not exact, and a swing least of all.
-        robots = [Robot.drawn(spec, joints, np.random.default_rng(seed)) for seed in range(_ROBOTS)]
-        motions = play([(robot, begun) for robot in robots], joints)
-        positions = np.stack([motion.states[:, 0] for motion in motions])
-        # By more than a radian from one tick to the next.
-        if not (np.abs(np.diff(positions, axis=1)) < 1.0).all():
-            raise ValueError("kp, kd: got gains with which the simulated robot flies apart, expected smaller ones")
-        return positions.swapaxes(0, 1).reshape(-1, len(joints))
-
-    sizes = (args.runs, args.seconds, args.rate_hz, args.seed, args.motion, held, args.max_speed)
-    # A servo's torque depends on its supply, which is not known before it was measured.
-    found = excitation(spec, joints, *sizes, follow if controller.kind == "pd" else None)
-    runs = tuple(_run(one, controller) for one in found)
+    _check_held(spec, joints)
+    sizes = (args.runs, args.seconds, args.rate_hz, args.seed, args.motion, still, args.max_speed)
+    follow = rehearsal(spec, joints, controller, args.seconds)
+    if follow is None:
+        console.print("note: what the motions would strike is looked for in the targets alone", highlight=False)
+    runs = tuple(run_of(one, controller) for one in excitation(spec, joints, *sizes, follow))
     log = Log(
         robot=robot,
         base="fixed",
@@ -108,28 +97,28 @@ def main(args: Args) -> None:
     )
 
 
-def _run(one: TargetRun, controller: Controller) -> Run:
-    return Run(
-        name=one.name,
-        condition=one.condition,
-        split=one.split,
-        controller=scaled(controller, one.gain),
-        time=one.time,
-        signals={"target": one.target, "enabled": one.enabled},
-    )
+def _check_held(spec: mujoco.MjSpec, joints: tuple[str, ...]) -> None:
+    """Says which joints must be held, and refuses a model of which others would not be read but may swing."""
+    model = models.suspended(spec, joints)
+    names = [model.joint(number).name or f"joint {number}" for number in range(model.njnt)]
+    if others := [name for name in names if name not in joints]:
+        raise ValueError(f"joints: got none of {', '.join(others)}, expected all that may move and that no motor holds")
+    if found := held_joints(spec, joints):
+        console.print(f"note: to be held where the model draws them: {', '.join(found)}", highlight=False, markup=False)
 
 
 def _described(args: Args) -> tuple[str, tuple[str, ...], Controller, Convention]:
     """Robot, joints and controller as the options say, in the model's units and signs."""
     robot = args.robot or "biteno"
     spec = models.spec(robot)
-    independent = independent_joints(spec)
-    joints = args.joints or independent
+    joints = args.joints or independent_joints(spec)
     if not joints or not all(joints):
         raise ValueError(f"robot: got '{robot}' with joints {joints}, expected hinges or slides that have names")
-    known = {joint.name for joint in spec.joints}
-    if unknown := [name for name in joints if name not in known]:
-        raise ValueError(f"joints: got {', '.join(unknown)}, expected some of {', '.join(sorted(known - {''}))}")
+    # A free joint is the base, which is held, and a ball joint has no scalar target.
+    kinds = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+    known = {joint.name for joint in spec.joints if joint.type in kinds} - {""}
+    if len(set(joints) & known) < len(joints):
+        raise ValueError(f"joints: got {', '.join(joints)}, expected some of {', '.join(sorted(known))}, each once")
     every = {}
     for name in ("kp", "kd", "torque_limit_nm"):
         values = getattr(args, name)

@@ -58,8 +58,7 @@ class DVMConfig:
     batch: int = 32
     """Windows in a gradient step."""
     learning_rate: float = 4e-3
-    """Peak of a one-cycle cosine schedule. On two CPU cores, batches of 32 with this rate take a quarter of the time of
-    batches of 128 with half of it, and reach a higher ELBO on episodes of a walking robot."""
+    """Peak of a one-cycle cosine schedule."""
     references: int = 2048
     """Simulated windows that are kept as candidates for Q."""
     neighbours: int = 10

@@ -61,7 +61,7 @@ def touching(
         mujoco.mj_fwdPosition(model, data)
         deep = data.contact.geom[data.contact.dist < -_DEEP_M]
         bodies = model.geom_bodyid[deep]
-        bodies = bodies[(bodies > 0).all(axis=1)] if free else bodies
+        bodies = bodies[(model.body_weldid[bodies] > 0).all(axis=1)] if free else bodies
         pairs = {tuple(sorted(model.body(body).name for body in pair)) for pair in bodies}
         for pair in pairs:
             touched[pair] = touched.get(pair, 0) + 1

@@ -22,12 +22,11 @@ from envs.models import suspended
 _CHIRP_HZ = (0.5, 10.0)
 _LEAST_ROWS = 10  # of a piece
 _LOOK_S = 0.02  # between targets that are tested for contacts
-_SIMULATED = 4  # times as many positions of simulated robots
 _TRIES, _SMALLER = 40, 0.95  # motions that are drawn until none touches, and by how much each is smaller
 
 
-class Touching(ValueError):
-    """Bodies of a robot touch in every motion that was drawn."""
+class Unplayable(ValueError):
+    """Bodies of a robot touch in every motion that was drawn, or it flies apart."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,7 +103,8 @@ def deciding(
     seconds: float = 3.0,
     rate_hz: float = 500.0,
     seed: int = 0,
-    held: np.ndarray | bool = False,
+    still: np.ndarray | bool = False,
+    follow: Callable[[TargetRun], np.ndarray] | None = None,
 ) -> Decision | None:
     """Chooses the motion with the largest score, of all but the medleys.
 
@@ -116,7 +116,9 @@ def deciding(
       seconds: length of a run in s.
       rate_hz: rows per second.
       seed: of postures, paces and steps; `excite` writes the same targets with the same numbers.
-      held: [joints] as in `excitation`.
+      still: [joints] as in `excitation`.
+
+      follow: as in `excitation`. Only motions that may be chosen are rehearsed, best first.
 
     Returns:
       The motion; None where no score is a number, or bodies touch in all motions.
@@ -127,15 +129,20 @@ def deciding(
     candidates = [name for name in MOTIONS if not name.endswith("medley")]
     motions = {}
     for name in candidates:
-        with suppress(Touching):
-            motions[name] = excitation(spec, joints, runs, seconds, rate_hz, seed, name, held)
+        with suppress(Unplayable):
+            motions[name] = excitation(spec, joints, runs, seconds, rate_hz, seed, name, still)
     scores = {name: float(score(motion)) for name, motion in motions.items()}
     # A simulation that diverges under a suspect decides nothing.
     scores = {name: value if np.isfinite(value) else -np.inf for name, value in scores.items()}
-    best = max(scores, key=scores.__getitem__, default=None)
-    if best is None or scores[best] == -np.inf:
-        return None
-    return Decision(name=best, motion=motions[best], scores=scores)
+    for name in sorted(scores, key=scores.__getitem__, reverse=True):
+        if scores[name] == -np.inf:
+            break
+        with suppress(Unplayable):
+            rehearsed = excitation(spec, joints, runs, seconds, rate_hz, seed, name, still, follow=follow)
+            if any((one.target != other.target).any() for one, other in zip(rehearsed, motions[name], strict=True)):
+                scores[name] = float(score(rehearsed))
+            return Decision(name=name, motion=rehearsed, scores=scores)
+    return None
 
 
 def excitation(
@@ -146,7 +153,7 @@ def excitation(
     rate_hz: float,
     seed: int = 0,
     motion: str = "medley",
-    held: np.ndarray | bool = False,
+    still: np.ndarray | bool = False,
     max_speed: float = np.inf,
     follow: Callable[[TargetRun], np.ndarray] | None = None,
 ) -> list[TargetRun]:
@@ -163,9 +170,9 @@ def excitation(
       rate_hz: rows per second.
       seed: of postures, paces and steps.
       motion: a name of `MOTIONS`.
-      held: [joints] true for those whose targets stay where they begin, as passive ones cannot follow any.
+      still: [joints] true for those whose targets stay where they begin, as passive ones cannot follow any.
       max_speed: of targets, in rad/s (m/s for a slide); faster ones are cut to it.
-      follow: where a run leads robots, [n, joints] rad, which is looked at for contacts beside the targets.
+      follow: where a run leads robots, [robots, n, joints] rad, which is looked at for contacts beside the targets.
 
     Returns:
       Runs, split into train, select and sealed so that every split has both of the motion's gains.
@@ -173,7 +180,7 @@ def excitation(
     Raises:
       ValueError: fewer runs than can be split, fewer rows than the motion needs, the motion is unknown, or a slide
         joint has no range.
-      Touching: bodies touch wherever the robot moves.
+      Unplayable: bodies touch wherever the robot moves, or `follow` says so.
     """
     if motion not in MOTIONS:
         raise ValueError(f"motion: got '{motion}', expected one of {', '.join(MOTIONS)}")
@@ -199,20 +206,23 @@ def excitation(
             posture = home + 0.25 * (high - low) * rng.uniform(-1, 1, len(joints))
             room = np.minimum(np.minimum(high - posture, posture - low), 0.6 * _SMALLER**tried)
             target, enabled = _targets(chosen, posture, room, seconds, rate_hz, rng)
-            target = _slowed(np.where(held, target[0], target), max_speed / rate_hz)
+            target = _slowed(np.where(still, target[0], target), max_speed / rate_hz)
             times = np.arange(len(target)) / rate_hz
             name, condition = f"run_{number:03d}", f"posture{number}_gain{gain:g}"
             drawn = TargetRun(name, condition, gain, split, times, target, enabled)
-            looks, where = round(seconds / _LOOK_S), "the targets"
-            if not (pairs := blocked.at(target, looks)) and follow is not None:
-                pairs, where = blocked.at(follow(drawn), _SIMULATED * looks), "the simulated motion"
+            looks, where = round(seconds / _LOOK_S), "targets"
+            pairs = blocked.at(target, looks)
+            if not pairs and follow is not None:
+                pairs = sorted(set().union(*(blocked.at(positions, looks) for positions in follow(drawn))))
+                where = "the simulated motion"
             if not pairs:
                 break
         else:
-            raise Touching(
-                f"robot: {' and '.join(pairs[0])} touch in {where} of every run that was drawn, by the model's "
-                "geometry: narrow the joints' ranges, correct the geometry, mount the robot away from it, or choose a "
-                "motion without a swing"
+            swings = ", or choose a motion without a swing" if where != "targets" and not enabled.all() else ""
+            raise Unplayable(
+                "robot: in every motion that was drawn bodies touch by the model's geometry, at last "
+                f"{' and '.join(pairs[0])} in {where}: narrow the joints' ranges, correct the geometry, mount the "
+                f"robot away from it{swings}"
             )
         motions.append(drawn)
     return motions

@@ -11,6 +11,7 @@ from envs.logs import Log, Run
 from envs.models import BUILT_IN
 from experiments.discovery.excitation import TargetRun, controller_of, deciding, passive, scaled, unlimited_slides
 from experiments.discovery.question import Question
+from experiments.discovery.rehearsal import rehearsal
 from experiments.discovery.whole_runs import simulate_runs
 from jaxtune.discovery.result import Result
 
@@ -39,11 +40,13 @@ def deciding_experiment(question: Question, log: Log, folder: Path, result: Resu
         # Of the joint in which they differ most.
         return float(np.sqrt(np.mean([(a - b) ** 2 for a, b in simulated], axis=(0, 1)).max()))
 
-    held = passive(controller_of(log))
-    if held.all():
+    controller = controller_of(log)
+    still = passive(controller)
+    if still.all():
         return None
     sizes = {"runs": _RUNS, "seconds": _SECONDS, "rate_hz": _RATE_HZ, "seed": 0}
-    found = deciding(question.spec, log.joints, score, **sizes, held=held)
+    follow = rehearsal(question.spec, log.joints, controller, _SECONDS)
+    found = deciding(question.spec, log.joints, score, **sizes, still=still, follow=follow)
     if found is None:
         return None
     return (

@@ -95,7 +95,7 @@ def playable(spec: mujoco.MjSpec, log: Log) -> mujoco.MjSpec:
     spec = spec.copy()
     still = [element for elements in held.elements(spec, log.joints) for element in elements]
     free = [joint for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_FREE]
-    for element in (*spec.keys, *spec.actuators, *spec.sensors, *still, *free):
+    for element in (*spec.keys, *spec.actuators, *spec.sensors, *spec.tuples, *still, *free):
         spec.delete(element)
     spec.option.timestep = step_s(log)
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT

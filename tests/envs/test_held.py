@@ -49,29 +49,55 @@ def robot(base="", tendon=SPLIT, equality=MIMIC, actuator=PULLED):
     return mujoco.MjSpec.from_string(text)
 
 
+MOTOR = '<motor joint="left"/>'
+TO_BASE = '<connect body1="left" body2="base" anchor="0 0 0"/>'
+
+
 @pytest.mark.parametrize(
-    ("options", "held"),
+    ("options", "held", "left"),
     [
-        ({}, ("left", "right")),  # a tendon drives both
-        ({"actuator": '<motor joint="left"/>'}, ("left", "right")),  # the other follows it
-        ({"actuator": '<motor joint="left"/>', "equality": ""}, ("left",)),
-        ({"actuator": ""}, ()),  # nobody holds them
-        ({"equality": '<joint joint1="left" joint2="elbow"/>'}, ("right",)),  # follows what is read
-        ({"equality": '<connect body1="left" body2="base" anchor="0 0 0"/>'}, ("right",)),  # a loop through it
-        ({"equality": '<connect body1="left" body2="right" anchor="0 0 0"/>'}, ("left", "right")),
-        ({"base": BASE}, ("x", "z", "pitch", "left", "right")),
-        ({"base": '<joint name="yaw" axis="0 0 1"/>'}, ("left", "right")),  # a joint like any other
+        ({}, ("left", "right"), 0),  # a tendon drives both
+        ({"actuator": MOTOR}, ("left", "right"), 0),  # the other follows it
+        ({"actuator": MOTOR, "equality": ""}, ("left",), 0),
+        ({"actuator": MOTOR, "equality": MIMIC.replace("/>", ' active="false"/>')}, ("left",), 0),
+        ({"actuator": ""}, (), 1),  # nobody holds them
+        ({"equality": ""}, (), 0),  # one motor cannot hold two
+        ({"equality": '<joint joint1="left" joint2="elbow"/>'}, (), 1),  # one follows what is read
+        ({"equality": TO_BASE}, (), 1),  # a loop through what is read
+        ({"equality": TO_BASE, "actuator": '<motor joint="right"/>'}, ("right",), 1),
+        ({"equality": '<connect body1="left" body2="right" anchor="0 0 0"/>'}, ("left", "right"), 0),
+        ({"base": BASE}, ("x", "z", "pitch", "left", "right"), 0),
+        ({"base": BASE, "equality": '<joint joint1="elbow" joint2="pitch"/>'}, (), 1),  # tied to what is read
+        ({"base": '<joint name="yaw" axis="0 0 1"/>'}, ("left", "right"), 0),  # a joint like any other
     ],
 )
-def test_joints_that_motors_hold_are_held_and_passive_ones_are_not(options, held):
+def test_joints_that_motors_hold_are_held_and_passive_ones_are_not(options, held, left):
+    """`left` is the number of equalities that still act."""
     spec = robot(**options)
     assert held_joints(spec, ["elbow"]) == held
     model = suspended(spec, ["elbow"])
-    names = {joint.name for joint in spec.joints} - set(held)
-    assert {model.joint(number).name for number in range(model.njnt)} == names
-    if "elbow" not in options.get("equality", "") and "base" not in options.get("equality", ""):
-        # What tied held joints to each other is gone, and with it the work of solving for it.
-        assert model.neq == 0 or "right" in names
+    assert {model.joint(number).name for number in range(model.njnt)} == {one.name for one in spec.joints} - set(held)
+    assert model.neq == left
+
+
+def test_a_lamp_beside_the_robot_is_no_base():
+    text = (
+        robot()
+        .to_xml()
+        .replace(
+            "<worldbody>",
+            '<worldbody><body name="lamp" pos="1 0 0"><joint name="cord" type="ball"/><geom size="0.1"/></body>',
+        )
+    )
+    spec = mujoco.MjSpec.from_string(text.replace('<key qpos="0 0 0"/>', ""))
+    assert held_joints(spec, ["elbow"]) == ("left", "right")
+
+
+def test_inertia_that_a_tendon_couples_is_not_lost():
+    heavy = SPLIT.replace('joint="right"', 'joint="elbow"').replace('name="split"', 'name="split" armature="0.5"')
+    spec = robot(tendon=heavy, equality="", actuator=MOTOR)
+    assert held_joints(spec, ["elbow"]) == ()
+    assert suspended(spec, ["elbow"]).ntendon == 1
 
 
 def test_a_spring_between_fingers_ties_them():
@@ -89,6 +115,11 @@ def test_a_log_of_all_joints_holds_none():
 def test_fingers_are_not_independent():
     assert independent_joints(robot()) == ("elbow",)
     assert independent_joints(robot(equality="")) == ("elbow", "left", "right")
+
+
+def test_a_spring_over_one_joint_couples_it_to_nothing():
+    spring = '<fixed name="split" stiffness="9"><joint joint="elbow" coef="1"/></fixed>'
+    assert independent_joints(robot(tendon=spring, actuator="", equality="")) == ("elbow", "left", "right")
 
 
 def test_held_joints_move_with_the_link_that_carries_them():

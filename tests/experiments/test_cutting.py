@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 
 from envs import segments
+from envs.corrected import save
 from envs.logs import Controller, Log, Run, splits, write
 from envs.models import suspended
 from envs.null_logs import Robot, as_recorded, play
+from experiments.discovery import playback
 from experiments.discovery.blind_cases import ARM
 from experiments.discovery.cutting import HORIZONS_S, cut_log, fitting_horizons, split_in_time
 from experiments.discovery.measured import drop_filtered, read_logs
@@ -168,8 +170,42 @@ def test_a_servos_supply_is_a_column_or_a_number(played, spec):
 
 def test_joints_that_nobody_reads_are_named_with_what_to_do(played, spec):
     log = split_in_time(replace(played, joints=("shoulder",)))
-    with pytest.raises(ValueError, match=r"joints: got a log without elbow, .* taking their <joint> out of the MJCF"):
+    with pytest.raises(ValueError, match=r"joints: got a log without elbow, .* take their <joint> out of the MJCF"):
         build_question(log, spec, null_logs=0)
+
+
+GRIPPER = """
+        <body name="left" pos="0.02 0 -0.25">
+          <joint name="left" type="slide" axis="1 0 0"/><geom size="0.01" mass="0.2"/>
+        </body>
+        <body name="right" pos="-0.02 0 -0.25">
+          <joint name="right" type="slide" axis="-1 0 0"/><geom size="0.01" mass="0.2"/>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <equality><joint joint1="left" joint2="right"/></equality>
+  <actuator><motor joint="left"/></actuator>
+</mujoco>"""
+
+
+def test_a_gripper_that_is_not_logged_is_held_from_log_to_saved_model(tmp_path, played):
+    """Its mass counts, in all simulators, and the corrected model still has its joints."""
+    bare = ARM.read_text()
+    logs = folder(tmp_path, played, bare[: bare.index("</body>")] + GRIPPER)
+    log, spec = read_logs(logs)
+    assert "not logged, so taken to be held where the model puts them: left, right" in log.notes
+    question = build_question(log, spec, null_logs=2)
+    assert question.rig.joints == JOINTS
+    assert question.rig.bodies == ("upper", "lower", "left", "right")
+    assert len(question.problem.null_logs) == 2
+    playable = playback.playable(spec, log).compile()
+    assert playable.njnt == 2
+    for model in (suspended(spec, JOINTS), playable):
+        assert model.body_subtreemass[0] == pytest.approx(1.2 + 0.6 + 0.4)
+    save(tmp_path / "model", question.spec, question.rig, np.zeros(len(question.rig.axes)))
+    saved = mujoco.MjModel.from_xml_path(str(tmp_path / "model" / "model.xml"))
+    assert [saved.joint(number).name for number in range(saved.njnt)] == [*JOINTS, "left", "right"]
 
 
 def test_flags_that_switch_physics_off_are_cleared_if_told(tmp_path, played):

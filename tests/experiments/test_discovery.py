@@ -238,6 +238,11 @@ def test_the_travel_of_friction_is_unknown_where_the_model_has_friction(spec):
     (number,) = np.flatnonzero(directions[3])
     assert (rig.axes[number].effect, rig.axes[number].place) == ("presliding", "elbow")
     assert (bounds[:, 0] == 0).all()
+    # When velocities were read is, by one period for all joints, and what lags more is an effect.
+    lag, most = unknown_directions(rig.axes, 500.0, ("dq", "q"))
+    moved = [rig.axes[number] for number in np.flatnonzero(lag[3])]
+    assert [(axis.effect, axis.place) for axis in moved] == [("velocity_lag", joint) for joint in JOINTS]
+    np.testing.assert_allclose(lag[3][lag[3] != 0] * most[3, 1], 1.0 / 500.0)
     # The scale of torques is unknown where they are compared.
     more, _ = unknown_directions(rig.axes, 1000.0, ("abs_tau", "q"))
     np.testing.assert_array_equal(more[:4], directions)
