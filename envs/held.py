@@ -20,8 +20,14 @@ def held_joints(spec: mujoco.MjSpec, joints: Sequence[str]) -> tuple[str, ...]:
       spec: of the robot.
       joints: names of those that are read.
     """
-    *_, still = elements(spec.copy(), joints)
-    return tuple(joint.name or f"joint {joint.id}" for joint in still)
+    still = elements(spec.copy(), joints)
+    return tuple(one.name or f"joint {one.id}" for one in still if isinstance(one, mujoco.MjsJoint))
+
+
+def unread_joints(model: mujoco.MjModel, joints: Sequence[str]) -> tuple[str, ...]:
+    """Names the joints of a suspended robot that are not among those that are read."""
+    names = (model.joint(number).name or f"joint {number}" for number in range(model.njnt))
+    return tuple(name for name in names if name not in joints)
 
 
 def independent_joints(spec: mujoco.MjSpec) -> tuple[str, ...]:
@@ -38,7 +44,7 @@ def independent_joints(spec: mujoco.MjSpec) -> tuple[str, ...]:
 
 def elements(
     spec: mujoco.MjSpec, joints: Sequence[str]
-) -> tuple[list[mujoco.MjsEquality], list[mujoco.MjsTendon], list[mujoco.MjsJoint]]:
+) -> list[mujoco.MjsEquality | mujoco.MjsTendon | mujoco.MjsJoint]:
     """Lists equalities, tendons and joints of a spec that are still because joints are held (`held_joints`).
 
     Deleted in this order, they leave the robot with these joints at zero, where the model is drawn.
@@ -49,7 +55,7 @@ def elements(
     """
     read = set(joints)
     if all(joint.name in read or joint.type == mujoco.mjtJoint.mjJNT_FREE for joint in spec.joints):
-        return [], [], []
+        return []
     model = spec.compile()
     known = {joint.id for joint in spec.joints if joint.name in read}
     # A free joint is left out of a test rig in any case.
@@ -65,11 +71,11 @@ def elements(
             held |= group
     # What also holds on to a joint that is read does nothing: an equality that is off, or a tendon without a spring.
     equalities = _of_equalities(model)
-    return (
-        [one for one in spec.equalities if equalities[one.id] & held],
-        [one for one in spec.tendons if _of_tendon(model, one.id) & held],
-        [one for one in spec.joints if one.id in held],
-    )
+    return [
+        *(one for one in spec.equalities if equalities[one.id] & held),
+        *(one for one in spec.tendons if _of_tendon(model, one.id) & held),
+        *(one for one in spec.joints if one.id in held),
+    ]
 
 
 def _bases(model: mujoco.MjModel, known: set[int]) -> list[set[int]]:

@@ -182,7 +182,7 @@ def suspended(spec: mujoco.MjSpec, joints: Sequence[str] | None = None) -> mujoc
       joints: those that are read. Others are held where the model puts them (`envs.held`); None if all are read.
     """
     spec = without_files(spec.copy())
-    still = [] if joints is None else [element for elements in held.elements(spec, joints) for element in elements]
+    still = [] if joints is None else held.elements(spec, joints)
     free = [joint for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_FREE]
     for element in (*spec.keys, *spec.actuators, *spec.sensors, *spec.pairs, *spec.tuples, *still, *free):
         spec.delete(element)

@@ -22,6 +22,7 @@ from envs.axes import Axis, describe_axis
 from envs.chain import MIN_FRICTION_NM, Chain
 from envs.effects import EVERY
 from envs.effects.memory import LONGEST_S
+from envs.held import unread_joints
 from envs.models import links, suspended
 from envs.segments import Segment
 from jaxtune.mjx import parameters
@@ -85,9 +86,7 @@ class Rig:
         self.bodies = tuple(model.body(i).name for i in self._bodies)
         self.mj_model = model
         # Joints that move but are neither controlled nor read; `check_matches` refuses a model that has some.
-        self.others = tuple(
-            model.joint(i).name or f"joint {i}" for i in range(model.njnt) if model.jnt_qposadr[i] not in self.qpos
-        )
+        self.others = unread_joints(model, joints)
         # Another copy for MJX, which solves for friction only in joints that had some when the model was put on the
         # device. `mj_model` keeps the nominal friction, from which priors and saved models are computed.
         device = suspended(spec, joints)

@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 
 from envs import models
-from envs.held import held_joints, independent_joints
+from envs.held import held_joints, independent_joints, unread_joints
 from envs.logs import Controller, Convention, Log, read_any, write
 from experiments.common.cli import console, run
 from experiments.discovery.excitation import MOTIONS, controller_of, excitation, passive
@@ -99,9 +99,7 @@ def main(args: Args) -> None:
 
 def _check_held(spec: mujoco.MjSpec, joints: tuple[str, ...]) -> None:
     """Says which joints must be held, and refuses a model of which others would not be read but may swing."""
-    model = models.suspended(spec, joints)
-    names = [model.joint(number).name or f"joint {number}" for number in range(model.njnt)]
-    if others := [name for name in names if name not in joints]:
+    if others := unread_joints(models.suspended(spec, joints), joints):
         raise ValueError(f"joints: got none of {', '.join(others)}, expected all that may move and that no motor holds")
     if found := held_joints(spec, joints):
         console.print(f"note: to be held where the model draws them: {', '.join(found)}", highlight=False, markup=False)

@@ -210,11 +210,7 @@ def excitation(
             times = np.arange(len(target)) / rate_hz
             name, condition = f"run_{number:03d}", f"posture{number}_gain{gain:g}"
             drawn = TargetRun(name, condition, gain, split, times, target, enabled)
-            looks, where = round(seconds / _LOOK_S), "targets"
-            pairs = blocked.at(target, looks)
-            if not pairs and follow is not None:
-                pairs = sorted(set().union(*(blocked.at(positions, looks) for positions in follow(drawn))))
-                where = "the simulated motion"
+            pairs, where = blocked.by(drawn, round(seconds / _LOOK_S), follow)
             if not pairs:
                 break
         else:
@@ -246,8 +242,20 @@ class _Blocked:
         columns = [int(self._model.joint(name).qposadr[0]) for name in joints]
         self._drawn = set(touching(self._model, joints, self._model.qpos0[None, columns]))
 
-    def at(self, positions: np.ndarray, most: int) -> list[tuple[str, str]]:
-        """Lists pairs of bodies that touch in some of the positions [rows, joints], of which `most` are looked at."""
+    def by(self, run: TargetRun, most: int, follow: Callable | None) -> tuple[list[tuple[str, str]], str]:
+        """Lists pairs of bodies that touch, and says where: in the targets or, if not there, where they lead robots.
+
+        Args:
+          run: of targets.
+          most: positions that are looked at, of the targets and of each robot.
+          follow: as in `excitation`.
+        """
+        pairs = self._at(run.target, most)
+        if pairs or follow is None:
+            return pairs, "targets"
+        return sorted(set().union(*(self._at(positions, most) for positions in follow(run)))), "the simulated motion"
+
+    def _at(self, positions: np.ndarray, most: int) -> list[tuple[str, str]]:
         return sorted(set(touching(self._model, self._joints, positions, most)) - self._drawn)
 
 

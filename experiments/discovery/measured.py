@@ -11,7 +11,7 @@ import numpy as np
 
 from envs import models, readings, segments
 from envs.clock import evened
-from envs.held import held_joints
+from envs.held import held_joints, unread_joints
 from envs.logs import Log, Run, read_any, splits, with_halves_swapped
 from experiments.discovery.cutting import row_rate, split_in_time
 
@@ -111,9 +111,7 @@ def check_simulatable(log: Log, spec: mujoco.MjSpec, horizons: Sequence[float]) 
       ValueError: names the run or the joints, and what is expected.
     """
     model, least_s = models.suspended(spec, log.joints), segments.HISTORY_S + min(horizons)
-    names = [model.joint(i).name or f"joint {i}" for i in range(model.njnt)]
-    others = [name for name in names if name not in log.joints]
-    if others:
+    if others := unread_joints(model, log.joints):
         raise ValueError(
             f"joints: got a log without {', '.join(others)}, expected all joints that may move: log these too. If they "
             "are held, take their <joint> out of the MJCF, or give it actuators for them"

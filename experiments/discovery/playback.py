@@ -93,7 +93,7 @@ def playable(spec: mujoco.MjSpec, log: Log) -> mujoco.MjSpec:
       log: of a suspended or clamped robot.
     """
     spec = spec.copy()
-    still = [element for elements in held.elements(spec, log.joints) for element in elements]
+    still = held.elements(spec, log.joints)
     free = [joint for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_FREE]
     for element in (*spec.keys, *spec.actuators, *spec.sensors, *spec.tuples, *still, *free):
         spec.delete(element)
