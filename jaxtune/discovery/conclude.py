@@ -11,7 +11,7 @@ from jaxtune.discovery.candidate import Candidate, cost, key_of, measures, squar
 from jaxtune.discovery.evaluate import is_worse, position_gap, rms
 from jaxtune.discovery.evidence import Thresholds, passes, weigh_evidence
 from jaxtune.discovery.fit import Fit, begin, polish, refine
-from jaxtune.discovery.naming import moved_forms, renamed, with_refinements
+from jaxtune.discovery.naming import at_fewest_places, moved_forms, renamed, with_refinements
 from jaxtune.discovery.noise_floor import Floor, NoiseFloor, Say
 from jaxtune.discovery.problem import Problem
 from jaxtune.discovery.resample import standard_errors
@@ -58,12 +58,9 @@ def conclude(settings: Settings, problem: Problem, floor: NoiseFloor, state: Sta
     """
     at = floor[problem.main_horizon]
     say("evidence")
-    state = _with_one_name(problem, at, state)
+    state = _where_it_shows(settings, problem, at, _with_one_name(problem, at, state))
     best, terms, ablated, dropped = _proved(settings, problem, floor, state)
-    candidates = sorted(
-        {one.key: one for one in (*state.candidates, best)}.values(), key=lambda one: total_cost(at, one, state.price)
-    )
-    probabilities = posterior(problem, at, candidates, state.price)
+    candidates, probabilities = _compared(problem, at, replace(state, best=best))
     terms = tuple(
         replace(term, confusable_with=rivals(at, candidates, probabilities, best, term.hypothesis, settings))
         for term in with_refinements(terms, settings.own)
@@ -147,6 +144,20 @@ def _with_one_name(problem: Problem, at: Floor, state: State) -> State:
     named = [renamed(problem, one) for one in state.candidates]
     named.sort(key=lambda one: total_cost(at, one, state.price), reverse=True)
     return replace(state, best=renamed(problem, state.best), candidates=tuple({one.key: one for one in named}.values()))
+
+
+def _where_it_shows(settings: Settings, problem: Problem, at: Floor, state: State) -> State:
+    """Claims effects only of the joints at which logs show them."""
+    if all(len(effect.places) == 1 for effect in state.best.effects):
+        return state
+    return replace(state, best=at_fewest_places(state.best, *_compared(problem, at, state), settings.possible))
+
+
+def _compared(problem: Problem, at: Floor, state: State) -> tuple[list[Candidate], np.ndarray]:
+    """All models, the cheapest first, and how far each is believed, [models]."""
+    models = {one.key: one for one in (*state.candidates, state.best)}.values()
+    ranked = sorted(models, key=lambda one: total_cost(at, one, state.price))
+    return ranked, posterior(problem, at, ranked, state.price)
 
 
 def learn(settings: Settings, problem: Problem, at: Floor, best: Candidate) -> Candidate:

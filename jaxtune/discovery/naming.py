@@ -1,4 +1,5 @@
-"""Which effects of a model give it a name: the larger of two that are alike, and none that refines a stronger one."""
+"""Which effects of a model give it a name: the larger of two that are alike, at the joints where logs show them, and
+none that refines a stronger one."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -33,6 +34,39 @@ def renamed(problem: Problem, candidate: Candidate) -> Candidate:
                 if all(theirs.values()):
                     other_names |= {effect.key: twin} | theirs
     return replace(candidate, hypotheses=tuple(other_names.get(one.key, one) for one in candidate.hypotheses))
+
+
+def at_fewest_places(
+    best: Candidate, candidates: Sequence[Candidate], probabilities: np.ndarray, possible: float
+) -> Candidate:
+    """Picks the model with the same effects at the fewest places that is still believed.
+
+    A limit that one joint reaches is as well explained by one that all joints have, since the others stay below it.
+    What logs do not show at a joint is not claimed of it.
+
+    Args:
+      best: the cheapest model.
+      candidates: all models.
+      probabilities: [candidates] of `belief.posterior`.
+      possible: probability from which on a model is believed.
+
+    Returns:
+      One of the candidates, or the best model itself.
+    """
+    believed = [one for one, p in zip(candidates, probabilities, strict=True) if p > possible and _within(one, best)]
+    # Candidates come in the order of their cost.
+    return min((best, *believed), key=_places)
+
+
+def _within(one: Candidate, other: Candidate) -> bool:
+    """Says whether a model has the effects of another one, each at some of its places."""
+    if sorted(h.name for h in one.effects) != sorted(h.name for h in other.effects):
+        return False
+    return all(any(h.name == o.name and set(h.places) <= set(o.places) for o in other.effects) for h in one.effects)
+
+
+def _places(candidate: Candidate) -> int:
+    return sum(len(effect.places) for effect in candidate.effects)
 
 
 def _like(problem: Problem, effect: Hypothesis, part: Hypothesis) -> Hypothesis | None:

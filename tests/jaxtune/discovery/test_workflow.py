@@ -14,7 +14,7 @@ from jaxtune.discovery.conclude import _rivals
 from jaxtune.discovery.evaluate import is_worse
 from jaxtune.discovery.evidence import Evidence
 from jaxtune.discovery.fit import begin
-from jaxtune.discovery.naming import moved_forms, renamed, with_refinements
+from jaxtune.discovery.naming import at_fewest_places, moved_forms, renamed, with_refinements
 from jaxtune.discovery.result import AcceptedTerm, Settings
 from jaxtune.discovery.screen import Lead
 from jaxtune.discovery.shares import explained, speak
@@ -410,6 +410,20 @@ def test_a_nominal_parameter_that_moved_is_no_form_of_an_effect():
     assert moved_forms(asked, begun.null.fit, errors, HYPOTHESES[2]) == []
     unknown = replace(asked, prior=asked.prior * np.array([axis != "damping" for axis in AXES]))
     assert moved_forms(unknown, begun.null.fit, errors, HYPOTHESES[2]) == [free]
+
+
+def test_an_effect_is_claimed_of_the_joints_that_show_it():
+    coulomb, push = (replace(HYPOTHESES[number], places=("a",)) for number in (2, 3))
+    everywhere, elsewhere = replace(coulomb, places=("a", "b")), replace(coulomb, places=("b",))
+    best, at_a, at_b, other = (Candidate((one,), None, None) for one in (everywhere, coulomb, elsewhere, push))
+    models = [best, at_b, at_a, other]
+    assert at_fewest_places(best, models, np.array([0.6, 0.2, 0.1, 0.1]), 0.05) is at_b
+    # Not where the logs speak against the one joint alone.
+    assert at_fewest_places(best, models, np.array([0.8, 0.01, 0.01, 0.18]), 0.05) is best
+    assert at_fewest_places(at_a, models, np.full(4, 0.25), 0.05) is at_a
+    both = Candidate((everywhere, push), None, None)
+    one_of_both = Candidate((push, coulomb), None, None)
+    assert at_fewest_places(both, [both, best, at_a, one_of_both], np.full(4, 0.25), 0.05) is one_of_both
 
 
 def with_shape(one):
