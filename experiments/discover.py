@@ -56,7 +56,9 @@ def main(args: Args) -> None:
     _check(args)
     # Says what is wrong with the logs before the folder is made and anything is compiled.
     log, spec = read_logs(args.logs, args.clear_flags, args.swap_halves, args.robot)
-    for note in gate.check(log, spec, args.horizons, trust=args.trust_log):
+    with console.status(f"looking for errors in {len(log.runs)} runs"):
+        notes = gate.check(log, spec, args.horizons, trust=args.trust_log)
+    for note in notes:
         console.print(f"note: {note}", highlight=False, markup=False, soft_wrap=True)
     identity = {name: value for name, value in vars(args).items() if name not in ("out", "trust_log")}
     # What was read may change behind the same names, as when a sign or a gain is corrected.

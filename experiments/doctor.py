@@ -37,7 +37,8 @@ def main(args: Args) -> None:
     """
     log = read_any(args.log, args.robot)
     out = args.out or Path("runs/doctor") / args.log.resolve().name
-    found = diagnose_log(log)
+    with console.status(f"looking for errors in {len(log.runs)} runs"):
+        found = diagnose_log(log)
     said = shared_findings(found)
     out.mkdir(parents=True, exist_ok=True)
     checkpoint.write_json(

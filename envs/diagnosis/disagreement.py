@@ -46,7 +46,10 @@ class Disagreement:
         self._dof = np.array([place.dofadr[0] for place in places])
         limited = np.array([bool(model.jnt_limited[place.id]) for place in places])
         span = np.array([place.range for place in places])
-        self._smoothed: dict[tuple[bytes, bytes], np.ndarray] = {}
+        # Repairs leave most of a run as it is, so what was computed of positions is kept.
+        self._smoothed: dict[int, np.ndarray] = {}
+        self._free: dict[int, np.ndarray] = {}
+        self._needed: dict[int, tuple[np.ndarray, np.ndarray]] = {}
         self._range = np.where(limited[:, None], span, [-np.inf, np.inf]).T
 
     def __call__(self, run: Run) -> float:
@@ -112,11 +115,10 @@ class Disagreement:
     def motion(self, run: Run) -> tuple[np.ndarray, np.ndarray]:
         """Estimates smoothed positions in rad and their slopes in rad/s, [rows, joints] each.
 
-        From positions alone, or the slopes would follow the velocities that they are compared with. Repairs leave most
-        columns as they are, so every column is smoothed once and kept.
+        From positions alone, or the slopes would follow the velocities that they are compared with.
         """
-        columns, time = run.signals["q"].T, run.time.tobytes()
-        keys = [(time, column.tobytes()) for column in columns]
+        columns = np.ascontiguousarray(run.signals["q"].T)
+        keys = [_key(run.time, column) for column in columns]
         new = {key: column for key, column in zip(keys, columns, strict=True) if key not in self._smoothed}
         if new:
             states = smoothed(replace(run, signals={"q": np.stack(list(new.values()), axis=1)}, known={}))
@@ -141,9 +143,12 @@ class Disagreement:
         Returns:
           [rows, joints]; False also a few rows before and after, since `needed` is smoothed.
         """
-        position, (low, high) = self.motion(run)[0], self._range
-        ends = _STOP * np.where(np.isfinite(high - low), high - low, 0.0)
-        return _together((low + ends < position) & (position < high - ends)) > 0.99
+        key = _key(run.time, run.signals["q"])
+        if key not in self._free:
+            position, (low, high) = self.motion(run)[0], self._range
+            ends = _STOP * np.where(np.isfinite(high - low), high - low, 0.0)
+            self._free[key] = _together((low + ends < position) & (position < high - ends)) > 0.99
+        return self._free[key]
 
     def needed(self, run: Run) -> tuple[np.ndarray, np.ndarray]:
         """Computes the torque that the model needs for the measured motion, by MuJoCo's inverse dynamics.
@@ -154,6 +159,9 @@ class Disagreement:
         Returns:
           Torques [some rows, joints] Nm, and the indices of these rows.
         """
+        key = _key(run.time, run.signals["q"])
+        if key in self._needed:
+            return self._needed[key]
         position, slope = self.motion(run)
         acceleration = np.gradient(_together(slope), run.time, axis=0)
         # At the ends the fit behind the smoothed states is one-sided.
@@ -164,7 +172,12 @@ class Disagreement:
             self._data.qacc[self._dof] = acceleration[row]
             mujoco.mj_inverse(self._model, self._data)
             found[index] = self._data.qfrc_inverse[self._dof]
-        return found, rows
+        self._needed[key] = found, rows
+        return self._needed[key]
+
+
+def _key(*arrays: np.ndarray) -> int:
+    return hash(tuple(values.tobytes() for values in arrays))
 
 
 def _together(values: np.ndarray) -> np.ndarray:
