@@ -12,7 +12,8 @@ episode:
     state = machine.init(policy, first, knobs())
     state, info = machine.tune(jax.random.key(0), state, measured)
 
-A distribution that changes compiles nothing anew.
+A distribution that changes compiles nothing anew. Where the robot's states are measured, `pieces_one_by_one` makes the
+tuner's `replay` of a function that goes on from a given state.
 """
 
 from collections.abc import Callable, Mapping
@@ -21,14 +22,16 @@ from functools import cached_property, partial
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jaxtune import loop
-from jaxtune.checks import check_measured, check_set
+from jaxtune.checks import check_measured, check_set, check_states
 from jaxtune.gate import Verify, calibrated_gate
 from jaxtune.loop import Info
 from jaxtune.misfits import Misfits, Phase, misfits, share_of_episode
 from jaxtune.readings import examine
+from jaxtune.replay import Replay
 from jaxtune.settings import TunerConfig
 from jaxtune.tuner import Measure, TrainPolicy, Tuner, TunerState, keep
 from jaxtune.types import Trajectory, Verdict
@@ -57,6 +60,41 @@ def one_by_one(
     return simulate
 
 
+def pieces_one_by_one(
+    go_on: Callable[[dict[str, np.ndarray], np.ndarray, dict[str, float]], Mapping[str, Any]],
+    read: Callable[[Mapping[str, jax.Array]], jax.Array] | None = None,
+) -> Replay:
+    """Makes a `replay` that simulates its pieces one after the other, in any Python.
+
+    About 20 times 8 (1 + coordinates) pieces are simulated for every piece that a measured set is cut into
+    (`jaxtune.replay`), each of `ReplayConfig.window` control steps.
+
+    Args:
+      go_on: `(state by name, actions [steps, act], coords by name) -> state` after these control steps. States have the
+        names and shapes of `Trajectory.state`.
+      read: `state -> features` by which states are compared, traceable by JAX. All of their numbers where None.
+    """
+
+    def flat(state):
+        return jnp.concatenate([jnp.ravel(values) for values in jax.tree.leaves(state)])
+
+    def one(state, actions, coords):
+        ended = go_on(state, actions, {name: float(value) for name, value in coords.items()})
+        return {name: np.asarray(ended[name], np.float32).reshape(np.shape(values)) for name, values in state.items()}
+
+    def every(*pieces):
+        pieces = jax.tree.map(np.asarray, pieces)
+        many = pieces[1].shape[:-2]
+        ended = [one(*jax.tree.map(lambda leaf, at=at: leaf[at], pieces)) for at in np.ndindex(many)]
+        return jax.tree.map(lambda *leaves: np.stack(leaves).reshape(*many, *leaves[0].shape), *ended)
+
+    def play(state, actions, coords):
+        shapes = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), state)
+        return (read or flat)(jax.pure_callback(every, shapes, state, actions, coords, vmap_method="broadcast_all"))
+
+    return Replay(play=play, read=read or flat)
+
+
 @dataclass(frozen=True, kw_only=True)
 class HostTuner:
     """Tunes the distribution of a simulator that JAX cannot trace; `jaxtune.tuner` has the algorithm.
@@ -65,6 +103,7 @@ class HostTuner:
       config: sizes.
       simulate: simulates episodes of robots with given coordinates (`HostSimulate`).
       train_policy, measure, verify, update, phase: as in `Tuner`; the first two may be any Python as well.
+      replay: as in `Tuner`; `pieces_one_by_one` makes one.
     """
 
     config: TunerConfig
@@ -73,6 +112,7 @@ class HostTuner:
     measure: Measure | None = None
     verify: Verify = calibrated_gate
     update: Update = posterior_update
+    replay: Replay | None = None
     phase: Phase = share_of_episode
 
     # The tuner's own functions; `step` calls the `tune` of this class.
@@ -93,20 +133,29 @@ class HostTuner:
           ValueError: episodes, simulated or measured, do not have the shapes that they should.
         """
         check_set(measured, self.config)
-        carry = loop.before(self.config, state.dist, state.past, replayed=False)
-        while carry["left"] > 0:
-            key_collect, key_verify, key_update = jax.random.split(jax.random.fold_in(key, carry["rounds"]), 3)
+        carry = loop.before(self.config, state.dist, state.past, self.replay is not None)
+
+        def collect(carry):
+            key_collect, *keys = jax.random.split(jax.random.fold_in(key, carry["rounds"]), 3)
             collected = self._tuner.collect(key_collect, state.policy, carry["dist"])
             check_measured(measured, collected.trajectory, self.config)
+            if self.replay is not None:
+                check_states(measured, collected.held_out, self.config, self.replay.needs)
+            return *keys, collected, loop.counted(carry, collected)
+
+        while carry["left"] > 0:
+            key_verify, key_update, collected, carry = collect(carry)
             # Once for gate and update.
             collected = collected.replace(reading=self._examine(collected, measured), past=carry["past"])
-            carry = loop.counted(carry, collected)
             if carry["verdict"] == Verdict.WIDEN:
                 gate = self._verify(key_verify, collected, measured, state.knobs)
                 carry = self._decide(carry, gate, state.knobs)
             if carry["verdict"] == Verdict.ACCEPT:
                 updated = self._update(key_update, collected, measured, carry["dist"], state.knobs)
                 carry = self._refine(carry, *updated, state.knobs)
+        if carry["verdict"] == Verdict.ACCEPT and not carry["sharpened"]:
+            _, key_update, collected, carry = collect(carry)
+            carry = self._sharpen(key_update, carry, collected, measured, state.knobs)
         return state.replace(dist=carry["dist"], past=loop.known_after(carry)), loop.make_info(carry, measured)
 
     def misfits(self, key: jax.Array, state: TunerState, measured: Trajectory) -> Misfits:
@@ -139,6 +188,10 @@ class HostTuner:
     @cached_property
     def _refine(self):
         return jax.jit(partial(loop.refine, self.config))
+
+    @cached_property
+    def _sharpen(self):
+        return jax.jit(partial(loop.sharpen, self.config, self.replay))
 
     @cached_property
     def _decide(self):

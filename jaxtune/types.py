@@ -56,7 +56,8 @@ class Trajectory:
         Args:
           episodes: mappings with `observation` [time, obs], `action` [time, act], `reward` [time] and `terminated`, for
             the episode or [time]. `truncated` is not read: an episode that was not terminated did not fall.
-            Observations may have one entry more, the one after the last step, which is left out.
+            Observations may have one entry more, the one after the last step, which is left out. With `state`, arrays
+            [time, ...] by name, the robot's whole state at the beginning of each step.
           steps: length of the set; longer episodes are cut, shorter ones masked. That of the longest where None.
 
         Returns:
@@ -64,7 +65,8 @@ class Trajectory:
           masked, and counts as one that fell and broke.
 
         Raises:
-          ValueError: there is no episode, one lacks a key or a step, or its lists or widths do not agree.
+          ValueError: there is no episode, one lacks a key or a step, or its lists or widths do not agree; or states
+            are of some episodes alone.
         """
         if isinstance(episodes, Mapping) or not isinstance(episodes, Sequence):
             raise ValueError(f"episodes: got {type(episodes).__name__}, expected a list of episodes")
@@ -87,6 +89,7 @@ class Trajectory:
             return whole
 
         obs, action, score = padded(obs), padded(action), padded(reward)
+        states = _read_states(episodes, [len(value) for value in reward])
         lived = np.array([min(len(value), steps) for value in reward])
         inside = np.arange(steps) < lived[:, None]
         finite = np.isfinite(obs).all(-1) & np.isfinite(action).all(-1) & np.isfinite(score)
@@ -100,7 +103,25 @@ class Trajectory:
             score=np.where(alive, score, 0.0),
             fell=ended | broke,
             not_finite=broke,
+            state={name: padded(values) for name, values in states.items()} or None,
         )
+
+
+def _read_states(episodes: Sequence[Mapping[str, Any]], steps: Sequence[int]) -> dict[str, list[np.ndarray]]:
+    """Reads the states of all episodes, [time, ...] each, by name; none where no episode has any."""
+    states = [dict(episode.get("state") or {}) for episode in episodes]
+    found: dict[str, list[np.ndarray]] = {name: [] for name in states[0]}
+    for number, (state, count) in enumerate(zip(states, steps, strict=True)):
+        if set(state) != set(found):
+            got, expected = (", ".join(sorted(names)) or "none" for names in (state, found))
+            raise ValueError(f"episode {number}, state: got {got}, expected {expected}, as in episode 0")
+        for name, values in state.items():
+            values = np.asarray(values, np.float32)
+            expected = found[name][0].shape[1:] if number else values.shape[1:]
+            if values.ndim < 1 or len(values) not in (count, count + 1) or values.shape[1:] != expected:
+                raise ValueError(f"episode {number}, state, {name}: got shape {values.shape}, expected {count} steps")
+            found[name].append(values[:count])
+    return found
 
 
 def _read_episode(number: int, episode: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray, np.ndarray, bool]:

@@ -24,15 +24,15 @@ SMALL = TunerConfig(
 )
 
 
-def run(guide, monkeypatch, small=SMALL):
-    """Runs the last program of a guide, and returns its variables."""
+def run(guide, monkeypatch, small=SMALL, programs=slice(-1, None)):
+    """Runs the last program of a guide, or those that go on from each other, and returns their variables."""
     monkeypatch.setattr(tuner, "TunerConfig", lambda **sizes: replace(small, **sizes))
     # Options of the compiler are for the program as a whole, not for what is jitted in it.
     jit, whole = jax.jit, ("tune", "run")
     monkeypatch.setattr(
         jax, "jit", lambda f, **options: (toys.long_jit if getattr(f, "__name__", "") in whole else jit)(f, **options)
     )
-    *_, code = re.findall(r"```python\n(.*?)```", (GUIDES / guide).read_text(), re.DOTALL)
+    code = "\n".join(re.findall(r"```python\n(.*?)```", (GUIDES / guide).read_text(), re.DOTALL)[programs])
     scope = {}
     exec(compile(code, guide, "exec"), scope)
     info = scope["info"]
@@ -43,10 +43,20 @@ def run(guide, monkeypatch, small=SMALL):
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def test_a_gymnasium_environment_is_tuned(monkeypatch):
     pytest.importorskip("gymnasium", reason="needs the extra test")
-    scope = run("gymnasium.md", monkeypatch)
+    scope = run("gymnasium.md", monkeypatch, programs=slice(1))
     found = scope["from_coords"](scope["TABLE"], scope["state"].dist.centre)
     for name, truth in scope["robot"].items():
         assert abs(found[name] - truth) < abs(1.0 - truth) / 2
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_a_gymnasium_environment_is_tuned_from_its_states(monkeypatch):
+    pytest.importorskip("gymnasium", reason="needs the extra test")
+    scope = run("gymnasium.md", monkeypatch, programs=slice(None))
+    found = scope["from_coords"](scope["TABLE"], scope["state"].dist.centre)
+    for name, truth in scope["robot"].items():
+        assert abs(found[name] - truth) < 2e-3
 
 
 @pytest.mark.slow

@@ -8,7 +8,8 @@ import toys
 
 from jaxtune import pooling
 from jaxtune.gate import calibrated_gate
-from jaxtune.host import HostTuner, one_by_one
+from jaxtune.host import HostTuner, one_by_one, pieces_one_by_one
+from jaxtune.replay import ReplayConfig
 from jaxtune.tuner import Tuner, TunerState, explain, keep, knobs
 from jaxtune.types import Trajectory, Verdict
 from jaxtune.update import posterior_update
@@ -56,6 +57,37 @@ def test_the_loop_in_python_gives_what_the_traced_one_gives(tuners, mass):
     for got, expected in zip(jax.tree.leaves((host_moved, host_info)), jax.tree.leaves((moved, info)), strict=True):
         np.testing.assert_allclose(got, expected, rtol=2e-3, atol=2e-3)
     assert explain(host_info).splitlines()[0] == explain(info).splitlines()[0]
+
+
+def test_states_are_simulated_again_in_python():
+    sizes = dataclasses.replace(SIZES, replay=ReplayConfig(sets=19))
+    slider = toys.Slider(noise=0.0)
+    traced = Tuner(config=sizes, train_policy=keep, simulate=slider.simulate, replay=slider.replay())
+    asked = []
+
+    def move(state, force, coords):
+        position, velocity = state["slider"]
+        push = force - np.exp(coords["friction"]) * velocity - slider.stiffness * position
+        velocity = velocity + slider.dt * push / np.exp(coords["mass"])
+        return {"slider": np.array([position + slider.dt * velocity, velocity])}
+
+    def go_on(state, actions, coords):
+        asked.append(coords)
+        for action in actions:
+            state = move(state, action[0], coords)
+        return state
+
+    host = HostTuner(config=sizes, simulate=slider.simulate, replay=pieces_one_by_one(go_on))
+    measured = slider.measure({"friction": 0.06, "mass": -0.04}, 2)(jax.random.key(0), toys.policy())
+    moved, info = jax.jit(traced.tune)(jax.random.key(1), state(), measured)
+    host_moved, host_info = host.tune(jax.random.key(1), state(), measured)
+    assert info.update.replayed and host_info.update.replayed
+    assert all(isinstance(value, float) for coords in asked for value in coords.values())
+    for name, truth in (("friction", 0.06), ("mass", -0.04)):
+        assert moved.dist.centre[name] == pytest.approx(truth, abs=1e-3)
+        assert host_moved.dist.centre[name] == pytest.approx(truth, abs=1e-3)
+    with pytest.raises(ValueError, match="measured, state: got none, expected arrays by name"):
+        host.tune(jax.random.key(1), state(), measured.replace(state=None))
 
 
 def test_a_policy_is_whatever_simulate_takes(tuners):
@@ -191,6 +223,18 @@ def test_episodes_of_any_length_become_one_set():
     assert not episodes.not_finite.any()
 
 
+def test_states_are_cut_and_padded_as_observations_are():
+    rows = np.arange(6.0)
+    states = [{"qpos": rows[:count, None] + [0.0, 10.0], "time": rows[:count]} for count in (6, 4)]
+    # One state more is that after the last step.
+    sets = [episode(6, state=states[0]), episode(3, state=states[1])]
+    state = Trajectory.from_episodes(sets, steps=5).state
+    assert state["qpos"].shape == (2, 5, 2)
+    np.testing.assert_array_equal(state["qpos"][1, :, 1], [10.0, 11.0, 12.0, 0.0, 0.0])
+    np.testing.assert_array_equal(state["time"], [[0.0, 1.0, 2.0, 3.0, 4.0], [0.0, 1.0, 2.0, 0.0, 0.0]])
+    assert Trajectory.from_episodes([episode(3)]).state is None
+
+
 def test_the_longest_episode_sets_the_length_and_a_last_observation_is_left_out():
     longer = episode(4, observation=[[0.0, 0.0]] * 5)
     assert Trajectory.from_episodes([episode(3), longer]).obs.shape == (2, 4, 2)
@@ -231,6 +275,12 @@ def test_an_episode_is_masked_from_its_first_number_that_is_not_finite():
         ([episode(3, terminated=None)], "episode 0, terminated: got object"),
         ([episode(3, terminated=[])], r"terminated: got float64 of shape \(0,\)"),
         ([episode(3, terminated=[False, True, False])], "True in none but the last"),
+        ([episode(3, state={"qpos": [0.0] * 3}), episode(3)], "episode 1, state: got none, expected qpos"),
+        ([episode(3, state={"qpos": [0.0] * 2})], r"episode 0, state, qpos: got shape \(2,\), expected 3 steps"),
+        (
+            [episode(2, state={"qpos": [[0.0]] * 2}), episode(2, state={"qpos": [[0.0, 1.0]] * 2})],
+            r"episode 1, state, qpos: got shape \(2, 2\)",
+        ),
     ],
 )
 def test_episodes_that_do_not_fit_together_are_refused(episodes, message):
