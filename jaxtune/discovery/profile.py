@@ -144,14 +144,16 @@ def profile_of(fit: Fit, library: np.ndarray, shares: np.ndarray) -> Profile:
       shares: [segments, components] how far each segment counts, about one for a usual one.
     """
     parts, count = fit.counts.components, len(fit.coordinates)
-    by_part = lambda values: values.reshape(len(values), -1, parts)  # noqa: E731
-    columns = [by_part(fit.residual[None]), by_part(fit.jacobian.T), by_part(library)]
     root = np.repeat(np.sqrt(shares), fit.counts.bins, axis=0)
-    sums = []
-    for part in range(parts):
-        one = np.concatenate([values[..., part] for values in columns]) * root[:, part]
-        sums.append(one @ one.T)
-    total, slopes, changes = np.stack(sums), slice(1, 1 + count), slice(1 + count, None)
+    columns = [fit.residual, *fit.jacobian.T, *library]
+    # The rows of a part one behind the other, column by column, since all at once would not fit into a cache.
+    of_part = np.empty((parts, len(columns), len(root)))
+    for number, column in enumerate(columns):
+        of_part[:, number] = (root * column.reshape(root.shape)).T
+    total = np.empty((parts, len(columns), len(columns)))
+    slopes, changes = slice(1, 1 + count), slice(1 + count, None)
+    for rows, products in zip(of_part, total, strict=True):
+        np.matmul(rows, rows.T, out=products)
     return Profile(
         counts=fit.counts,
         residual=fit.residual,
