@@ -39,6 +39,7 @@ FAILED = {
     "inside_bounds": "its fit went to the end of its range",
     "clear_of_zero": "its size may be zero",
     "horizons": "it helps at too few lengths of segments",
+    "of_interest": "it is far smaller than any size of interest",
 }
 """Why an effect was taken out of the model again, by the test of `jaxtune.discovery.evidence.passes` that it failed."""
 

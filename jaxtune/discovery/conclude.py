@@ -189,7 +189,7 @@ def _proved(
     best = replace(state.best, fit=fit)
     of_effect = Thresholds(state.price)
     # Much of what forms are about ends at its bounds: friction can be all at the motor, a limit as soft as it gets.
-    of_form = Thresholds(0.5 * state.price, floors=0.0, of_left=0.0, inside=False, horizons=1)
+    of_form = Thresholds(0.5 * state.price, floors=0.0, of_left=0.0, inside=False, horizons=1, size=0.0)
     fitted = {one.key: one for one in state.candidates}
     while True:
         weighed = {h.key: (h, *weigh_evidence(problem, floor, best, h, fitted)) for h in best.hypotheses}

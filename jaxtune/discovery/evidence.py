@@ -47,6 +47,8 @@ class Evidence:
     """True if all coordinates are inside their bounds."""
     horizons: int
     """Number of horizons at which `train` and `select` cost less with it, prior included."""
+    size: float
+    """Its largest parameter, divided by the smallest size of interest."""
 
 
 @dataclass(frozen=True)
@@ -66,6 +68,7 @@ class Thresholds:
     inside: bool = True
     """Whether the fit may not stand at a bound."""
     horizons: int = 2
+    size: float = 0.1
 
 
 def weigh_evidence(
@@ -115,6 +118,7 @@ def weigh_evidence(
         ),
         inside=bool(((low < values) & (values < high)).all()),
         horizons=_horizons_better(floor, candidate.fit, ablated.fit),
+        size=_in_smallest(values, hypothesis.probes),
     )
     return evidence, ablated
 
@@ -135,6 +139,8 @@ def passes(evidence: Evidence, thresholds: Thresholds) -> dict[str, bool]:
         "clear_of_zero": low > 0 or high < 0,
         # Long segments let a wrong effect compensate, short ones are blind to slow bias: two must agree.
         "horizons": evidence.horizons >= thresholds.horizons,
+        # Where logs are very exact, much less than anybody looks for makes up for the form of another effect.
+        "of_interest": evidence.size >= thresholds.size,
     }
 
 
@@ -167,6 +173,12 @@ def or_known(candidate: Candidate, fitted: Mapping[str, Candidate]) -> Candidate
     """
     known = fitted.get(candidate.key)
     return known if known and known.fit.cost <= candidate.fit.cost else candidate
+
+
+def _in_smallest(values: np.ndarray, probes: np.ndarray) -> float:
+    """The largest of parameters [parameters], each divided by its smallest probe; one without a probe is no size."""
+    smallest = np.where(probes != 0, np.abs(probes), np.inf).min(axis=0)
+    return float((np.abs(values) / smallest).max())
 
 
 def _largest_fall(before: np.ndarray, now: np.ndarray, least: np.ndarray | None = None) -> tuple[float, float]:

@@ -23,7 +23,7 @@ from jaxtune.discovery.result import AcceptedTerm, DroppedTerm, Result, Suspect
 JOINTS = ("shoulder", "elbow")
 GAINS = {"kp": np.array([40.0, 20.0]), "kd": np.array([2.0, 0.8]), "torque_limit_nm": np.array([15.0, 15.0])}
 EVIDENCE = Evidence(
-    gain=90.0, confirmed=40.0, floors=3.0, left=1.1, relief=0.0, interval=(0.4, 0.6), inside=True, horizons=3
+    gain=90.0, confirmed=40.0, floors=3.0, left=1.1, relief=0.0, interval=(0.4, 0.6), inside=True, horizons=3, size=1.0
 )
 
 

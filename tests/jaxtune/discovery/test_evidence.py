@@ -9,13 +9,13 @@ from slider import HYPOTHESES, problem
 from jaxtune.discovery import noise_floor, state, step
 from jaxtune.discovery.belief import believed, posterior, rivals
 from jaxtune.discovery.candidate import Candidate
-from jaxtune.discovery.evidence import Evidence, Thresholds, ablate, or_known, passes, weigh_evidence
+from jaxtune.discovery.evidence import Evidence, Thresholds, _in_smallest, ablate, or_known, passes, weigh_evidence
 from jaxtune.discovery.fit import begin, polish, without
 from jaxtune.discovery.resample import correlation_length, times_drawn, units
 from jaxtune.discovery.result import Settings
 
 GOOD = Evidence(
-    gain=50.0, confirmed=20.0, floors=2.0, left=1.1, relief=0.0, interval=(0.1, 0.2), inside=True, horizons=3
+    gain=50.0, confirmed=20.0, floors=2.0, left=1.1, relief=0.0, interval=(0.1, 0.2), inside=True, horizons=3, size=1.0
 )
 
 
@@ -38,6 +38,7 @@ def stepped():
         ("clear_of_zero", {"interval": (-0.1, 0.2)}),
         ("inside_bounds", {"inside": False}),
         ("horizons", {"horizons": 1}),
+        ("of_interest", {"size": 0.09}),
     ],
 )
 def test_every_test_can_fail_alone(test, change):
@@ -45,6 +46,17 @@ def test_every_test_can_fail_alone(test, change):
     assert all(passes(GOOD, thresholds).values())
     failed = [name for name, passed in passes(replace(GOOD, **change), thresholds).items() if not passed]
     assert failed == [test]
+
+
+def test_a_size_is_seen_in_the_smallest_of_interest(stepped):
+    asked, floor, found = stepped
+    (coulomb,) = found.best.effects
+    evidence, _ = weigh_evidence(asked, floor, found.best, coulomb, {})
+    (value,) = found.best.fit.coordinates[found.best.fit.along(coulomb)]
+    assert evidence.size == pytest.approx(abs(value) / np.abs(coulomb.probes).min())
+    assert evidence.size > 1.0
+    # Of several the largest; one that only shapes the effect counts for nothing.
+    assert _in_smallest(np.array([0.3, -1.0, 9.0]), np.array([[0.1, 0, 0], [-0.3, 0, 0], [0, 0.5, 0]])) == pytest.approx(3.0)
 
 
 def test_a_fit_that_was_not_finished_is_no_evidence(stepped):

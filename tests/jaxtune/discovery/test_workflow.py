@@ -110,7 +110,15 @@ def test_a_weak_effect_beside_a_strong_one_at_the_same_joint_stays_in_the_model_
 def test_an_effect_refines_a_stronger_one_only_where_it_acts_at_no_other_joint(joints, gain, refines):
     coulomb, push = (next(one for one in HYPOTHESES if one.name == name) for name in ("coulomb", "push"))
     evidence = Evidence(
-        gain=100.0, confirmed=9.0, floors=2.0, left=1.0, relief=0.0, interval=(1.0, 2.0), inside=True, horizons=3
+        gain=100.0,
+        confirmed=9.0,
+        floors=2.0,
+        left=1.0,
+        relief=0.0,
+        interval=(1.0, 2.0),
+        inside=True,
+        horizons=3,
+        size=1.0,
     )
     strong = AcceptedTerm(replace(coulomb, joints=(1, 2)), evidence, None)
     weak = AcceptedTerm(replace(push, joints=joints), replace(evidence, gain=gain), None)
