@@ -1,7 +1,7 @@
 """Writes joint targets that make missing effects visible in a log: `python -m experiments.excite --robot MJCF --out D`.
 
 The result is a log without measurements. Play its targets on the robot, suspended or clamped, and add the measured
-columns; `experiments.discover` then reads the log. The motion is described in `experiments.discovery.excitation`.
+columns; `experiments.discover` then reads the log. The motion is described in `experiments.discovery.target_runs`.
 """
 
 import math
@@ -15,8 +15,9 @@ from envs import models
 from envs.held import held_joints, independent_joints, unread_joints
 from envs.logs import Controller, Convention, Log, read_any, write
 from experiments.common.cli import console, run
-from experiments.discovery.excitation import MOTIONS, controller_of, excitation, passive
+from experiments.discovery.excitation import controller_of, excitation, passive
 from experiments.discovery.rehearsal import rehearsal, run_of
+from experiments.discovery.target_runs import MOTIONS
 
 _MOST = {"seconds": 3600.0, "rate_hz": 1e5, "kp": 1e6, "torque_limit_nm": 1e5, "control_hz": 1e5}
 """Largest values of options: what a robot can be, and what fits into memory."""

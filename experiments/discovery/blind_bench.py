@@ -20,8 +20,9 @@ from experiments.discovery.benchmark import Benchmark
 from experiments.discovery.blind_cases import SIZE_BOUNDS, SIZES, Case
 from experiments.discovery.blind_robots import Truth, record
 from experiments.discovery.cutting import HORIZONS_S
-from experiments.discovery.excitation import TargetRun, excitation
+from experiments.discovery.excitation import excitation
 from experiments.discovery.question import Question, build_question
+from experiments.discovery.target_runs import TargetRun
 from jaxtune.discovery.least_squares import Linear
 from jaxtune.discovery.noise_floor import Floor, measure
 from jaxtune.discovery.simulation import residuals

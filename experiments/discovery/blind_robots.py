@@ -15,7 +15,7 @@ import numpy as np
 
 from envs.logs import Controller, Log, Run
 from envs.models import suspended
-from experiments.discovery.excitation import TargetRun, scaled
+from experiments.discovery.target_runs import TargetRun, scaled
 
 _STEP_S = 0.0004
 _BRISTLE = 2000.0  # 1/rad: one over the displacement at which bristles slip
@@ -53,7 +53,7 @@ def record(
     Args:
       spec: the nominal model.
       joints: names, in the log's order.
-      motions: target runs, of `experiments.discovery.excitation`.
+      motions: `target_runs.TargetRun`s.
       controller: of the joints; each run uses its share of the gains.
       truth: what is hidden.
       nominal_error: relative error of masses, armatures, dampings and frictions; gains are wrong by a third of it.

@@ -1,16 +1,12 @@
-"""Designs motions that make missing effects distinguishable, for a robot that is suspended or clamped.
+"""Draws motions that make missing effects distinguishable, for a robot that is suspended or clamped.
 
-Every run of the `medley` moves about one posture with one controller gain. It consists of slow triangular reversals
-(friction, backlash), a chirp to 10 Hz (delay, lag, inertia), steps that may saturate the motors (torque limits), and a
-swing with the motors off (mass and friction without the actuators). Posture and gain differ from run to run, so that a
-log can be split by condition, with every kind of motion in every part.
-
-The other motions have one of these each. `deciding` chooses the one in which two suspects differ most.
+Posture and gain differ from run to run, so that a log can be split by condition, with every kind of motion
+(`target_runs`) in every part. `deciding` chooses the motion in which two suspects differ most.
 """
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import mujoco
 import numpy as np
@@ -18,8 +14,8 @@ import numpy as np
 from envs.diagnosis.contacts import touching
 from envs.logs import Controller, Log
 from envs.models import suspended
+from experiments.discovery.target_runs import MOTIONS, TargetRun, slowed, targets
 
-_CHIRP_HZ = (0.5, 10.0)
 _LEAST_ROWS = 10  # of a piece
 _LOOK_S = 0.02  # between targets that are tested for contacts
 _TRIES, _SMALLER = 40, 0.95  # motions that are drawn until none touches, and by how much each is smaller
@@ -27,60 +23,6 @@ _TRIES, _SMALLER = 40, 0.95  # motions that are drawn until none touches, and by
 
 class Unplayable(ValueError):
     """Bodies of a robot touch in every motion that was drawn, or it flies apart."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Motion:
-    """What the runs of a log do, whatever the robot; a row of `MOTIONS`."""
-
-    shares: Mapping[str, float]
-    """Parts of a run's time in their order, by the name of a piece (`_PIECES`)."""
-    gains: tuple[float, float] = (1.0, 0.5)
-    """Factors on kp and kd, which alternate within every split."""
-    size: float = 1.0
-    """Factor on the amplitudes of the pieces."""
-    shows: str
-    """What the motion makes visible, for a person."""
-
-
-MOTIONS = {
-    "medley": Motion(
-        shares={"triangle": 0.35, "chirp": 0.3, "steps": 0.2, "swing": 0.15},
-        shows="a little of everything, for a first log",
-    ),
-    "powered_medley": Motion(
-        shares={"triangle": 0.4, "chirp": 0.35, "steps": 0.25},
-        shows="the same without the swing, for a robot whose brakes close when its motors are off",
-    ),
-    "slow_triangles": Motion(shares={"triangle": 1.0}, shows="friction and backlash, at slow reversals"),
-    "small_steps": Motion(shares={"steps": 1.0}, size=0.25, shows="deadband, backlash and delay, below all limits"),
-    "large_steps": Motion(shares={"steps": 1.0}, shows="limits of torque and speed"),
-    "chirp": Motion(shares={"chirp": 1.0}, gains=(1.0, 1.0), shows="delay, lag and inertia, up to 10 Hz"),
-    "soft_chirp": Motion(shares={"chirp": 1.0}, gains=(0.5, 0.5), shows="inertia and compliance, at half the gains"),
-    "swing": Motion(shares={"steps": 0.3, "swing": 0.7}, shows="mass and friction without the motors"),
-    "holds": Motion(shares={"holds": 1.0}, shows="gravity, bias and scale of torque, in two postures a run"),
-}
-"""Motions by name: what `excite --motion` writes, and what `deciding` chooses among (all but the medleys)."""
-
-
-@dataclass(frozen=True)
-class TargetRun:
-    """The joint targets of one run, before anything is measured; a robot or a simulation plays it."""
-
-    name: str
-    """Name of the run, which is that of its file."""
-    condition: str
-    """Posture and gain of the run; runs of one condition belong to one split."""
-    gain: float
-    """Factor on kp and kd of the joint controllers in this run."""
-    split: str
-    """train, select (validation) or sealed (held-out test)."""
-    time: np.ndarray
-    """[rows] s"""
-    target: np.ndarray
-    """[rows, joints] rad"""
-    enabled: np.ndarray
-    """[rows] 0 where the motors are off."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,7 +59,6 @@ def deciding(
       rate_hz: rows per second.
       seed: of postures, paces and steps; `excite` writes the same targets with the same numbers.
       still: [joints] as in `excitation`.
-
       follow: as in `excitation`. Only motions that may be chosen are rehearsed, best first.
 
     Returns:
@@ -205,8 +146,8 @@ def excitation(
         for tried in range(_TRIES):
             posture = home + 0.25 * (high - low) * rng.uniform(-1, 1, len(joints))
             room = np.minimum(np.minimum(high - posture, posture - low), 0.6 * _SMALLER**tried)
-            target, enabled = _targets(chosen, posture, room, seconds, rate_hz, rng)
-            target = _slowed(np.where(still, target[0], target), max_speed / rate_hz)
+            target, enabled = targets(chosen, posture, room, seconds, rate_hz, rng)
+            target = slowed(np.where(still, target[0], target), max_speed / rate_hz)
             times = np.arange(len(target)) / rate_hz
             name, condition = f"run_{number:03d}", f"posture{number}_gain{gain:g}"
             drawn = TargetRun(name, condition, gain, split, times, target, enabled)
@@ -222,16 +163,6 @@ def excitation(
             )
         motions.append(drawn)
     return motions
-
-
-def _slowed(target: np.ndarray, most: float) -> np.ndarray:
-    """Cuts the steps between rows of targets [rows, joints] to a largest size."""
-    if not np.isfinite(most):
-        return target
-    slow = target.copy()
-    for row in range(1, len(slow)):
-        slow[row] = slow[row - 1] + np.clip(target[row] - slow[row - 1], -most, most)
-    return slow
 
 
 class _Blocked:
@@ -286,57 +217,3 @@ def _ranges(model: mujoco.MjModel, joints: Sequence[str]) -> tuple[np.ndarray, n
     low, high = np.where(limited[:, None], span, [-np.pi / 2, np.pi / 2]).T
     middle = np.where(limited, 0.5 * (low + high), np.array([joint.qpos0[0] for joint in found]))
     return low, high, middle
-
-
-def _targets(motion: Motion, posture, room, seconds, rate_hz, rng) -> tuple[np.ndarray, np.ndarray]:
-    """Puts the pieces of a run together; returns targets [rows, joints] and whether the motors are on [rows]."""
-    rows = {name: round(share * seconds * rate_hz) for name, share in motion.shares.items()}
-    offsets = [_PIECES[name](count, len(posture), rate_hz, rng) for name, count in rows.items()]
-    on = [np.full(count, float(name != "swing")) for name, count in rows.items()]
-    return posture + motion.size * room * np.concatenate(offsets), np.concatenate(on)
-
-
-def _triangle(rows: int, joints: int, rate_hz: float, rng: np.random.Generator) -> np.ndarray:
-    # Joints move at different paces, so that coupling between them shows.
-    pace = rng.uniform(0.8, 1.6, joints) / (rows / rate_hz) * 1.5
-    phase = (np.arange(rows)[:, None] / rate_hz * pace + rng.uniform(0, 1, joints)) % 1.0
-    return 0.7 * (4 * np.abs(phase - 0.5) - 1)
-
-
-def _chirp(rows: int, joints: int, rate_hz: float, rng: np.random.Generator) -> np.ndarray:
-    share, length = np.arange(rows) / rows, rows / rate_hz
-    ratio = _CHIRP_HZ[1] / _CHIRP_HZ[0]
-    cycles = _CHIRP_HZ[0] * length / np.log(ratio) * (ratio**share - 1)
-    fade = 0.4 / (1 + 3 * share)
-    return fade[:, None] * np.sin(2 * np.pi * (cycles[:, None] + rng.uniform(0, 1, joints)))
-
-
-def _steps(rows: int, joints: int, rate_hz: float, rng: np.random.Generator) -> np.ndarray:
-    every = max(1, round(0.15 * rate_hz))
-    levels = rng.uniform(-1, 1, (-(-rows // every), joints))
-    return 0.8 * np.repeat(levels, every, axis=0)[:rows]
-
-
-def _holds(rows: int, joints: int, rate_hz: float, rng: np.random.Generator) -> np.ndarray:
-    # The way between both postures takes a third of the time, so that little is excited but gravity.
-    side = np.where(rng.uniform(size=joints) < 0.5, -1.0, 1.0)
-    return 0.8 * side * np.clip(3.0 * (2.0 * np.arange(rows)[:, None] / rows - 1.0), -1.0, 1.0)
-
-
-def _rest(rows: int, joints: int, rate_hz: float, rng: np.random.Generator) -> np.ndarray:
-    return np.zeros((rows, joints))
-
-
-# Of rows, joints, rows per second and random numbers: targets as shares of the room, [rows, joints].
-_PIECES = {"triangle": _triangle, "chirp": _chirp, "steps": _steps, "holds": _holds, "swing": _rest}
-
-
-def scaled(controller: Controller, gain: float) -> Controller:
-    """Returns a controller whose gains of position and velocity errors are multiplied by a factor; limits stay.
-
-    Two gains make effects of the controller (delay, gain error) distinguishable from those of the body.
-    """
-    gains = {
-        name: values * (gain if name in ("kp", "kd", "gain") else 1.0) for name, values in controller.gains.items()
-    }
-    return replace(controller, gains=gains)

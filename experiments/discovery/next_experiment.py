@@ -9,9 +9,10 @@ import numpy as np
 from envs import segments
 from envs.logs import Log, Run
 from envs.models import BUILT_IN
-from experiments.discovery.excitation import TargetRun, controller_of, deciding, passive, scaled, unlimited_slides
+from experiments.discovery.excitation import controller_of, deciding, passive, unlimited_slides
 from experiments.discovery.question import Question
 from experiments.discovery.rehearsal import rehearsal
+from experiments.discovery.target_runs import TargetRun, scaled
 from experiments.discovery.whole_runs import simulate_runs
 from jaxtune.discovery.result import Result
 

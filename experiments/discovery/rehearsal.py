@@ -8,7 +8,8 @@ import numpy as np
 
 from envs.logs import Controller, Run
 from envs.null_logs import Robot, play
-from experiments.discovery.excitation import TargetRun, Unplayable, scaled
+from experiments.discovery.excitation import Unplayable
+from experiments.discovery.target_runs import TargetRun, scaled
 
 _ROBOTS = 4  # drawn from the prior, since no model is exact, and a swing least of all
 _MOST_TICKS = 60_000  # of a controller in a run, each of which is a step in Python

@@ -13,7 +13,8 @@ from envs import models
 from envs.logs import Controller, read, write
 from experiments import excite
 from experiments.discovery.blind_cases import ARM
-from experiments.discovery.excitation import MOTIONS, deciding, excitation, scaled
+from experiments.discovery.excitation import deciding, excitation
+from experiments.discovery.target_runs import MOTIONS, scaled
 
 JOINTS = ("shoulder", "elbow")
 LEG = """<mujoco model="leg">

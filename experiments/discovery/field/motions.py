@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from experiments.discovery.excitation import TargetRun
 from experiments.discovery.field.robots import Topology
+from experiments.discovery.target_runs import TargetRun
 
 
 @dataclass(frozen=True)

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from experiments.discovery.excitation import TargetRun
 from experiments.discovery.field.forms import Form, Now, Setting
 from experiments.discovery.field.links import Kinematics
 from experiments.discovery.field.robots import Robot
+from experiments.discovery.target_runs import TargetRun
 
 LEAD_S = 0.4
 """Time before the first row in which the robot settles at the first target."""

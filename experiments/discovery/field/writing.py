@@ -10,7 +10,6 @@ import numpy as np
 
 from envs.logs import Controller, Log, Run, write
 from experiments.common.checkpoint import write_json
-from experiments.discovery.excitation import TargetRun
 from experiments.discovery.field import motions, readings, robots
 from experiments.discovery.field.cases import FieldCase
 from experiments.discovery.field.forms import Form
@@ -20,6 +19,7 @@ from experiments.discovery.field.playing import Hidden, Script, Trace, script, w
 from experiments.discovery.field.readings import stamped_late
 from experiments.discovery.field.severity import Generator, Meter, search
 from experiments.discovery.field.sizes import FAMILY, ON_BODY, bounds
+from experiments.discovery.target_runs import TargetRun
 
 _TRIES = 8  # robots that are drawn until one can show what is wanted
 _SEVERITY_RATIO = 1.3  # between wanted and reached severity, at most

@@ -56,7 +56,9 @@ def test_a_size_is_seen_in_the_smallest_of_interest(stepped):
     assert evidence.size == pytest.approx(abs(value) / np.abs(coulomb.probes).min())
     assert evidence.size > 1.0
     # Of several the largest; one that only shapes the effect counts for nothing.
-    assert _in_smallest(np.array([0.3, -1.0, 9.0]), np.array([[0.1, 0, 0], [-0.3, 0, 0], [0, 0.5, 0]])) == pytest.approx(3.0)
+    assert _in_smallest(
+        np.array([0.3, -1.0, 9.0]), np.array([[0.1, 0, 0], [-0.3, 0, 0], [0, 0.5, 0]])
+    ) == pytest.approx(3.0)
 
 
 def test_a_fit_that_was_not_finished_is_no_evidence(stepped):
