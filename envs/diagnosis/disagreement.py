@@ -13,6 +13,7 @@ from envs.smoothing import smoothed
 
 _MOST = 2.0  # disagreement of two signals that have opposite signs
 _ROWS = 250  # at which inverse dynamics are evaluated, at most
+_MEAN_S = 0.035  # over which accelerations are averaged; stamps that jitter make them noise over less
 _LEAST_FREE = 0.1  # share of rows away from stops; of a joint with fewer the dynamics are unknown
 _STOP = 0.02  # of a joint's range at either end, where a mechanical stop may carry any torque
 
@@ -109,7 +110,7 @@ class Disagreement:
             needed, rows = self.needed(run)
             free = self.free(run)[rows]
             # Averaged like the accelerations behind `needed`, so that both are equally smooth.
-            found["dynamics"] = free * _together(given)[rows], free * needed
+            found["dynamics"] = free * _together(given, run.time)[rows], free * needed
         return found
 
     def motion(self, run: Run) -> tuple[np.ndarray, np.ndarray]:
@@ -147,7 +148,7 @@ class Disagreement:
         if key not in self._free:
             position, (low, high) = self.motion(run)[0], self._range
             ends = _STOP * np.where(np.isfinite(high - low), high - low, 0.0)
-            self._free[key] = _together((low + ends < position) & (position < high - ends)) > 0.99
+            self._free[key] = _together((low + ends < position) & (position < high - ends), run.time) > 0.99
         return self._free[key]
 
     def needed(self, run: Run) -> tuple[np.ndarray, np.ndarray]:
@@ -163,9 +164,11 @@ class Disagreement:
         if key in self._needed:
             return self._needed[key]
         position, slope = self.motion(run)
-        acceleration = np.gradient(_together(slope), run.time, axis=0)
+        acceleration = np.gradient(_together(slope, run.time), run.time, axis=0)
         # At the ends the fit behind the smoothed states is one-sided.
-        rows = np.unique(np.linspace(10, len(run.time) - 11, _ROWS).astype(int))
+        # A mean is none at the ends.
+        margin = 7 + _mean_rows(run.time) // 2
+        rows = np.unique(np.linspace(margin, len(run.time) - 1 - margin, _ROWS).astype(int))
         found = np.empty((len(rows), len(self._dof)))
         for index, row in enumerate(rows):
             self._data.qpos[self._qpos], self._data.qvel[self._dof] = position[row], slope[row]
@@ -180,10 +183,16 @@ def _key(*arrays: np.ndarray) -> int:
     return hash(tuple(values.tobytes() for values in arrays))
 
 
-def _together(values: np.ndarray) -> np.ndarray:
-    """Averages over seven neighbouring rows (a moving mean), [rows, joints]."""
-    kernel = np.ones(7) / 7.0
-    return np.stack([np.convolve(column, kernel, "same") for column in values.T], axis=1)
+def _mean_rows(time: np.ndarray) -> int:
+    """The odd number of rows that are averaged: seven, or as many as 35 ms have, up to a quarter of a short run."""
+    half = round(0.5 * _MEAN_S / float(np.median(np.diff(time))))
+    return 2 * max(3, min(half, len(time) // 8)) + 1
+
+
+def _together(values: np.ndarray, time: np.ndarray) -> np.ndarray:
+    """Averages over neighbouring rows (a moving mean), [rows, joints]."""
+    count = _mean_rows(time)
+    return np.stack([np.convolve(column, np.ones(count) / count, "same") for column in values.T], axis=1)
 
 
 def relative_difference(one: np.ndarray, other: np.ndarray) -> np.ndarray:

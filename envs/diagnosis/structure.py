@@ -1,6 +1,7 @@
 """Finds defects of time stamps and rows, which can be seen without the robot's model."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -13,6 +14,7 @@ _LEAST_RATE_HZ = 100.0
 _LEAST_HOLE = 1.6  # usual steps of the clock
 _SHORT = 3.25  # usual steps: the longest gap over which readings can be interpolated
 _FEW = 0.01  # share of the steps that may be short gaps
+_BRIEF_S, _LEAST_S = 0.02, 0.5  # the longest hole at which a run is cut, and the shortest piece that is kept
 _SOON, _IN_STEP = 3, 0.3  # rows after a late one, and usual steps from their place, by which the clock is in step again
 _APART = 1.4  # ratio of two steps, one of which is a hole and the other none
 _PACE, _AS_FAR = 0.95, 1.4  # quantile of the steps up to which they may be a pace of the clock; least ratio of motion
@@ -41,26 +43,58 @@ def structure(run: Run) -> tuple[list[Finding], Run]:
             f"{np.argmax(twice) + 2}; remove them"
         )
         found.append(Finding("duplicated rows", "t", (), float(twice.sum()), text))
-    holes = np.flatnonzero(steps > max(_LEAST_HOLE * period, _longest_usual(steps)))
-    holes = np.setdiff1d(holes, _pace(run, steps, holes))
-    # A row that was read late, with the time at which it was read, is no defect.
-    short = [row for row in holes if steps[row] <= _SHORT * period]
-    gaps = [row for row in short if not _in_step_again(run.time, row, period)]
-    if len(gaps) > _FEW * len(steps):
-        short = np.setdiff1d(short, gaps)
-    elif gaps:
+    holes, gaps = _holes(run)
+    if len(gaps):
         text = (
             f"short gaps: {len(gaps)} of up to {steps[gaps].max():.4g} s, where {period:.4g} s from row to row are "
             f"usual, the first after row {gaps[0] + 1}"
         )
         found.append(Finding("short gaps", "t", (), float(len(gaps)), text))
-    holes = np.setdiff1d(holes, short)
     for row in holes:
         moved = _moves_on(run, row)
         kind, what = ("missing rows", "rows are missing") if moved else ("clock jump", "the clock jumps")
         text = f"{what} after row {row + 1}: {steps[row]:.4g} s to the next row, where {period:.4g} s are usual"
         found.append(Finding(kind, "t", (), float(steps[row]), text))
     return found, _longest(run, np.union1d(holes, np.flatnonzero(twice)))
+
+
+def pieces(run: Run) -> list[Run]:
+    """Cuts a run at holes of up to 20 ms, in which a recorder missed rows, so that nothing is interpolated over them.
+
+    Longer holes are a reason to look at the recording, so the run is left as it is there.
+
+    Args:
+      run: as it was read.
+
+    Returns:
+      Pieces of half a second and more; the run itself where it has no such hole, or no such piece.
+    """
+    holes, _ = _holes(run)
+    cuts = [row + 1 for row in holes if run.time[row + 1] - run.time[row] <= _BRIEF_S]
+    if not cuts:
+        return [run]
+    found = []
+    for begin, end in pairwise([0, *cuts, len(run.time)]):
+        if run.time[end - 1] - run.time[begin] >= _LEAST_S:
+            rows = slice(begin, end)
+            signals, other = ({name: values[rows] for name, values in of.items()} for of in (run.signals, run.other))
+            name = f"{run.name}_{len(found)}"
+            found.append(replace(run, name=name, time=run.time[rows], signals=signals, other=other))
+    return found or [run]
+
+
+def _holes(run: Run) -> tuple[np.ndarray, np.ndarray]:
+    """Rows after which others are missing, and those with short gaps, over which readings can be interpolated."""
+    steps = np.diff(run.time)
+    period = float(np.median(steps))
+    holes = np.flatnonzero(steps > max(_LEAST_HOLE * period, _longest_usual(steps)))
+    holes = np.setdiff1d(holes, _pace(run, steps, holes))
+    # A row that was read late, with the time at which it was read, is no defect.
+    short = [row for row in holes if steps[row] <= _SHORT * period]
+    gaps = np.array([row for row in short if not _in_step_again(run.time, row, period)], int)
+    if len(gaps) > _FEW * len(steps):
+        return np.setdiff1d(holes, np.setdiff1d(short, gaps)), gaps[:0]
+    return np.setdiff1d(holes, short), gaps
 
 
 def _pace(run: Run, steps: np.ndarray, holes: np.ndarray) -> np.ndarray:

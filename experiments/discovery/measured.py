@@ -11,6 +11,7 @@ import numpy as np
 
 from envs import models, readings, segments
 from envs.clock import evened
+from envs.diagnosis.structure import pieces
 from envs.held import held_joints, unread_joints
 from envs.logs import Log, Run, read_any, splits, with_halves_swapped
 from experiments.discovery.cutting import row_rate, split_in_time
@@ -39,7 +40,7 @@ def read_logs(
       ValueError: a log cannot be read, the logs are not of one robot, its base is free, or its model has flags that
         switch physics off.
     """
-    logs = [_on_lines(read_any(folder, robot)) for folder in folders]
+    logs = [_in_pieces(_on_lines(read_any(folder, robot))) for folder in folders]
     if not logs:
         raise ValueError("logs: got none, expected one or more")
     first = logs[0]
@@ -73,6 +74,16 @@ def _on_lines(log: Log) -> Log:
         return log
     note = f"time stamps of {moved} runs jitter and were put on a line: positions are smoother there"
     return replace(log, runs=runs, notes=(*log.notes, note))
+
+
+def _in_pieces(log: Log) -> Log:
+    """The log with its runs cut where a recorder missed a few rows (`pieces`)."""
+    runs = [pieces(run) for run in log.runs]
+    several = [run.name for run, found in zip(log.runs, runs, strict=True) if found[0] is not run]
+    if not several:
+        return log
+    note = f"a few rows are missing in {', '.join(several)}: cut there, into pieces of half a second and more"
+    return replace(log, runs=tuple(piece for found in runs for piece in found), notes=(*log.notes, note))
 
 
 def _numbered(run: Run, number: int) -> Run:

@@ -67,6 +67,27 @@ def with_signals(log, **changes):
     return replace(log, runs=(replace(log.runs[0], signals=signals),))
 
 
+@pytest.mark.parametrize("missing, begins", [(5, [0, 605]), (20, [0])])
+def test_a_run_is_cut_where_a_few_rows_are_missing(tmp_path, missing, begins):
+    # 10 ms, and 40 ms, in which somebody should look at the recording.
+    time = np.delete(0.002 * np.arange(1500), np.arange(600, 600 + missing))
+    q = np.sin(5.0 * time)[:, None] * [0.5, 0.4]
+    controller = Controller(kind="pd", rate_hz=500.0, gains=PD)
+    signals = {"q": q + 1e-4 * np.random.default_rng(0).normal(size=q.shape), "target": q}
+    one = Run(name="run_000", condition="a", split="train", controller=controller, time=time, signals=signals)
+    runs = (one, replace(one, name="run_001", condition="b", split="select"))
+    runs = (*runs, replace(one, name="run_002", condition="c", split="sealed"))
+    log = Log(robot="arm.xml", base="fixed", rate_hz=500.0, joints=JOINTS, policy=None, runs=runs)
+    log, _ = read_logs(folder(tmp_path, log))
+    mine = [run for run in log.runs if run.condition == "a"]
+    np.testing.assert_allclose([run.time[0] for run in mine], 0.002 * np.array(begins))
+    assert {run.split for run in mine} == {"train"}
+    assert len({run.name for run in log.runs}) == len(log.runs) == 3 * len(begins)
+    assert [note[:40] for note in log.notes] == ["a few rows are missing in run_000, run_0"] * (len(begins) - 1)
+    for run in log.runs:
+        assert all(len(values) == len(run.time) for values in run.signals.values())
+
+
 def test_one_condition_is_split_in_time(tmp_path, played):
     log, _ = read_logs(folder(tmp_path, played))
     assert len(log.notes) == 1
