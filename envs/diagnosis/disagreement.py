@@ -15,6 +15,7 @@ _MOST = 2.0  # disagreement of two signals that have opposite signs
 _ROWS = 250  # at which inverse dynamics are evaluated, at most
 _MEAN_S = 0.035  # over which accelerations are averaged; stamps that jitter make them noise over less
 _LEAST_FREE = 0.1  # share of rows away from stops; of a joint with fewer the dynamics are unknown
+_END = 7  # rows at either end of a run, where slopes are poor
 _STOP = 0.02  # of a joint's range at either end, where a mechanical stop may carry any torque
 
 
@@ -148,7 +149,8 @@ class Disagreement:
         if key not in self._free:
             position, (low, high) = self.motion(run)[0], self._range
             ends = _STOP * np.where(np.isfinite(high - low), high - low, 0.0)
-            self._free[key] = _together((low + ends < position) & (position < high - ends), run.time) > 0.99
+            away = _together((low + ends < position) & (position < high - ends), run.time)
+            self._free[key] = away > 1.0 - 0.5 / _mean_rows(run.time)
         return self._free[key]
 
     def needed(self, run: Run) -> tuple[np.ndarray, np.ndarray]:
@@ -165,9 +167,8 @@ class Disagreement:
             return self._needed[key]
         position, slope = self.motion(run)
         acceleration = np.gradient(_together(slope, run.time), run.time, axis=0)
-        # At the ends the fit behind the smoothed states is one-sided.
-        # A mean is none at the ends.
-        margin = 7 + _mean_rows(run.time) // 2
+        # Near an end the moving mean lacks rows, and the fit behind the smoothed states is one-sided.
+        margin = _END + _mean_rows(run.time) // 2
         rows = np.unique(np.linspace(margin, len(run.time) - 1 - margin, _ROWS).astype(int))
         found = np.empty((len(rows), len(self._dof)))
         for index, row in enumerate(rows):

@@ -58,7 +58,7 @@ def conclude(settings: Settings, problem: Problem, floor: NoiseFloor, state: Sta
     """
     at = floor[problem.main_horizon]
     say("evidence")
-    state = _where_it_shows(settings, problem, at, _with_one_name(problem, at, state))
+    state = _where_it_shows(problem, at, _with_one_name(problem, at, state))
     best, terms, ablated, dropped = _proved(settings, problem, floor, state)
     candidates, probabilities = _compared(problem, at, replace(state, best=best))
     terms = tuple(
@@ -146,11 +146,11 @@ def _with_one_name(problem: Problem, at: Floor, state: State) -> State:
     return replace(state, best=renamed(problem, state.best), candidates=tuple({one.key: one for one in named}.values()))
 
 
-def _where_it_shows(settings: Settings, problem: Problem, at: Floor, state: State) -> State:
+def _where_it_shows(problem: Problem, at: Floor, state: State) -> State:
     """Claims effects only of the joints at which logs show them."""
     if all(len(effect.places) == 1 for effect in state.best.effects):
         return state
-    return replace(state, best=at_fewest_places(state.best, *_compared(problem, at, state), settings.possible))
+    return replace(state, best=at_fewest_places(state.best, *_compared(problem, at, state)))
 
 
 def _compared(problem: Problem, at: Floor, state: State) -> tuple[list[Candidate], np.ndarray]:

@@ -6,12 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from jaxtune.discovery.candidate import Candidate
+from jaxtune.discovery.candidate import Candidate, key_of
 from jaxtune.discovery.fit import Fit, taken_over
 from jaxtune.discovery.problem import Hypothesis, Problem, acts_within
 from jaxtune.discovery.result import AcceptedTerm
 
 _CLEAR = 2.0  # standard errors
+_ODDS = 10.0  # against the model with fewer places, up to which it is taken
 
 
 def renamed(problem: Problem, candidate: Candidate) -> Candidate:
@@ -36,33 +37,45 @@ def renamed(problem: Problem, candidate: Candidate) -> Candidate:
     return replace(candidate, hypotheses=tuple(other_names.get(one.key, one) for one in candidate.hypotheses))
 
 
-def at_fewest_places(
-    best: Candidate, candidates: Sequence[Candidate], probabilities: np.ndarray, possible: float
-) -> Candidate:
-    """Picks the model with the same effects at the fewest places that is still believed.
+def at_fewest_places(best: Candidate, candidates: Sequence[Candidate], probabilities: np.ndarray) -> Candidate:
+    """Picks the model with the same effects at the fewest places, if it is believed nearly as much as the best one.
 
     A limit that one joint reaches is as well explained by one that all joints have, since the others stay below it.
-    What logs do not show at a joint is not claimed of it.
+    What logs do not show at a joint is not claimed of it. Where two such models are believed, logs do not say which
+    joint it is, and the best model stays.
 
     Args:
       best: the cheapest model.
-      candidates: all models.
+      candidates: all models, the cheapest first, the best one among them.
       probabilities: [candidates] of `belief.posterior`.
-      possible: probability from which on a model is believed.
 
     Returns:
-      One of the candidates, or the best model itself.
+      One of the candidates.
     """
-    believed = [one for one, p in zip(candidates, probabilities, strict=True) if p > possible and _within(one, best)]
-    # Candidates come in the order of their cost.
-    return min((best, *believed), key=_places)
+    believed: dict[str, float] = {}
+    cheapest: dict[str, Candidate] = {}
+    for one, probability in zip(candidates, probabilities, strict=True):
+        if _within(one, best):
+            # In whichever form.
+            key = key_of(one.effects)
+            believed[key] = believed.get(key, 0.0) + float(probability)
+            cheapest.setdefault(key, one)
+    most = believed[key_of(best.effects)]
+    fewer = [one for key, one in cheapest.items() if believed[key] >= most / _ODDS]
+    least = min(map(_places, fewer))
+    found = [one for one in fewer if _places(one) == least < _places(best)]
+    return found[0] if len(found) == 1 else best
 
 
 def _within(one: Candidate, other: Candidate) -> bool:
     """Says whether a model has the effects of another one, each at some of its places."""
-    if sorted(h.name for h in one.effects) != sorted(h.name for h in other.effects):
-        return False
-    return all(any(h.name == o.name and set(h.places) <= set(o.places) for o in other.effects) for h in one.effects)
+
+    def holds(many: Hypothesis, few: Hypothesis) -> bool:
+        return many.name == few.name and set(few.places) <= set(many.places)
+
+    # Effects of one name in one model share no place, so each holds one at the most.
+    pairs = [(many, few) for many in other.effects for few in one.effects if holds(many, few)]
+    return len(pairs) == len(one.effects) == len(other.effects) == len({many.key for many, _ in pairs})
 
 
 def _places(candidate: Candidate) -> int:

@@ -21,6 +21,7 @@ import numpy as np
 from jaxtune.discovery.fit import Fit
 from jaxtune.discovery.least_squares import Counts
 
+_TOGETHER = 8  # components whose rows are in memory at once
 _REWEIGHTED = 4  # times; the cost changes by less than chance after
 
 
@@ -146,14 +147,16 @@ def profile_of(fit: Fit, library: np.ndarray, shares: np.ndarray) -> Profile:
     parts, count = fit.counts.components, len(fit.coordinates)
     root = np.repeat(np.sqrt(shares), fit.counts.bins, axis=0)
     columns = [fit.residual, *fit.jacobian.T, *library]
-    # The rows of a part one behind the other, column by column, since all at once would not fit into a cache.
-    of_part = np.empty((parts, len(columns), len(root)))
-    for number, column in enumerate(columns):
-        of_part[:, number] = (root * column.reshape(root.shape)).T
     total = np.empty((parts, len(columns), len(columns)))
     slopes, changes = slice(1, 1 + count), slice(1 + count, None)
-    for rows, products in zip(of_part, total, strict=True):
-        np.matmul(rows, rows.T, out=products)
+    for begin in range(0, parts, _TOGETHER):
+        some = slice(begin, min(begin + _TOGETHER, parts))
+        # The rows of a part one behind the other, column by column, since all at once would not fit into a cache.
+        of_part = np.empty((some.stop - begin, len(columns), len(root)))
+        for number, column in enumerate(columns):
+            of_part[:, number] = (root[:, some] * column.reshape(root.shape)[:, some]).T
+        for rows, products in zip(of_part, total[some], strict=True):
+            np.matmul(rows, rows.T, out=products)
     return Profile(
         counts=fit.counts,
         residual=fit.residual,

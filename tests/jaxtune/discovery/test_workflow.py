@@ -422,16 +422,25 @@ def test_a_nominal_parameter_that_moved_is_no_form_of_an_effect():
 
 def test_an_effect_is_claimed_of_the_joints_that_show_it():
     coulomb, push = (replace(HYPOTHESES[number], places=("a",)) for number in (2, 3))
-    everywhere, elsewhere = replace(coulomb, places=("a", "b")), replace(coulomb, places=("b",))
-    best, at_a, at_b, other = (Candidate((one,), None, None) for one in (everywhere, coulomb, elsewhere, push))
-    models = [best, at_b, at_a, other]
-    assert at_fewest_places(best, models, np.array([0.6, 0.2, 0.1, 0.1]), 0.05) is at_b
-    # Not where the logs speak against the one joint alone.
-    assert at_fewest_places(best, models, np.array([0.8, 0.01, 0.01, 0.18]), 0.05) is best
-    assert at_fewest_places(at_a, models, np.full(4, 0.25), 0.05) is at_a
-    both = Candidate((everywhere, push), None, None)
-    one_of_both = Candidate((push, coulomb), None, None)
-    assert at_fewest_places(both, [both, best, at_a, one_of_both], np.full(4, 0.25), 0.05) is one_of_both
+    shape = replace(DIRECTION, places=("a",))
+    wide, at_b = (replace(coulomb, places=places) for places in (("a", "b"), ("b",)))
+    wide_push, wider = replace(push, places=("a", "b")), replace(coulomb, places=("c", "d"))
+
+    def chosen(*groups_and_beliefs):
+        models = [Candidate(group, None, None) for group, _ in groups_and_beliefs]
+        found = at_fewest_places(models[0], models, np.array([belief for _, belief in groups_and_beliefs]))
+        return found.hypotheses
+
+    assert chosen(((wide,), 0.7), ((coulomb,), 0.2), ((push,), 0.1)) == (coulomb,)
+    # Not where logs speak against it, or show it at the one joint as little as at the other.
+    assert chosen(((wide,), 0.7), ((coulomb,), 0.06), ((push,), 0.24)) == (wide,)
+    assert chosen(((wide,), 0.5), ((coulomb,), 0.3), ((at_b,), 0.2)) == (wide,)
+    # Forms of one model count together, and the cheapest of them is taken.
+    assert chosen(((wide,), 0.7), ((coulomb, shape), 0.04), ((coulomb,), 0.04)) == (coulomb, shape)
+    # Every effect keeps a place.
+    assert chosen(((wide, wide_push), 0.5), ((push, coulomb), 0.5)) == (push, coulomb)
+    assert chosen(((wide, wider), 0.5), ((coulomb, at_b), 0.5)) == (wide, wider)
+    assert chosen(((wide, push), 0.5), ((coulomb,), 0.5)) == (wide, push)
 
 
 def with_shape(one):
