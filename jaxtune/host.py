@@ -16,6 +16,7 @@ A distribution that changes compiles nothing anew. Where the robot's states are 
 tuner's `replay` of a function that goes on from a given state.
 """
 
+import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -66,33 +67,45 @@ def pieces_one_by_one(
 ) -> Replay:
     """Makes a `replay` that simulates its pieces one after the other, in any Python.
 
-    About 20 times 8 (1 + coordinates) pieces are simulated for every piece that a measured set is cut into
-    (`jaxtune.replay`), each of `ReplayConfig.window` control steps.
+    At least 20 times 8 (1 + coordinates) pieces are simulated for every piece that a measured set is cut into, and five
+    times as many where the set fits badly (`jaxtune.replay`). Each has `ReplayConfig.window` control steps.
 
     Args:
       go_on: `(state by name, actions [steps, act], coords by name) -> state` after these control steps. States have the
         names and shapes of `Trajectory.state`.
       read: `state -> features` by which states are compared, traceable by JAX. All of their numbers where None.
     """
+    read = read or _every_number
+    # Devices of a mesh ask at once, and a simulator may have one state alone.
+    lock = threading.Lock()
 
-    def flat(state):
-        return jnp.concatenate([jnp.ravel(values) for values in jax.tree.leaves(state)])
+    def play_one(state, action, coords):
+        ended = go_on(state, action, {name: float(value) for name, value in coords.items()})
+        # Copied, as a simulator may return what it goes on to change.
+        found = {name: np.array(ended[name], values.dtype) for name, values in state.items() if name in ended}
+        for name, values in state.items():
+            if name not in found or found[name].shape != values.shape:
+                got = f"shape {found[name].shape}" if name in found else ", ".join(ended)
+                raise ValueError(f"go_on, {name}: got {got}, expected shape {values.shape}, as of the state before")
+        return found
 
-    def one(state, actions, coords):
-        ended = go_on(state, actions, {name: float(value) for name, value in coords.items()})
-        return {name: np.asarray(ended[name], np.float32).reshape(np.shape(values)) for name, values in state.items()}
-
-    def every(*pieces):
-        pieces = jax.tree.map(np.asarray, pieces)
-        many = pieces[1].shape[:-2]
-        ended = [one(*jax.tree.map(lambda leaf, at=at: leaf[at], pieces)) for at in np.ndindex(many)]
-        return jax.tree.map(lambda *leaves: np.stack(leaves).reshape(*many, *leaves[0].shape), *ended)
+    def play_batch(*batch):
+        batch = jax.tree.map(np.asarray, batch)
+        _, actions, _ = batch
+        sizes = actions.shape[:-2]
+        with lock:
+            ended = [play_one(*jax.tree.map(lambda leaf, at=at: np.array(leaf[at]), batch)) for at in np.ndindex(sizes)]
+        return jax.tree.map(lambda *leaves: np.stack(leaves).reshape(*sizes, *leaves[0].shape), *ended)
 
     def play(state, actions, coords):
         shapes = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), state)
-        return (read or flat)(jax.pure_callback(every, shapes, state, actions, coords, vmap_method="broadcast_all"))
+        return read(jax.pure_callback(play_batch, shapes, state, actions, coords, vmap_method="broadcast_all"))
 
-    return Replay(play=play, read=read or flat)
+    return Replay(play=play, read=read)
+
+
+def _every_number(state: Mapping[str, jax.Array]) -> jax.Array:
+    return jnp.concatenate([jnp.ravel(values) for values in jax.tree.leaves(state)])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -133,6 +146,9 @@ class HostTuner:
           ValueError: episodes, simulated or measured, do not have the shapes that they should.
         """
         check_set(measured, self.config)
+        if self.replay is not None:
+            # Simulated states are looked at once there are some; what is known before should not take minutes.
+            check_states(measured, measured, self.config, self.replay.needs)
         carry = loop.before(self.config, state.dist, state.past, self.replay is not None)
 
         def collect(carry):

@@ -305,12 +305,14 @@ def _cut(config: ReplayConfig, replay: Replay, episodes: Trajectory) -> _Pieces:
     within = starts[:, None] + jnp.arange(config.window)
     states = lambda where: jax.tree.map(lambda leaf: devices.merged(leaf[:, where]), episodes.state)  # noqa: E731
     # The state after a fall may be anything, so the step of the end must be alive too.
-    alive = episodes.alive[:, within].all(axis=-1) & episodes.alive[:, starts + config.window]
+    alive = devices.merged(episodes.alive[:, within].all(axis=-1) & episodes.alive[:, starts + config.window])
+    # What is simulated in the place of others does not matter, but a simulator may not bear what it never was.
+    instead = jnp.where(alive, jnp.arange(len(alive)), jnp.argmax(alive))
     return _Pieces(
-        start=states(starts),
+        start=jax.tree.map(lambda leaf: leaf[instead], states(starts)),
         action=devices.merged(episodes.action[:, within]),
         end=jax.vmap(replay.read)(states(starts + config.window)),
-        valid=devices.merged(alive),
+        valid=alive,
     )
 
 

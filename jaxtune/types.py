@@ -57,7 +57,7 @@ class Trajectory:
           episodes: mappings with `observation` [time, obs], `action` [time, act], `reward` [time] and `terminated`, for
             the episode or [time]. `truncated` is not read: an episode that was not terminated did not fall.
             Observations may have one entry more, the one after the last step, which is left out. With `state`, arrays
-            [time, ...] by name, the robot's whole state at the beginning of each step.
+            [time, ...] by name, the robot's whole state at the beginning of each step, and maybe after the last.
           steps: length of the set; longer episodes are cut, shorter ones masked. That of the longest where None.
 
         Returns:
@@ -92,7 +92,9 @@ class Trajectory:
         states = _read_states(episodes, [len(value) for value in reward])
         lived = np.array([min(len(value), steps) for value in reward])
         inside = np.arange(steps) < lived[:, None]
-        finite = np.isfinite(obs).all(-1) & np.isfinite(action).all(-1) & np.isfinite(score)
+        state = {name: padded(values) for name, values in states.items()}
+        numbers = [values.reshape(*inside.shape, -1) for values in (obs, action, score, *state.values())]
+        finite = np.all([np.isfinite(values).all(-1) for values in numbers], axis=0)
         alive = inside & np.logical_and.accumulate(finite, axis=1)
         broke = (inside & ~finite).any(axis=1)
         ended = np.array([end and len(value) <= steps for end, value in zip(terminated, reward, strict=True)])
@@ -103,24 +105,30 @@ class Trajectory:
             score=np.where(alive, score, 0.0),
             fell=ended | broke,
             not_finite=broke,
-            state={name: padded(values) for name, values in states.items()} or None,
+            state=state or None,
         )
 
 
 def _read_states(episodes: Sequence[Mapping[str, Any]], steps: Sequence[int]) -> dict[str, list[np.ndarray]]:
     """Reads the states of all episodes, [time, ...] each, by name; none where no episode has any."""
-    states = [dict(episode.get("state") or {}) for episode in episodes]
-    found: dict[str, list[np.ndarray]] = {name: [] for name in states[0]}
-    for number, (state, count) in enumerate(zip(states, steps, strict=True)):
-        if set(state) != set(found):
-            got, expected = (", ".join(sorted(names)) or "none" for names in (state, found))
-            raise ValueError(f"episode {number}, state: got {got}, expected {expected}, as in episode 0")
+    found: dict[str, list[np.ndarray]] = {}
+    for number, (episode, count) in enumerate(zip(episodes, steps, strict=True)):
+        where, state = f"episode {number}, state", episode.get("state")
+        state = {} if state is None else state
+        if not isinstance(state, Mapping):
+            raise ValueError(f"{where}: got {type(state).__name__}, expected arrays [time, ...] by name")
+        if number and set(state) != set(found):
+            got, wanted = (", ".join(sorted(names)) or "none" for names in (state, found))
+            raise ValueError(f"{where}: got {got}, expected {wanted}, as in episode 0")
         for name, values in state.items():
-            values = np.asarray(values, np.float32)
-            expected = found[name][0].shape[1:] if number else values.shape[1:]
-            if values.ndim < 1 or len(values) not in (count, count + 1) or values.shape[1:] != expected:
-                raise ValueError(f"episode {number}, state, {name}: got shape {values.shape}, expected {count} steps")
-            found[name].append(values[:count])
+            try:
+                values = np.asarray(values, np.float32)
+            except (TypeError, ValueError):
+                raise ValueError(f"{where}, {name}: expected numbers of one shape for every step") from None
+            sizes = found[name][0].shape[1:] if number else values.shape[1:]
+            if values.shape not in ((count, *sizes), (count + 1, *sizes)):
+                raise ValueError(f"{where}, {name}: got shape {values.shape}, expected {(count, *sizes)}")
+            found.setdefault(name, []).append(values[:count])
     return found
 
 

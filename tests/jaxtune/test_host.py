@@ -225,7 +225,7 @@ def test_episodes_of_any_length_become_one_set():
 
 def test_states_are_cut_and_padded_as_observations_are():
     rows = np.arange(6.0)
-    states = [{"qpos": rows[:count, None] + [0.0, 10.0], "time": rows[:count]} for count in (6, 4)]
+    states = [{"qpos": rows[:count, None] + [0.0, 10.0], "time": rows[:count].copy()} for count in (6, 4)]
     # One state more is that after the last step.
     sets = [episode(6, state=states[0]), episode(3, state=states[1])]
     state = Trajectory.from_episodes(sets, steps=5).state
@@ -233,6 +233,37 @@ def test_states_are_cut_and_padded_as_observations_are():
     np.testing.assert_array_equal(state["qpos"][1, :, 1], [10.0, 11.0, 12.0, 0.0, 0.0])
     np.testing.assert_array_equal(state["time"], [[0.0, 1.0, 2.0, 3.0, 4.0], [0.0, 1.0, 2.0, 0.0, 0.0]])
     assert Trajectory.from_episodes([episode(3)]).state is None
+    # A state that is not finite ends an episode as an observation does.
+    sets[0]["state"]["time"][2] = np.nan
+    np.testing.assert_array_equal(Trajectory.from_episodes(sets).alive.sum(axis=1), [2, 3])
+
+
+def test_a_simulator_may_return_what_it_changes_later():
+    buffer = np.zeros(2, np.float32)
+
+    def go_on(state, actions, coords):
+        buffer[:] = state["x"] + coords["mass"]
+        state["x"] += 1.0
+        return {"x": buffer}
+
+    play = jax.vmap(pieces_one_by_one(go_on).play)
+    ended = play({"x": jnp.arange(8.0).reshape(4, 2)}, jnp.zeros((4, 3, 1)), {"mass": jnp.arange(4.0)})
+    np.testing.assert_array_equal(ended, np.arange(8.0).reshape(4, 2) + np.arange(4.0)[:, None])
+    whole = jax.vmap(pieces_one_by_one(lambda state, *_: state).play)
+    assert whole({"steps": jnp.arange(3)}, jnp.zeros((3, 1, 1)), {}).tolist() == [[0], [1], [2]]
+
+
+@pytest.mark.parametrize(
+    ("returned", "message"),
+    [
+        ({"y": np.zeros(2)}, r"go_on, x: got y, expected shape \(2,\)"),
+        ({"x": np.zeros((2, 1))}, r"go_on, x: got shape \(2, 1\), expected shape \(2,\)"),
+    ],
+)
+def test_a_state_of_another_name_or_shape_is_named(returned, message):
+    play = pieces_one_by_one(lambda *_: returned).play
+    with pytest.raises(Exception, match=message):
+        jax.block_until_ready(play({"x": jnp.zeros(2)}, jnp.zeros((1, 1)), {}))
 
 
 def test_the_longest_episode_sets_the_length_and_a_last_observation_is_left_out():
@@ -276,11 +307,13 @@ def test_an_episode_is_masked_from_its_first_number_that_is_not_finite():
         ([episode(3, terminated=[])], r"terminated: got float64 of shape \(0,\)"),
         ([episode(3, terminated=[False, True, False])], "True in none but the last"),
         ([episode(3, state={"qpos": [0.0] * 3}), episode(3)], "episode 1, state: got none, expected qpos"),
-        ([episode(3, state={"qpos": [0.0] * 2})], r"episode 0, state, qpos: got shape \(2,\), expected 3 steps"),
+        ([episode(3, state={"qpos": [0.0] * 2})], r"episode 0, state, qpos: got shape \(2,\), expected \(3,\)"),
         (
             [episode(2, state={"qpos": [[0.0]] * 2}), episode(2, state={"qpos": [[0.0, 1.0]] * 2})],
-            r"episode 1, state, qpos: got shape \(2, 2\)",
+            r"episode 1, state, qpos: got shape \(2, 2\), expected \(2, 1\)",
         ),
+        ([episode(2, state=[[0.0], [0.0]])], r"episode 0, state: got list, expected arrays \[time, ...\] by name"),
+        ([episode(2, state={"qpos": [[0.0], [0.0, 1.0]]})], "episode 0, state, qpos: expected numbers of one shape"),
     ],
 )
 def test_episodes_that_do_not_fit_together_are_refused(episodes, message):
