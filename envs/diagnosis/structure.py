@@ -5,6 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from envs.clock import SAME_S
 from envs.diagnosis.finding import Finding
 from envs.diagnosis.repeats import repeated, slope
 from envs.logs import Run
@@ -14,7 +15,8 @@ _LEAST_RATE_HZ = 100.0
 _LEAST_HOLE = 1.6  # usual steps of the clock
 _SHORT = 3.25  # usual steps: the longest gap over which readings can be interpolated
 _FEW = 0.01  # share of the steps that may be short gaps
-_BRIEF_S, _LEAST_S = 0.02, 0.5  # the longest hole at which a run is cut, and the shortest piece that is kept
+_BRIEF_S = 0.02  # the longest hole at which a run is cut
+_LEAST_S, _MOST_ROWS = 0.5, 0.9  # the shortest piece that is kept, and the share of a run that all pieces must have
 _SOON, _IN_STEP = 3, 0.3  # rows after a late one, and usual steps from their place, by which the clock is in step again
 _APART = 1.4  # ratio of two steps, one of which is a hole and the other none
 _PACE, _AS_FAR = 0.95, 1.4  # quantile of the steps up to which they may be a pace of the clock; least ratio of motion
@@ -61,26 +63,27 @@ def structure(run: Run) -> tuple[list[Finding], Run]:
 def pieces(run: Run) -> list[Run]:
     """Cuts a run at holes of up to 20 ms, in which a recorder missed rows, so that nothing is interpolated over them.
 
-    Longer holes are a reason to look at the recording, so the run is left as it is there.
+    Longer holes are a reason to look at the recording, and so are many: then the run is left as it is.
 
     Args:
       run: as it was read.
 
     Returns:
-      Pieces of half a second and more; the run itself where it has no such hole, or no such piece.
+      Pieces of half a second and more, all with the name of the run, which together have nine tenths of its rows or
+      more; the run itself where that cannot be.
     """
     holes, _ = _holes(run)
-    cuts = [row + 1 for row in holes if run.time[row + 1] - run.time[row] <= _BRIEF_S]
-    if not cuts:
+    brief = run.time[holes + 1] - run.time[holes] <= _BRIEF_S + SAME_S
+    edges = [0, *(holes[brief] + 1), len(run.time)]
+    found = [slice(a, b) for a, b in pairwise(edges) if run.time[b - 1] - run.time[a] >= _LEAST_S]
+    if sum(rows.stop - rows.start for rows in found) < _MOST_ROWS * len(run.time):
         return [run]
-    found = []
-    for begin, end in pairwise([0, *cuts, len(run.time)]):
-        if run.time[end - 1] - run.time[begin] >= _LEAST_S:
-            rows = slice(begin, end)
-            signals, other = ({name: values[rows] for name, values in of.items()} for of in (run.signals, run.other))
-            name = f"{run.name}_{len(found)}"
-            found.append(replace(run, name=name, time=run.time[rows], signals=signals, other=other))
-    return found or [run]
+    return [_rows(run, rows) for rows in found]
+
+
+def _rows(run: Run, rows: slice) -> Run:
+    signals, other = ({name: values[rows] for name, values in of.items()} for of in (run.signals, run.other))
+    return replace(run, time=run.time[rows], signals=signals, other=other)
 
 
 def _holes(run: Run) -> tuple[np.ndarray, np.ndarray]:
@@ -145,5 +148,4 @@ def _longest(run: Run, cuts: np.ndarray) -> Run:
     """Takes the longest piece between cuts; a cut lies after the row that it names."""
     edges = np.concatenate([[0], cuts + 1, [len(run.time)]])
     index = int(np.argmax(np.diff(edges)))
-    rows = slice(edges[index], edges[index + 1])
-    return replace(run, time=run.time[rows], signals={name: values[rows] for name, values in run.signals.items()})
+    return _rows(run, slice(edges[index], edges[index + 1]))

@@ -3,6 +3,7 @@
 import hashlib
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import count
 from operator import itemgetter
 from pathlib import Path
 
@@ -40,7 +41,7 @@ def read_logs(
       ValueError: a log cannot be read, the logs are not of one robot, its base is free, or its model has flags that
         switch physics off.
     """
-    logs = [_in_pieces(_on_lines(read_any(folder, robot))) for folder in folders]
+    logs = [_on_lines(read_any(folder, robot)) for folder in folders]
     if not logs:
         raise ValueError("logs: got none, expected one or more")
     first = logs[0]
@@ -62,7 +63,7 @@ def read_logs(
     if len(logs) > 1:
         runs = tuple(_numbered(run, number) for number, log in enumerate(logs) for run in log.runs)
     notes += tuple(note for log in logs for note in log.notes)
-    log = split_in_time(replace(first, runs=runs, notes=notes))
+    log = _in_pieces(split_in_time(replace(first, runs=runs, notes=notes)))
     return with_halves_swapped(log) if swap_halves else log, spec
 
 
@@ -77,13 +78,26 @@ def _on_lines(log: Log) -> Log:
 
 
 def _in_pieces(log: Log) -> Log:
-    """The log with its runs cut where a recorder missed a few rows (`pieces`)."""
-    runs = [pieces(run) for run in log.runs]
-    several = [run.name for run, found in zip(log.runs, runs, strict=True) if found[0] is not run]
-    if not several:
+    """The log with its runs cut where a recorder missed a few rows (`pieces`); a note says where."""
+    runs, cut, lost = [], [], 0.0
+    taken = {run.name for run in log.runs}
+    for run in log.runs:
+        found = pieces(run)
+        if len(found) == 1 and len(found[0].time) == len(run.time):
+            runs.append(run)
+            continue
+        cut.append(run.name)
+        lost += (1.0 - sum(len(one.time) for one in found) / len(run.time)) * (run.time[-1] - run.time[0])
+        names = (name for number in count() if (name := f"{run.name}_{number}") not in taken)
+        # Of the same condition, so they stay in one split.
+        runs += [replace(one, name=name) for one, name in zip(found, names, strict=False)]
+    if not cut:
         return log
-    note = f"a few rows are missing in {', '.join(several)}: cut there, into pieces of half a second and more"
-    return replace(log, runs=tuple(piece for found in runs for piece in found), notes=(*log.notes, note))
+    note = (
+        f"time stamps jump by up to 20 ms in {', '.join(cut)}, as where rows are missing: cut there into pieces of "
+        f"half a second and more, without {lost:.2g} s"
+    )
+    return replace(log, runs=tuple(runs), notes=(*log.notes, note))
 
 
 def _numbered(run: Run, number: int) -> Run:

@@ -3,6 +3,7 @@ none that refines a stronger one."""
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import permutations
 
 import numpy as np
 
@@ -16,7 +17,9 @@ _ODDS = 10.0  # against the model with fewer places, up to which it is taken
 
 
 def renamed(problem: Problem, candidate: Candidate) -> Candidate:
-    """Lets the larger part give the name where two effects may each be a form of the other, such as delay and filter.
+    """Makes a form of an effect that may be one of another, and lets the larger part give the name to both.
+
+    A load and a shifted centre of mass are a load beside the centre; delay and filter may each be a form of the other.
 
     Args:
       problem: the hypotheses and their forms.
@@ -25,6 +28,7 @@ def renamed(problem: Problem, candidate: Candidate) -> Candidate:
     Returns:
       The same model, with another name for some of its parts.
     """
+    candidate = _joined(problem, candidate)
     other_names: dict[str, Hypothesis] = {}
     for effect in candidate.effects:
         forms = candidate.forms_of(effect)
@@ -80,6 +84,16 @@ def _within(one: Candidate, other: Candidate) -> bool:
 
 def _places(candidate: Candidate) -> int:
     return sum(len(effect.places) for effect in candidate.effects)
+
+
+def _joined(problem: Problem, candidate: Candidate) -> Candidate:
+    """Makes one effect of two where the other one, with its forms, is a form of the first."""
+    other_names: dict[str, Hypothesis] = {}
+    for effect, host in permutations(candidate.effects, 2):
+        parts = {one.key: _like(problem, host, one) for one in (effect, *candidate.forms_of(effect))}
+        if not {effect.key, host.key} & set(other_names) and all(parts.values()):
+            other_names |= parts
+    return replace(candidate, hypotheses=tuple(other_names.get(one.key, one) for one in candidate.hypotheses))
 
 
 def _like(problem: Problem, effect: Hypothesis, part: Hypothesis) -> Hypothesis | None:

@@ -67,25 +67,66 @@ def with_signals(log, **changes):
     return replace(log, runs=(replace(log.runs[0], signals=signals),))
 
 
-@pytest.mark.parametrize("missing, begins", [(5, [0, 605]), (20, [0])])
+def with_holes(lengths, holes, **facts):
+    """A log of runs of 500 rows a second, each without the rows of its holes: (first row, rows) of each run."""
+    controller, runs = Controller(kind="pd", rate_hz=500.0, gains=PD), []
+    for number, (length, missing) in enumerate(zip(lengths, holes, strict=True)):
+        time = np.delete(0.002 * np.arange(length), [row + k for row, rows in missing for k in range(rows)])
+        q = np.sin(5.0 * time)[:, None] * [0.5, 0.4]
+        signals = {"q": q + 1e-4 * np.random.default_rng(0).normal(size=q.shape), "target": q}
+        own = {name: values[number] for name, values in facts.items()}
+        one = {"name": f"run_{number}", "condition": f"run_{number}", "split": None} | own
+        runs.append(Run(controller=controller, time=time, signals=signals, **one))
+    return Log(robot="arm.xml", base="fixed", rate_hz=500.0, joints=JOINTS, policy=None, runs=tuple(runs))
+
+
+@pytest.mark.parametrize("missing, begins", [(5, [0, 605]), (10, [0]), (20, [0])])
 def test_a_run_is_cut_where_a_few_rows_are_missing(tmp_path, missing, begins):
-    # 10 ms, and 40 ms, in which somebody should look at the recording.
-    time = np.delete(0.002 * np.arange(1500), np.arange(600, 600 + missing))
-    q = np.sin(5.0 * time)[:, None] * [0.5, 0.4]
-    controller = Controller(kind="pd", rate_hz=500.0, gains=PD)
-    signals = {"q": q + 1e-4 * np.random.default_rng(0).normal(size=q.shape), "target": q}
-    one = Run(name="run_000", condition="a", split="train", controller=controller, time=time, signals=signals)
-    runs = (one, replace(one, name="run_001", condition="b", split="select"))
-    runs = (*runs, replace(one, name="run_002", condition="c", split="sealed"))
-    log = Log(robot="arm.xml", base="fixed", rate_hz=500.0, joints=JOINTS, policy=None, runs=runs)
-    log, _ = read_logs(folder(tmp_path, log))
-    mine = [run for run in log.runs if run.condition == "a"]
+    # 10 ms, and 22 and 42 ms, in which somebody should look at the recording.
+    log, _ = read_logs(folder(tmp_path, with_holes([1500] * 3, [[(600, missing)]] * 3)))
+    mine = [run for run in log.runs if run.condition == "run_0"]
     np.testing.assert_allclose([run.time[0] for run in mine], 0.002 * np.array(begins))
-    assert {run.split for run in mine} == {"train"}
     assert len({run.name for run in log.runs}) == len(log.runs) == 3 * len(begins)
-    assert [note[:40] for note in log.notes] == ["a few rows are missing in run_000, run_0"] * (len(begins) - 1)
+    assert ["jump by up to 20 ms in run_0, run_1, run_2" in note for note in log.notes] == [True] * (len(begins) - 1)
     for run in log.runs:
         assert all(len(values) == len(run.time) for values in run.signals.values())
+    assert {split: {run.condition for run in runs} for split, runs in splits(log).items()} == {
+        "train": {"run_0"},
+        "select": {"run_1"},
+        "sealed": {"run_2"},
+    }
+
+
+def test_a_piece_takes_no_other_runs_name(tmp_path):
+    names = ("run_walk", "run_walk_1", "run_walk_0")
+    asked = with_holes(
+        [1500] * 3, [[(600, 5)], [], []], name=names, condition=names, split=("train", "sealed", "select")
+    )
+    log, _ = read_logs(folder(tmp_path, asked))
+    assert [(run.name, run.split) for run in log.runs] == [
+        ("run_walk_2", "train"),
+        ("run_walk_3", "train"),
+        ("run_walk_0", "select"),
+        ("run_walk_1", "sealed"),
+    ]
+
+
+def test_little_is_left_out_at_holes_and_it_is_said(tmp_path):
+    # Of the first run 0.2 s; the second has a hole every 0.4 s, and is left to the doctor.
+    log = with_holes([3000, 3000, 3000], [[(600, 5), (700, 5)], [(200 * k, 5) for k in range(1, 14)], []])
+    log, _ = read_logs(folder(tmp_path, log))
+    assert [run.name for run in log.runs] == ["run_0_0", "run_0_1", "run_1", "run_2"]
+    assert [note for note in log.notes if note.endswith("without 0.19 s")] != []
+
+
+def test_runs_of_one_condition_are_split_in_time_before_they_are_cut(tmp_path):
+    log, _ = read_logs(folder(tmp_path, with_holes([5000], [[(4700, 5)]])))
+    assert [(run.split, round(run.time[0] - log.runs[0].time[0])) for run in log.runs] == [
+        ("train", 0),
+        ("select", 5),
+        ("sealed", 8),
+        ("sealed", 9),
+    ]
 
 
 def test_one_condition_is_split_in_time(tmp_path, played):

@@ -160,10 +160,13 @@ def test_an_effect_in_its_first_form_gets_no_other():
 
 
 def test_the_two_models_that_are_most_believed_differ_in_more_than_form():
-    result = discover({"coulomb": 1.2, "push": 0.6}, forms=(DIRECTION,))
+    result = discover({"coulomb": 1.2, "cubic": 6.0}, forms=(WARPED,))
     (first, vector), (second, other) = result.rivals
     assert first == "coulomb@slider" != second
     assert not np.allclose(vector, other)
+    # A push beside friction is friction that depends on the direction, so it is no rival of that.
+    ((only, _),) = discover({"coulomb": 1.2, "push": 0.6}, forms=(DIRECTION,)).rivals
+    assert only == "coulomb@slider"
 
 
 def test_what_hardly_anybody_believes_is_worth_no_experiment():
@@ -418,6 +421,26 @@ def test_a_nominal_parameter_that_moved_is_no_form_of_an_effect():
     assert moved_forms(asked, begun.null.fit, errors, HYPOTHESES[2]) == []
     unknown = replace(asked, prior=asked.prior * np.array([axis != "damping" for axis in AXES]))
     assert moved_forms(unknown, begun.null.fit, errors, HYPOTHESES[2]) == [free]
+
+
+def test_two_effects_of_which_one_is_a_form_of_the_other_are_one():
+    coulomb, push = HYPOTHESES[2:4]
+    # As a shifted centre of mass is one of a load, and not the other way round.
+    beside = replace(push, name="coulomb", family=coulomb.family, form="beside")
+    asked = problem({"coulomb": 0.8, "push": 0.4}, forms=(beside, WARPED))
+    floor, begun = state.begin(asked, measured_floor(asked))
+
+    def names(*group):
+        points, evaluate = [np.full(len(group), 0.1)], floor[asked.main_horizon].residuals["train"]
+        (fit,) = begin(begun.null.fit, [group], points, [begun.null.fit.coordinates], evaluate)
+        return [h.key for h in renamed(asked, Candidate(group, fit, begun.null.select)).hypotheses]
+
+    both = [coulomb.key, "coulomb(beside)@slider"]
+    assert names(coulomb, push) == both
+    assert names(push, coulomb) == both[::-1]
+    # The form stays a form of what gives the name, and another effect stays one.
+    assert names(coulomb, push, WARPED) == [*both, WARPED.key]
+    assert names(HYPOTHESES[1], push) == [HYPOTHESES[1].key, push.key]
 
 
 def test_an_effect_is_claimed_of_the_joints_that_show_it():
