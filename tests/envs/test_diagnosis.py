@@ -164,6 +164,25 @@ def test_nothing_is_said_of_undamaged_logs():
     assert share == 1.0, wrong
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_noise_at_a_high_rate_swaps_no_joints(seed):
+    # Over seven rows, of a thousand a second whose stamps jitter, accelerations would be noise.
+    rng = np.random.default_rng(seed)
+    time = 0.001 * np.arange(2500)
+    position = 0.5 * np.sin(time[:, None] * [3.0, 4.0] + [0.0, 1.0]) * [1.0, 0.7]
+    speed = np.gradient(position, time, axis=0)
+    data, torque = mujoco.MjData(MODEL), np.empty_like(position)
+    for row, state in enumerate(zip(position, speed, np.gradient(speed, time, axis=0), strict=True)):
+        data.qpos[:], data.qvel[:], data.qacc[:] = state
+        mujoco.mj_inverse(MODEL, data)
+        torque[row] = data.qfrc_inverse
+    stamps = np.sort(time + rng.uniform(-5e-4, 5e-4, len(time)))
+    signals = {"q": position + 3e-4 * rng.normal(size=position.shape), "tau": torque}
+    controller = Controller(kind="pd", rate_hz=1000.0, gains=GAINS)
+    run = replace(undamaged(0), controller=controller, time=stamps, signals=signals, known={})
+    assert diagnose(run, JOINTS, MODEL) == []
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("cases", [alone, paired])
 def test_two_hundred_are_found(cases):

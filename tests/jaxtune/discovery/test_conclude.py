@@ -1,4 +1,4 @@
-"""Which model is saved where no effect gets a name."""
+"""Which joints an answer names, and which model is saved where no effect gets a name."""
 
 from dataclasses import replace
 
@@ -15,11 +15,12 @@ def stepped():
     asked = problem({"coulomb": 0.5})
     floor, begun = state.begin(asked, noise_floor.measure(asked, lambda text: None))
     found, _ = step.step(Settings(), asked, floor, begun)
-    return asked, floor[asked.main_horizon], found
+    return asked, floor, found
 
 
 def test_the_model_that_costs_least_on_validation_runs_is_saved(stepped):
-    asked, at, found = stepped
+    asked, floor, found = stepped
+    at = floor[asked.main_horizon]
     assert next(iter(conclude._by_select(asked, at, found, found.best, found.null))) == "effects"
     # Worse in one segment, as all models would be that none explains, and better in all others.
     odd = at.unflatten(found.best.select).copy()
@@ -29,7 +30,8 @@ def test_the_model_that_costs_least_on_validation_runs_is_saved(stepped):
 
 
 def test_a_model_that_breaks_in_one_segment_is_not_saved(stepped):
-    asked, at, found = stepped
+    asked, floor, found = stepped
+    at = floor[asked.main_horizon]
     broken = at.unflatten(found.best.select).copy()
     broken[0] *= 1e4
     best = replace(found.best, select=broken.ravel())
@@ -37,3 +39,13 @@ def test_a_model_that_breaks_in_one_segment_is_not_saved(stepped):
     # The cost alone does not mind.
     assert costs[0] < costs[1]
     assert next(iter(conclude._by_select(asked, at, found, best, best))) in ("null", "nominal")
+
+
+def test_the_answer_names_the_joints_that_show_an_effect(stepped):
+    asked, floor, found = stepped
+    (coulomb,) = found.best.effects
+    # Another joint that stays below what the effect needs: the same simulations.
+    wide = replace(found.best, hypotheses=(replace(coulomb, places=("slider", "other")),))
+    begun = replace(found, best=wide, candidates=(wide, *found.candidates))
+    (term,) = conclude.conclude(Settings(), asked, floor, begun, lambda text: None).terms
+    assert term.hypothesis.places == ("slider",)
