@@ -33,7 +33,7 @@ def check(log: Log, spec: mujoco.MjSpec, horizons: Sequence[float] | None = None
       trust: whether what the doctor suspects is a note too.
 
     Returns:
-      Notes: sentences of the log doctor with the runs that they are true of.
+      Notes: sentences of the log doctor, and of what torques are taken for, with the runs that they are true of.
 
     Raises:
       ValueError: nothing can be learnt from the log, or it is misleading and not trusted.
@@ -52,7 +52,11 @@ def check(log: Log, spec: mujoco.MjSpec, horizons: Sequence[float] | None = None
         raise ValueError(f"{'; '.join(refused)}: correct the log, or use --trust-log where it is right")
     # After the doctor, because everything is at its limit in wrong units.
     _check_saturation(log)
-    return [sentence for _, sentence in said]
+    sent = [run.name for run in log.runs if "target" not in run.signals]
+    taken = (
+        [f"no targets, so torques are taken as sent to the motors, and not as measured ({_some(sent)})"] if sent else []
+    )
+    return [sentence for _, sentence in said] + taken
 
 
 def _some(names: Sequence[str], most: int = 3) -> str:
