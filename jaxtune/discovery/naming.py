@@ -89,10 +89,13 @@ def _places(candidate: Candidate) -> int:
 def _joined(problem: Problem, candidate: Candidate) -> Candidate:
     """Makes one effect of two where the other one, with its forms, is a form of the first."""
     other_names: dict[str, Hypothesis] = {}
+    hosts: set[str] = set()
     for effect, host in permutations(candidate.effects, 2):
         parts = {one.key: _like(problem, host, one) for one in (effect, *candidate.forms_of(effect))}
-        if not {effect.key, host.key} & set(other_names) and all(parts.values()):
+        # What has taken in another effect stays, and what was taken in takes in none.
+        if effect.key not in hosts | set(other_names) and host.key not in other_names and all(parts.values()):
             other_names |= parts
+            hosts.add(host.key)
     return replace(candidate, hypotheses=tuple(other_names.get(one.key, one) for one in candidate.hypotheses))
 
 

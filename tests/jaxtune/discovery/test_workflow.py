@@ -441,6 +441,11 @@ def test_two_effects_of_which_one_is_a_form_of_the_other_are_one():
     # The form stays a form of what gives the name, and another effect stays one.
     assert names(coulomb, push, WARPED) == [*both, WARPED.key]
     assert names(HYPOTHESES[1], push) == [HYPOTHESES[1].key, push.key]
+    # In a chain every form keeps its effect.
+    damping = HYPOTHESES[1]
+    further = replace(coulomb, name="damping", family=damping.family, form="dry")
+    asked = replace(asked, forms=(*asked.forms, further))
+    assert names(push, coulomb, damping) == [both[1], both[0], damping.key]
 
 
 def test_an_effect_is_claimed_of_the_joints_that_show_it():
