@@ -70,13 +70,13 @@ def pieces(run: Run) -> list[Run]:
 
     Returns:
       Pieces of half a second and more, all with the name of the run, which together have nine tenths of its rows or
-      more; the run itself where that cannot be.
+      more; the run itself where that cannot be, or where there is no such hole.
     """
     holes, _ = _holes(run)
     brief = run.time[holes + 1] - run.time[holes] <= _BRIEF_S + SAME_S
     edges = [0, *(holes[brief] + 1), len(run.time)]
     found = [slice(a, b) for a, b in pairwise(edges) if run.time[b - 1] - run.time[a] >= _LEAST_S]
-    if sum(rows.stop - rows.start for rows in found) < _MOST_ROWS * len(run.time):
+    if not brief.any() or sum(rows.stop - rows.start for rows in found) < _MOST_ROWS * len(run.time):
         return [run]
     return [_rows(run, rows) for rows in found]
 

@@ -83,7 +83,7 @@ def _in_pieces(log: Log) -> Log:
     taken = {run.name for run in log.runs}
     for run in log.runs:
         found = pieces(run)
-        if len(found) == 1 and len(found[0].time) == len(run.time):
+        if found[0] is run:
             runs.append(run)
             continue
         cut.append(run.name)

@@ -1,7 +1,7 @@
 """Which effects of a model give it a name: the larger of two that are alike, at the joints where logs show them, and
 none that refines a stronger one."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import permutations
 
@@ -38,7 +38,7 @@ def renamed(problem: Problem, candidate: Candidate) -> Candidate:
                 theirs = {one.key: _like(problem, twin, effect if one is form else one) for one in forms}
                 if all(theirs.values()):
                     other_names |= {effect.key: twin} | theirs
-    return replace(candidate, hypotheses=tuple(other_names.get(one.key, one) for one in candidate.hypotheses))
+    return _with_names(candidate, other_names)
 
 
 def at_fewest_places(best: Candidate, candidates: Sequence[Candidate], probabilities: np.ndarray) -> Candidate:
@@ -96,6 +96,10 @@ def _joined(problem: Problem, candidate: Candidate) -> Candidate:
         if effect.key not in hosts | set(other_names) and host.key not in other_names and all(parts.values()):
             other_names |= parts
             hosts.add(host.key)
+    return _with_names(candidate, other_names)
+
+
+def _with_names(candidate: Candidate, other_names: Mapping[str, Hypothesis]) -> Candidate:
     return replace(candidate, hypotheses=tuple(other_names.get(one.key, one) for one in candidate.hypotheses))
 
 
