@@ -98,7 +98,8 @@ class Chain:
           x: the controller's inputs.
 
         Returns:
-          The robot and the memories after the step, and what was read before it: `q`, `dq` and `tau`, [joints] each.
+          The robot and the memories after the step, and what was read before it, [joints] each: `q`, `dq`, `tau`, the
+          torque of the motors, and `command`, that which the controller asked for.
         """
         joint, within = self.joints(data), self._within(model, x)
         motor, running = self._seen(values, joint, memory, within)
@@ -108,8 +109,8 @@ class Chain:
         gains = {name: within * x[name] for name in ("stiffness", "damping")}
         torque = torque - x["emf"] * joint[1]
         data, memory, torque = self._move(model, data, memory, values, torque, x | gains)
-        tau, memory = self.stage("torque_reading", values, torque, None, memory)
-        return data, memory, {"q": readings[0], "dq": readings[1] + running, "tau": tau}
+        torques, memory = self.stage("torque_reading", values, jnp.stack([torque, memory["held"]]), None, memory)
+        return data, memory, {"q": readings[0], "dq": readings[1] + running, "tau": torques[0], "command": torques[1]}
 
     def remember(self, values, memory: dict, motor: jax.Array, x) -> tuple[dict, jax.Array]:
         """Fills the memories of sensors, controller and friction by a step of measured motion.

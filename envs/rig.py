@@ -310,7 +310,7 @@ class Rig:
             all lengths can share one program.
 
         Returns:
-          Readings at the segment's rows by signal: `q`, `dq` and `tau` [rows, joints], `gravity` [rows, 3].
+          Readings at the segment's rows by signal: `q`, `dq`, `tau` and `command` [rows, joints], `gravity` [rows, 3].
         """
         model = self.model(values)
         chain = self.chain

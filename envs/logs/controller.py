@@ -8,12 +8,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-GAINS = {"pd": ("kp", "kd", "torque_limit_nm"), "servo": ("gain", "kt", "resistance_ohm")}
+GAINS = {"pd": ("kp", "kd", "torque_limit_nm"), "servo": ("gain", "kt", "resistance_ohm"), "unknown": ()}
 """Names of a controller's numbers by its type; each is given for all joints or one per joint."""
 
-OPTIONAL_GAINS = {"pd": ("kt",), "servo": ("volts",)}
+OPTIONAL_GAINS = {"pd": ("kt",), "servo": ("volts",), "unknown": ("kt",)}
 """Further numbers that a controller may have: the torque constant, for logs of motor currents, and the supply voltage,
 where it was not recorded."""
+
+FOLLOWING_HZ = 1000.0
+"""Rate of the controller that takes the place of an unknown one."""
 
 BETWEEN_ROWS = ("hold", "linear", "unknown")
 """How targets go on between two rows of a log: held until the next row, in a straight line to it, or unknown."""
@@ -74,11 +77,13 @@ class Controller:
                 torque = kt (duty volts - kt dq) / resistance_ohm
                        = clip(gain stall e, -stall, stall) - kt^2 / resistance_ohm dq
 
-    `impedance` brings both into one form.
+    `impedance` brings both into one form. Where the controller is unknown, `envs.following` puts one of its own in its
+    place, with the gains of a `pd` controller.
     """
 
     kind: str
-    """`pd` (position and velocity error, limited) or `servo` (position error sets the duty cycle of a DC motor)."""
+    """`pd` (position and velocity error, limited), `servo` (position error sets the duty cycle of a DC motor) or
+    `unknown` (only the motion and the torques that were measured say what it did)."""
     rate_hz: float
     """How often it reads the joint; its torque is held in between."""
     gains: Mapping[str, np.ndarray]
@@ -101,7 +106,7 @@ class Controller:
           ValueError: a servo has neither.
         """
         gains, on = self.gains, 1.0 if enabled is None else np.asarray(enabled)[..., None]
-        if self.kind == "pd":
+        if self.kind != "servo":
             stiffness = on * gains["kp"]
             return Impedance(
                 stiffness=stiffness,

@@ -212,6 +212,8 @@ def _run(path: Path, meta: Meta, needed: str) -> tuple[Run, list[str]]:
         raise ValueError(f"{path}, column '{column_names(needed, meta.joints)[0]}': is missing")
     elif not {"target", "tau"} & set(signals):
         raise ValueError(f"{path}: there is neither '{column_names('target', meta.joints)[0]}' nor 'tau' or 'current'")
+    if entry["controller"] is not None and entry["controller"].kind == "unknown" and needed != OBSERVATION:
+        notes += _keep_measured(path, signals, meta)
     run = Run(
         name=path.stem,
         condition=entry.get("condition", path.stem),
@@ -223,6 +225,17 @@ def _run(path: Path, meta: Meta, needed: str) -> tuple[Run, list[str]]:
         known=known,
     )
     return run, notes
+
+
+def _keep_measured(path: Path, signals: dict[str, np.ndarray], meta: Meta) -> list[str]:
+    """Takes out what an unknown controller was told, which says nothing of its torques, and returns a note of it."""
+    if "tau" not in signals:
+        raise ValueError(
+            f"{path}, column '{column_names('tau', meta.joints)[0]}': is missing, which a log of an unknown controller "
+            "needs: torques that were measured, with their signs"
+        )
+    left = [name for name in ("target", "enabled") if signals.pop(name, None) is not None]
+    return [f"{path.stem}: not used, since the controller is unknown: {', '.join(left)}"] if left else []
 
 
 def _signals(path: Path, columns: dict[str, np.ndarray], meta: Meta) -> dict[str, np.ndarray]:

@@ -14,7 +14,7 @@ import numpy as np
 import yaml
 
 from envs.logs.containment import check_inside, check_model
-from envs.logs.controller import BETWEEN_ROWS, GAINS, OPTIONAL_GAINS, Controller
+from envs.logs.controller import BETWEEN_ROWS, FOLLOWING_HZ, GAINS, OPTIONAL_GAINS, Controller
 from envs.logs.format import (
     FACTS,
     JOINT_SIGNALS,
@@ -195,12 +195,13 @@ class Meta:
         entry = self._mapping(where, entry, None)
         kind = self._one_of(f"{where}.type", entry.get("type"), GAINS)
         own = {name: name != "torque_limit_nm" for name in GAINS[kind]} | dict.fromkeys(OPTIONAL_GAINS[kind], False)
-        self._mapping(where, entry, {"type": True, "rate_hz": True, "target_between_rows": False} | own)
+        rest = {"rate_hz": kind != "unknown", "target_between_rows": False}
+        self._mapping(where, entry, {"type": True} | rest | own)
         there = [name for name in own if name in GAINS[kind] or name in entry]
         between = entry.get("target_between_rows", "unknown")
         return Controller(
             kind=kind,
-            rate_hz=self._rate(f"{where}.rate_hz", entry["rate_hz"]),
+            rate_hz=self._rate(f"{where}.rate_hz", entry.get("rate_hz", FOLLOWING_HZ)),
             gains={name: self._gain(f"{where}.{name}", entry.get(name, np.inf), name) for name in there},
             between_rows=self._one_of(f"{where}.target_between_rows", between, BETWEEN_ROWS),
         )

@@ -52,9 +52,14 @@ def check(log: Log, spec: mujoco.MjSpec, horizons: Sequence[float] | None = None
         raise ValueError(f"{'; '.join(refused)}: correct the log, or use --trust-log where it is right")
     # After the doctor, because everything is at its limit in wrong units.
     _check_saturation(log)
-    sent = [run.name for run in log.runs if "target" not in run.signals]
+    sent = [run.name for run in log.runs if "target" not in run.signals and run.controller.kind != "unknown"]
     taken = (
-        [f"no targets, so torques are taken as sent to the motors, and not as measured ({_some(sent)})"] if sent else []
+        [
+            f"no targets, so torques are taken as sent to the motors ({_some(sent)}); where they were measured, say "
+            "controller: {type: unknown} in meta.yaml"
+        ]
+        if sent
+        else []
     )
     return [sentence for _, sentence in said] + taken
 

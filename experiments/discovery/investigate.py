@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from envs import corrected
+from envs.following import followed
 from envs.logs import Log
 from experiments.common import checkpoint
 from experiments.common.checkpoint import read_json, write_json
@@ -65,6 +66,7 @@ def investigate(
     """
     began, saved = time.monotonic(), out / "state.json"
     log, spec = read_logs(logs, clear_flags, swap_halves, robot)
+    log = followed(log, spec)
     question = build_question(log, spec, horizons, null_logs, seed)
     out.mkdir(parents=True, exist_ok=True)
     result = workflow.discover(

@@ -42,6 +42,8 @@ def deciding_experiment(question: Question, log: Log, folder: Path, result: Resu
         return float(np.sqrt(np.mean([(a - b) ** 2 for a, b in simulated], axis=(0, 1)).max()))
 
     controller = controller_of(log)
+    if controller.kind == "unknown":
+        return None
     still = passive(controller)
     if still.all():
         return None

@@ -9,6 +9,7 @@ import numpy as np
 
 from envs import readings, segments
 from envs.effects import LEARNED, LIBRARY
+from envs.following import OF_CONTROLLER, followed
 from envs.logs import Log, Run, splits, with_splits
 from envs.null_logs import simulate_null_logs
 from envs.regimes import REGIMES
@@ -43,10 +44,14 @@ class _Simulator:
     rig: Rig = field(compare=False)
     layout: Hashable
     signals: tuple[str, ...]
+    follows: bool
+    """Whether the controller follows measured motion (`envs.following`): `tau` is then what it asks for, and what a
+    motor makes of that is between the measured torque and the joint."""
 
     def __call__(self, system, values, inputs, steps):
         read = self.rig.on(system).simulate(self.rig.tree(values), inputs, steps)
-        read = read | {"abs_tau": jnp.abs(read["tau"])}
+        tau = read["command" if self.follows else "tau"]
+        read = read | {"tau": tau, "abs_tau": jnp.abs(tau)}
         return {name: read[name] for name in self.signals}
 
 
@@ -79,27 +84,30 @@ def build_question(
     horizons = fitting_horizons(log, horizons)
     rate = check_simulatable(log, spec, horizons)
     log, notes = drop_filtered(with_splits(log))
-    log = replace(log, runs=readings.with_noise(log.runs, without_sealed(log).runs))
+    log = followed(replace(log, runs=readings.with_noise(log.runs, without_sealed(log).runs)), spec)
     unsealed = without_sealed(log).runs
     plain = plain or Rig(spec, log.joints, rate)
     plain.check_matches(log.joints, rate)
     rig = plain.scaled(measure_scales(plain, unsealed))
     signals, partly = _compared(log)
     axes = {(axis.effect, axis.place): number for number, axis in enumerate(rig.axes)}
-    library = {name: row for name, row in rig.effects.items() if name in LIBRARY}
+    # Of a controller of our own nothing is unknown.
+    ours = log.runs[0].controller.kind == "unknown"
+    exact = {name for name, row in rig.effects.items() if ours and row.enters in OF_CONTROLLER}
+    library = {name: row for name, row in rig.effects.items() if name in LIBRARY and name not in exact}
     every = hypotheses(rig.axes, rig.places, library)
-    unknowns, unknown_bounds = unknown_directions(rig.axes, rig.control_hz, signals)
+    unknowns, unknown_bounds = unknown_directions(rig.axes, rig.control_hz, signals, exact)
     bin_rows = segments.rows_together(1.0 / log.rate_hz, BIN_S)
     measured = cut_log(log, rig.dt, signals, horizons)
-    simulated = simulate_null_logs(log, spec, null_logs, seed)
+    simulated = [followed(one, spec) for one in simulate_null_logs(log, spec, null_logs, seed)]
     nulls = [told_alike(cut_log(one, rig.dt, signals, horizons), measured) for one in simulated]
     problem = Problem(
-        simulate=_Simulator(plain, plain.layout, signals),
+        simulate=_Simulator(plain, plain.layout, signals, ours),
         system=plain.system,
         values=rig.inner,
         axes=len(rig.axes),
         hypotheses=every,
-        prior=np.array([axis.prior_sd for axis in rig.axes]),
+        prior=np.array([0.0 if axis.effect in exact else axis.prior_sd for axis in rig.axes]),
         unknowns=unknowns,
         unknown_bounds=unknown_bounds,
         trees=rig.trees,

@@ -1,0 +1,84 @@
+"""Robots whose controller nobody knows: one of our own follows their measured motion, and needs torques as they did.
+
+Where the torques at the joints were measured, no controller has to be known. What the model needs for the measured
+motion is compared with them, as in the identification of robots by inverse dynamics (Siciliano et al., *Robotics*,
+2009, section 7.3). Playing the measured torques without a controller would not do: a light joint with a little friction
+too much runs away, and the model that ignores the torques most, one of heavy rotors, then fits best.
+"""
+
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+
+from envs.logs import Log, Run
+from envs.models import suspended
+from envs.readings import aligned
+from envs.smoothing import smoothed
+
+# How fast it settles: within a fifth of the shortest segments, and stable with ten steps of 1 ms in its period.
+_FOLLOW_RAD_S = 150.0
+_POSES = 20
+
+OF_CONTROLLER = ("command", "error", "speed")
+"""What effects enter (`jaxtune.types.Effect.enters`) that change what a controller asks for."""
+
+
+def followed(log: Log, spec: mujoco.MjSpec) -> Log:
+    """Gives the runs of an unknown controller targets and gains with which the model moves as measured.
+
+    Critically damped for every joint alone, it has
+
+        torque = kp (target - q) - kd dq,   target = q_measured + kd / kp dq_measured + tau_measured / kp
+
+    so while the model moves as measured, its torque is the measured one. What else the model needs shows in `tau`.
+
+    Args:
+      log: as it was read, or followed before: targets follow from its present readings anew.
+      spec: the nominal model.
+
+    Returns:
+      The log, unchanged where its controller is known.
+
+    Raises:
+      ValueError: the controller is unknown in some runs only.
+    """
+    unknown = [run.controller.kind == "unknown" for run in log.runs]
+    if not any(unknown):
+        return log
+    if not all(unknown):
+        name = log.runs[unknown.index(False)].name
+        raise ValueError(f"{name}: controller.type: got a known one, expected 'unknown' as in others, or in none")
+    inertia = _least_inertia(log, spec)
+    gains = {
+        "kp": inertia * _FOLLOW_RAD_S**2,
+        "kd": 2.0 * inertia * _FOLLOW_RAD_S,
+        "torque_limit_nm": np.full(len(inertia), np.inf),
+    }
+    return replace(log, runs=tuple(_followed(run, gains) for run in log.runs))
+
+
+def _followed(run: Run, gains: dict[str, np.ndarray]) -> Run:
+    states = smoothed(run)
+    target = states[:, 0] + (gains["kd"] * states[:, 1] + aligned(run, "tau")) / gains["kp"]
+    controller = replace(run.controller, gains=gains, between_rows="linear")
+    return replace(run, controller=controller, signals={**run.signals, "target": target})
+
+
+def _least_inertia(log: Log, spec: mujoco.MjSpec) -> np.ndarray:
+    """The least inertia of every joint in poses of the log while the other joints are free, [joints] kg m^2.
+
+    With more, a joint that others carry would be controlled too hard for the step of the simulation.
+    """
+    model = suspended(spec, log.joints)
+    data, dense = mujoco.MjData(model), np.zeros((model.nv, model.nv))
+    found = [model.joint(name) for name in log.joints]
+    qpos, dof = (np.array([getattr(one, field)[0] for one in found]) for field in ("qposadr", "dofadr"))
+    positions = np.concatenate([run.signals["q"] for run in log.runs])
+    least = np.full(len(dof), np.inf)
+    for row in np.linspace(0, len(positions) - 1, _POSES).astype(int):
+        data.qpos[qpos] = positions[row]
+        mujoco.mj_forward(model, data)
+        mujoco.mj_fullM(model, data, dense)
+        least = np.minimum(least, 1.0 / np.diag(np.linalg.inv(dense))[dof])
+    return least

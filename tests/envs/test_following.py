@@ -1,0 +1,144 @@
+"""Logs of unknown controllers: what is read, who follows the motion, and which torques a model then needs."""
+
+from dataclasses import replace
+
+import jax
+import mujoco
+import numpy as np
+import pytest
+import rigs
+
+from envs import segments
+from envs.following import followed
+from envs.logs import Controller, Log, Run, read, write
+from envs.rig import Rig
+
+UNKNOWN = Controller(kind="unknown", rate_hz=1000.0, gains={})
+FRICTION_NM = 0.25
+
+
+def recorded(friction_nm=0.0, names=("run_000",)):
+    """A log of the arm under computed torques and a PD law, which it does not tell; the elbow may have dry friction."""
+    model = mujoco.MjModel.from_xml_string(rigs.ARM)
+    model.opt.timestep = 0.0005
+    real, ideal = mujoco.MjData(model), mujoco.MjData(model)
+    rate = 2 * np.pi * np.array([0.7, 1.1])
+    rows = []
+    for step in range(3000):
+        phase = rate * real.time
+        target = np.array([0.6, 0.9]) * np.stack([np.sin(phase), rate * np.cos(phase), -(rate**2) * np.sin(phase)])
+        if step == 0:
+            real.qpos[:], real.qvel[:] = target[:2]
+        ideal.qpos[:], ideal.qvel[:] = real.qpos, real.qvel
+        ideal.qacc[:] = target[2] + 400 * (target[0] - real.qpos) + 40 * (target[1] - real.qvel)
+        mujoco.mj_inverse(model, ideal)
+        torque = ideal.qfrc_inverse.copy()
+        if step % 4 == 0:
+            rows.append(np.concatenate([[real.time], real.qpos, real.qvel, torque]))
+        real.qfrc_applied[:] = torque - [0.0, friction_nm * np.tanh(real.qvel[1] / 0.01)]
+        mujoco.mj_step(model, real)
+    time, *columns = np.array(rows).T
+    q, dq, tau = np.reshape(columns, (3, 2, -1)).transpose(0, 2, 1)
+    runs = [
+        Run(
+            name=name,
+            condition=name,
+            split=None,
+            controller=UNKNOWN,
+            time=time,
+            signals={"q": q, "dq": dq, "tau": tau},
+        )
+        for name in names
+    ]
+    return Log(robot="arm.xml", base="fixed", rate_hz=500.0, joints=rigs.ARM_JOINTS, policy=None, runs=tuple(runs))
+
+
+@pytest.fixture(scope="module")
+def spec():
+    return mujoco.MjSpec.from_string(rigs.ARM)
+
+
+@pytest.fixture(scope="module")
+def needed(spec):
+    """Torques that the nominal arm needs, less the measured ones, and measured speeds: [rows, joints] by friction."""
+    rig = Rig(spec, rigs.ARM_JOINTS, UNKNOWN.rate_hz)
+    player, found = rigs.Player(rig), {}
+    for friction in (0.0, FRICTION_NM):
+        log = followed(recorded(friction), spec)
+        cut = segments.cut(log.runs, 0.1, rig.dt)
+        pieces = [jax.tree.map(lambda leaf, n=n: leaf[n], cut.segments) for n in range(len(cut.run))]
+        read = [player.play(piece) for piece in pieces]
+        settled = slice(15, None)
+        less = np.concatenate([one["command"][settled] for one in read]) - np.concatenate(
+            cut.signals["tau"][:, settled]
+        )
+        far = np.concatenate([one["q"][settled] for one in read]) - np.concatenate(cut.signals["q"][:, settled])
+        found[friction] = less, far, np.concatenate(cut.signals["dq"][:, settled])
+    return found
+
+
+def test_a_model_that_is_right_needs_the_measured_torques(needed):
+    less, far, _ = needed[0.0]
+    assert np.sqrt((less**2).mean(axis=0)) == pytest.approx([0.0, 0.0], abs=0.02)
+    assert np.abs(far).max() < 2e-4
+
+
+def test_what_a_model_lacks_shows_in_the_torque_of_its_joint(needed):
+    less, far, speed = needed[FRICTION_NM]
+    fast = np.abs(speed[:, 1]) > 0.5
+    # The model moves as the robot did, without the friction that the robot had to overcome.
+    np.testing.assert_allclose(less[fast, 1], -FRICTION_NM * np.sign(speed[fast, 1]), atol=0.3 * FRICTION_NM)
+    assert np.abs(less[fast, 1]).mean() == pytest.approx(FRICTION_NM, rel=0.1)
+    assert np.abs(less[:, 0]).mean() < 0.15 * FRICTION_NM
+    assert np.abs(far).max() < 2e-3
+
+
+def test_following_twice_follows_the_readings_that_are_there(spec):
+    log = followed(recorded(), spec)
+    again = followed(log, spec)
+    np.testing.assert_array_equal(again.runs[0].signals["target"], log.runs[0].signals["target"])
+    moved = replace(log.runs[0], signals=log.runs[0].signals | {"q": log.runs[0].signals["q"] + 0.1})
+    moved = followed(replace(log, runs=(moved,)), spec).runs[0]
+    np.testing.assert_allclose(moved.signals["target"] - log.runs[0].signals["target"], 0.1, atol=1e-6)
+
+
+def test_a_known_controller_stays_and_a_mixture_is_refused(spec):
+    log = recorded(names=("run_000", "run_001"))
+    gains = {name: np.ones(2) for name in ("kp", "kd", "torque_limit_nm")}
+    known = replace(log.runs[1], controller=Controller(kind="pd", rate_hz=1000.0, gains=gains))
+    driven = replace(log, runs=(known,))
+    assert followed(driven, spec) is driven
+    with pytest.raises(ValueError, match=r"run_001: controller\.type: got a known one, expected 'unknown'"):
+        followed(replace(log, runs=(log.runs[0], known)), spec)
+
+
+def written(folder, log):
+    write(log, folder)
+    (folder / "arm.xml").write_text(rigs.ARM)
+    return folder
+
+
+def test_only_the_type_of_an_unknown_controller_is_needed(tmp_path):
+    meta = written(tmp_path, recorded()) / "meta.yaml"
+    assert read(tmp_path).runs[0].controller.kind == "unknown"
+    text = meta.read_text()
+    start, end = text.index("controller:"), text.index("runs:")
+    meta.write_text(f"{text[:start]}controller: {{type: unknown}}\n{text[end:].split('    controller')[0]}")
+    assert read(tmp_path).runs[0].controller.rate_hz == 1000.0
+
+
+def test_targets_of_an_unknown_controller_are_not_used_and_said_so(tmp_path):
+    log = recorded()
+    run = log.runs[0]
+    run = replace(run, signals=run.signals | {"target": run.signals["q"], "enabled": np.ones(len(run.time))})
+    log = read(written(tmp_path, replace(log, runs=(run,))))
+    assert not {"target", "enabled"} & set(log.runs[0].signals)
+    assert "run_000: not used, since the controller is unknown: target, enabled" in log.notes
+
+
+def test_an_unknown_controller_without_measured_torques_is_refused(tmp_path):
+    log = recorded()
+    run = log.runs[0]
+    signals = {"q": run.signals["q"], "target": run.signals["q"], "abs_tau": np.abs(run.signals["tau"])}
+    with pytest.raises(ValueError, match=r"run_000.csv.*tau.shoulder'.*unknown controller"):
+        read(written(tmp_path, replace(log, runs=(replace(run, signals=signals),))))
