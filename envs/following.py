@@ -13,25 +13,25 @@ import numpy as np
 
 from envs.logs import Log, Run
 from envs.models import suspended
-from envs.readings import aligned
 from envs.smoothing import smoothed
 
 # How fast it settles: within a fifth of the shortest segments, and stable with ten steps of 1 ms in its period.
 _FOLLOW_RAD_S = 150.0
 _POSES = 20
 
-OF_CONTROLLER = ("command", "error", "speed")
-"""What effects enter (`jaxtune.types.Effect.enters`) that change what a controller asks for."""
+OF_CONTROLLER = ("command", "error", "speed", "torque")
+"""What effects enter (`jaxtune.types.Effect.enters`) that stand between targets and the torques at the joints."""
 
 
 def followed(log: Log, spec: mujoco.MjSpec) -> Log:
     """Gives the runs of an unknown controller targets and gains with which the model moves as measured.
 
-    Critically damped for every joint alone, it has
+    Critically damped for every joint alone, it has, with smoothed measurements,
 
         torque = kp (target - q) - kd dq,   target = q_measured + kd / kp dq_measured + tau_measured / kp
 
-    so while the model moves as measured, its torque is the measured one. What else the model needs shows in `tau`.
+    so while the model moves as measured, it asks for the measured torque. What else it needs shows in that, and in how
+    far the motion is off.
 
     Args:
       log: as it was read, or followed before: targets follow from its present readings anew.
@@ -60,7 +60,9 @@ def followed(log: Log, spec: mujoco.MjSpec) -> Log:
 
 def _followed(run: Run, gains: dict[str, np.ndarray]) -> Run:
     states = smoothed(run)
-    target = states[:, 0] + (gains["kd"] * states[:, 1] + aligned(run, "tau")) / gains["kp"]
+    # Noise of the torques would shake the model.
+    torque = smoothed(replace(run, signals={"q": run.signals["tau"]}, known={"q": run.known.get("tau", {})}))[:, 0]
+    target = states[:, 0] + (gains["kd"] * states[:, 1] + torque) / gains["kp"]
     controller = replace(run.controller, gains=gains, between_rows="linear")
     return replace(run, controller=controller, signals={**run.signals, "target": target})
 

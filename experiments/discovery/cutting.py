@@ -100,7 +100,7 @@ def _part(run: Run, split: str) -> Run:
     )
 
 
-def told_alike(null: Cuts, measured: Cuts) -> Cuts:
+def told_alike(null: Cuts, measured: Cuts, follows: bool = False) -> Cuts:
     """Lets a null log share what the controller was told with the measured log, of which it is the same.
 
     A long log is hundreds of megabytes otherwise, for every null log.
@@ -108,12 +108,14 @@ def told_alike(null: Cuts, measured: Cuts) -> Cuts:
     Args:
       null: segments of a simulated null log.
       measured: segments of the log that it imitates.
+      follows: whether targets follow from a log's own readings (`envs.following`).
     """
+    own_fields = ("measured", "past", *(("target", "past_target") if follows else ()))
     return {
         split: {
             horizon: replace(
                 own,
-                inputs=measured[split][horizon].inputs.replace(measured=own.inputs.measured, past=own.inputs.past),
+                inputs=measured[split][horizon].inputs.replace(**{name: own.inputs[name] for name in own_fields}),
             )
             for horizon, own in lengths.items()
         }

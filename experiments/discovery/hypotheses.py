@@ -1,7 +1,7 @@
 """Lists the hypotheses of discovery: every effect at every place alone, and at sets of places that are alike."""
 
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -94,7 +94,7 @@ def _kind(place: str) -> str:
 
 
 def unknown_directions(
-    axes: Sequence[Axis], control_hz: float, signals: Sequence[str] = (), exact: Collection[str] = ()
+    axes: Sequence[Axis], control_hz: float, signals: Sequence[str] = (), follows: bool = False
 ) -> tuple[np.ndarray, np.ndarray]:
     """Returns directions in the rig's coordinates along what neither log nor model says, and their bounds.
 
@@ -108,26 +108,24 @@ def unknown_directions(
       axes: coordinates of the rig.
       control_hz: rate of the controller in Hz.
       signals: that are compared.
-      exact: names of effects that the robot cannot have.
+      follows: whether the controller is one that follows measured motion (`envs.following`), of which all is known.
+        What it asks for was measured, so joints get an unknown share of that.
 
     Returns:
       [unknowns, axes] of the size of half a period, of half of the way between rows, of a typical travel, or of a
       typical error of a motor's constant; and [unknowns, 2] least and largest coordinate.
     """
     # Nothing acts before it is time, and nothing is later than a whole period.
-    common = {"sensor_delay": 0.5 / control_hz, "command_delay": 0.5 / control_hz, "target_between_rows": 0.5}
+    common = {"sensor_delay": 0.5 / control_hz}
+    common |= {} if follows else {"command_delay": 0.5 / control_hz, "target_between_rows": 0.5}
     # Velocities of positions that were read before and now are those of half of the time in between.
     common |= {"velocity_lag": 0.5 / control_hz} if "dq" in signals else {}
-    found = [
-        ([size * (axis.effect == effect) for axis in axes], (0.0, 2.0))
-        for effect, size in common.items()
-        if effect not in exact
-    ]
+    found = [([size * (axis.effect == effect) for axis in axes], (0.0, 2.0)) for effect, size in common.items()]
     rubbing = {axis.place for axis in axes if axis.effect == "coulomb" and axis.prior_sd > 0}
     recorded = {axis.place for axis in axes if {"tau", "abs_tau"} & set(signals)}
     for effect, size, bounds, places in (
         ("presliding", _TRAVEL_RAD, (0.0, _MOST_TRAVELS), rubbing),
-        ("torque_reading", _TORQUE_SHARE, (-_MOST_SHARES, _MOST_SHARES), recorded),
+        ("torque_scale" if follows else "torque_reading", _TORQUE_SHARE, (-_MOST_SHARES, _MOST_SHARES), recorded),
     ):
         mine = [number for number, axis in enumerate(axes) if axis.effect == effect and axis.place in places]
         found += [(size * np.eye(len(axes))[number], bounds) for number in mine]

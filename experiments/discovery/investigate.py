@@ -66,7 +66,6 @@ def investigate(
     """
     began, saved = time.monotonic(), out / "state.json"
     log, spec = read_logs(logs, clear_flags, swap_halves, robot)
-    log = followed(log, spec)
     question = build_question(log, spec, horizons, null_logs, seed)
     out.mkdir(parents=True, exist_ok=True)
     result = workflow.discover(
@@ -75,7 +74,7 @@ def investigate(
         save=lambda state: write_json(saved, state),
         say=say,
     )
-    free = free_runs(log, question, result)
+    free = free_runs(followed(log, spec), question, result)
     stamp = {"seconds": time.monotonic() - began, "versions": checkpoint.versions()}
     summary = summarise(question, log, logs[0], result) | stamp
     corrected.save(out / "model", spec, question.rig, result.model)

@@ -91,18 +91,18 @@ def build_question(
     rig = plain.scaled(measure_scales(plain, unsealed))
     signals, partly = _compared(log)
     axes = {(axis.effect, axis.place): number for number, axis in enumerate(rig.axes)}
-    # Of a controller of our own nothing is unknown.
-    ours = log.runs[0].controller.kind == "unknown"
-    exact = {name for name, row in rig.effects.items() if ours and row.enters in OF_CONTROLLER}
+    # Of a controller of our own all is known.
+    follows = log.runs[0].controller.kind == "unknown"
+    exact = {name for name, row in rig.effects.items() if follows and row.enters in OF_CONTROLLER}
     library = {name: row for name, row in rig.effects.items() if name in LIBRARY and name not in exact}
     every = hypotheses(rig.axes, rig.places, library)
-    unknowns, unknown_bounds = unknown_directions(rig.axes, rig.control_hz, signals, exact)
+    unknowns, unknown_bounds = unknown_directions(rig.axes, rig.control_hz, signals, follows)
     bin_rows = segments.rows_together(1.0 / log.rate_hz, BIN_S)
     measured = cut_log(log, rig.dt, signals, horizons)
     simulated = [followed(one, spec) for one in simulate_null_logs(log, spec, null_logs, seed)]
-    nulls = [told_alike(cut_log(one, rig.dt, signals, horizons), measured) for one in simulated]
+    nulls = [told_alike(cut_log(one, rig.dt, signals, horizons), measured, follows) for one in simulated]
     problem = Problem(
-        simulate=_Simulator(plain, plain.layout, signals, ours),
+        simulate=_Simulator(plain, plain.layout, signals, follows),
         system=plain.system,
         values=rig.inner,
         axes=len(rig.axes),

@@ -6,12 +6,13 @@ import jax
 import mujoco
 import numpy as np
 import pytest
-import rigs
 
 from envs import segments
 from envs.following import followed
 from envs.logs import Controller, Log, Run, read, write
 from envs.rig import Rig
+from experiments.discovery.question import build_question
+from tests.rigs import ARM, ARM_JOINTS, Player
 
 UNKNOWN = Controller(kind="unknown", rate_hz=1000.0, gains={})
 FRICTION_NM = 0.25
@@ -19,7 +20,7 @@ FRICTION_NM = 0.25
 
 def recorded(friction_nm=0.0, names=("run_000",)):
     """A log of the arm under computed torques and a PD law, which it does not tell; the elbow may have dry friction."""
-    model = mujoco.MjModel.from_xml_string(rigs.ARM)
+    model = mujoco.MjModel.from_xml_string(ARM)
     model.opt.timestep = 0.0005
     real, ideal = mujoco.MjData(model), mujoco.MjData(model)
     rate = 2 * np.pi * np.array([0.7, 1.1])
@@ -50,19 +51,19 @@ def recorded(friction_nm=0.0, names=("run_000",)):
         )
         for name in names
     ]
-    return Log(robot="arm.xml", base="fixed", rate_hz=500.0, joints=rigs.ARM_JOINTS, policy=None, runs=tuple(runs))
+    return Log(robot="arm.xml", base="fixed", rate_hz=500.0, joints=ARM_JOINTS, policy=None, runs=tuple(runs))
 
 
 @pytest.fixture(scope="module")
 def spec():
-    return mujoco.MjSpec.from_string(rigs.ARM)
+    return mujoco.MjSpec.from_string(ARM)
 
 
 @pytest.fixture(scope="module")
 def needed(spec):
     """Torques that the nominal arm needs, less the measured ones, and measured speeds: [rows, joints] by friction."""
-    rig = Rig(spec, rigs.ARM_JOINTS, UNKNOWN.rate_hz)
-    player, found = rigs.Player(rig), {}
+    rig = Rig(spec, ARM_JOINTS, UNKNOWN.rate_hz)
+    player, found = Player(rig), {}
     for friction in (0.0, FRICTION_NM):
         log = followed(recorded(friction), spec)
         cut = segments.cut(log.runs, 0.1, rig.dt)
@@ -114,7 +115,7 @@ def test_a_known_controller_stays_and_a_mixture_is_refused(spec):
 
 def written(folder, log):
     write(log, folder)
-    (folder / "arm.xml").write_text(rigs.ARM)
+    (folder / "arm.xml").write_text(ARM)
     return folder
 
 
@@ -142,3 +143,16 @@ def test_an_unknown_controller_without_measured_torques_is_refused(tmp_path):
     signals = {"q": run.signals["q"], "target": run.signals["q"], "abs_tau": np.abs(run.signals["tau"])}
     with pytest.raises(ValueError, match=r"run_000.csv.*tau.shoulder'.*unknown controller"):
         read(written(tmp_path, replace(log, runs=(replace(run, signals=signals),))))
+
+
+def test_what_a_controller_does_is_no_question_where_ours_follows(spec):
+    log = recorded(names=tuple(f"run_{number:03d}" for number in range(4)))
+    problem = build_question(log, spec, (0.05, 0.1, 0.2), null_logs=2).problem
+    names = {hypothesis.name for hypothesis in problem.hypotheses}
+    assert {"coulomb", "payload", "encoder_bias", "sensor_delay"} <= names
+    assert not {"command_delay", "gain_error", "deadband", "torque_scale", "torque_limit"} & names
+    for null in problem.null_logs:
+        for own, measured in zip(null["train"].values(), problem.data["train"].values(), strict=True):
+            # Null logs are followed by their own readings, and share the rest.
+            assert np.abs(own.inputs.target - measured.inputs.target).max() > 0
+            assert own.inputs.feed is measured.inputs.feed

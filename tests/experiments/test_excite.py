@@ -391,6 +391,19 @@ def test_a_robot_without_any_gain_follows_no_targets(tmp_path):
         like(tmp_path, [0.0, 0.0])
 
 
+def test_targets_for_an_unknown_controller_are_refused(tmp_path):
+    excite.main(excite.Args(out=tmp_path / "targets", robot=str(ARM), seconds=2.0))
+    log = read(tmp_path / "targets", measured=False)
+    controller = Controller(kind="unknown", rate_hz=500.0, gains={})
+    silent = [
+        replace(run, controller=controller, signals=dict.fromkeys(("q", "tau"), run.signals["target"]))
+        for run in log.runs
+    ]
+    write(replace(log, runs=tuple(silent)), tmp_path / "measured")
+    with pytest.raises(ValueError, match=r"controller\.type: got unknown, expected one that plays targets"):
+        excite.main(excite.Args(out=tmp_path / "next", like=tmp_path / "measured", robot=str(ARM), seconds=2.0))
+
+
 def test_a_built_in_robot_may_stand_for_the_one_of_a_log(tmp_path):
     excite.main(excite.Args(out=tmp_path / "targets", seconds=2.0))
     log = read(tmp_path / "targets", measured=False)

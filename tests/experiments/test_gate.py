@@ -167,6 +167,16 @@ def test_torques_that_were_sent_need_no_gain(good):
     assert any("torques are taken as sent to the motors" in note for note in check(sent, trust=True))
 
 
+def test_torques_beside_an_unknown_controller_were_measured(good):
+    runs = []
+    for run in without(good, "target").runs:
+        controller = replace(run.controller, kind="unknown", gains={})
+        runs.append(replace(run, controller=controller, signals=run.signals | {"tau": run.signals["q"]}))
+    notes = check(replace(good, runs=tuple(runs)), trust=True)
+    assert any("the controller is unknown, so torques that were measured are compared" in note for note in notes)
+    assert not any("taken as sent" in note for note in notes)
+
+
 @pytest.mark.parametrize("name", ["Enabled", "enable", "ENABLED", "enabeled", "volt", "Tau.elbow", "gyro_x"])
 def test_a_name_that_is_nearly_known_is_named(good, name):
     run = without(good, "enabled").runs[0]
