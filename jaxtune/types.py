@@ -273,5 +273,7 @@ class Effect:
     ones, [time, 2, joints]."""
     forms: tuple[Form, ...] = ()
     """Other forms that it may have."""
+    differs: bool = False
+    """True where robots often have it at all joints, in another size at each: no gears rub alike."""
     needs: Literal["", "free", "gravity"] = ""
     """What the log must offer: a robot with a free base, or a recorded gravity vector."""

@@ -103,6 +103,7 @@ ROWS = (
         sizes=(0.004,),
         act=_encoder_bias,
         undo=_undo_bias,
+        differs=True,
         sentence="The encoder's zero differs from the joint's.",
         excited_by="postures on both sides of the vertical at two controller gains",
         **_SENSING,

@@ -209,6 +209,7 @@ ROWS = (
         enters="model",
         parameters=(Parameter(name="kg_m2", scale="inertia", bounds=(-0.5, 5.0), prior=0.3, fields=("dof_armature",)),),
         sizes=(0.03,),
+        differs=True,
         sentence="The rotor's inertia, seen through the gears, differs from the model's.",
         excited_by="a chirp to 10 Hz at two controller gains",
         **_TRANSMISSION,

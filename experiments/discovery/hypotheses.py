@@ -22,7 +22,8 @@ def hypotheses(
     """Lists the hypotheses about a robot, in the order of the library.
 
     An effect at several places has the same physical size at each of them. So a hypothesis has one direction in the
-    rig's coordinates for each parameter, and this direction passes through all its places.
+    rig's coordinates for each parameter, and this direction passes through all its places. What joints often have in
+    sizes of their own (`Effect.differs`) is tried so at all of them as well.
 
     Args:
       axes: coordinates of the rig (the simulator with all effects built in).
@@ -30,9 +31,12 @@ def hypotheses(
       rows: effects that are tried, by name.
     """
     index = {(axis.effect, axis.parameter, axis.place): number for number, axis in enumerate(axes)}
-    return tuple(
-        _hypothesis(axes, index, row, chosen) for row in rows.values() for chosen in place_sets(places[row.on])
-    )
+    found = []
+    for row in rows.values():
+        found += [_hypothesis(axes, index, row, chosen) for chosen in place_sets(places[row.on])]
+        if row.differs and len(places[row.on]) > 1:
+            found.append(_each(axes, index, row, tuple(places[row.on])))
+    return tuple(found)
 
 
 def forms(axes: Sequence[Axis], rows: Mapping[str, Effect], every: Sequence[Hypothesis]) -> tuple[Hypothesis, ...]:
@@ -47,6 +51,8 @@ def forms(axes: Sequence[Axis], rows: Mapping[str, Effect], every: Sequence[Hypo
     return tuple(
         _as_form(_hypothesis(axes, index, rows[form.effect], one.places, form.parameter), one, form)
         for one in every
+        # They are those of the same effect with one size.
+        if not one.each
         for form in rows[one.name].forms
     )
 
@@ -182,6 +188,22 @@ def _hypothesis(
         bounds=bounds,
         prior=np.array([one.prior for one in parameters]),
         joints=tuple(sorted({joint for axis in first for joint in axes[axis].joints[:1]})),
+    )
+
+
+def _each(axes: Sequence[Axis], index: Mapping, row: Effect, places: tuple[str, ...]) -> Hypothesis:
+    """Makes the hypothesis of an effect with one parameter that has a size of its own at each place."""
+    (parameter,) = row.parameters
+    alone = [_hypothesis(axes, index, row, (place,)) for place in places]
+    return replace(
+        alone[0],
+        places=places,
+        directions=np.concatenate([one.directions for one in alone]),
+        probes=row.sizes[0] * np.eye(len(places)),
+        bounds=np.concatenate([one.bounds for one in alone]),
+        prior=np.full(len(places), parameter.prior),
+        joints=tuple(sorted({joint for one in alone for joint in one.joints})),
+        each=True,
     )
 
 

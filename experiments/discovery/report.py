@@ -198,9 +198,10 @@ def place_in_words(question: Question, effect: Mapping) -> str:
 
 
 def brief_keys(question: Question, text: str) -> str:
-    """Puts `all joints` and such in the place of all their names, wherever a text has the keys of hypotheses."""
+    """Puts `all joints` or `each joint` in the place of all their names, wherever a text has the keys of hypotheses."""
     for kind, plural in (("joint", "joints"), ("body", "bodies")):
         every = question.rig.places[kind]
         if len(every) > 1:
             text = text.replace(f"@{'+'.join(every)}", f"@all {plural}")
+            text = text.replace(f"@{'&'.join(every)}", f"@each {kind}")
     return text

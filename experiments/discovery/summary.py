@@ -113,7 +113,7 @@ def _changed(question: Question, result: Result) -> list[AcceptedTerm]:
 
 def _effect(rig: Rig, term: AcceptedTerm, fit: Fit, errors: np.ndarray) -> dict:
     """Describes a fitted effect: physical values with 95 % intervals, and what would distinguish it from its rivals."""
-    hypothesis, parameters = term.hypothesis, {}
+    hypothesis, parameters, places = term.hypothesis, {}, []
     rows = [(part.form, row) for part in (hypothesis, *term.forms) for row in part.directions]
     for form, direction in rows:
         mine = [i for i, free in enumerate(fit.free.directions) if ((free != 0) & (direction != 0)).any()]
@@ -128,13 +128,20 @@ def _effect(rig: Rig, term: AcceptedTerm, fit: Fit, errors: np.ndarray) -> dict:
         low = max(low, 1e-12) if parameter.form == "reciprocal" else low
         ends = np.clip([value - error, value + error], low, high)
         ends = sorted(float(parameter.value(float(end), scale)) for end in ends)
+        name = parameter.name
+        if hypothesis.each and not form:
+            # Only where it is clear of nothing.
+            if abs(value) <= error:
+                continue
+            places.append(axis.place)
+            name = f"{name}.{axis.place}"
         # A delay that is filtered has two times.
-        name = f"{form}.{parameter.name}" if parameter.name in parameters else parameter.name
+        name = f"{form}.{name}" if name in parameters else name
         parameters[name] = {"value": float(parameter.value(value, scale)), "low": ends[0], "high": ends[1]}
     return {
         "name": hypothesis.name,
         "family": hypothesis.family,
-        "places": list(hypothesis.places),
+        "places": places or list(hypothesis.places),
         "parameters": parameters,
         "form": _names(term.forms),
         "confusable_with": list(term.confusable_with),

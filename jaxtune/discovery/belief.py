@@ -40,14 +40,15 @@ def posterior(problem: Problem, at: Floor, candidates: Sequence[Candidate], pric
 def believed(candidates: Sequence[Candidate], probabilities: np.ndarray) -> list[Suspect]:
     """Lists every effect of the candidates with the probability that it is there, most likely first.
 
-    Its forms are those of the most likely model that has it.
+    Its forms are those of the most likely model that has it, as is whether every place has a size of its own.
     """
-    found: dict[str, Suspect] = {}
+    found: dict[tuple[str, tuple[str, ...]], Suspect] = {}
     for index in np.argsort(-probabilities, kind="stable"):
         candidate, probability = candidates[index], float(probabilities[index])
         for hypothesis in candidate.effects:
-            known = found.get(hypothesis.key, Suspect(hypothesis, candidate.forms_of(hypothesis), 0.0))
-            found[hypothesis.key] = replace(known, probability=known.probability + probability)
+            key = hypothesis.name, hypothesis.places
+            known = found.get(key, Suspect(hypothesis, candidate.forms_of(hypothesis), 0.0))
+            found[key] = replace(known, probability=known.probability + probability)
     return sorted(found.values(), key=lambda one: -one.probability)
 
 

@@ -42,7 +42,7 @@ class Candidate:
 
     def price(self, of_effect: float) -> float:
         """Returns what its hypotheses cost; a form costs half, as there are few to choose from."""
-        return of_effect * (len(self.hypotheses) + len(self.effects)) / 2
+        return of_effect * sum(hypothesis.worth for hypothesis in self.hypotheses)
 
 
 def key_of(hypotheses: Sequence[Hypothesis]) -> str:

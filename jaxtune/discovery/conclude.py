@@ -13,7 +13,7 @@ from jaxtune.discovery.evidence import Thresholds, passes, weigh_evidence
 from jaxtune.discovery.fit import Fit, begin, polish, refine
 from jaxtune.discovery.naming import at_fewest_places, moved_forms, renamed, with_refinements
 from jaxtune.discovery.noise_floor import Floor, NoiseFloor, Say
-from jaxtune.discovery.problem import Problem
+from jaxtune.discovery.problem import Hypothesis, Problem
 from jaxtune.discovery.resample import standard_errors
 from jaxtune.discovery.result import AcceptedTerm, DroppedTerm, Settings, Suspect
 from jaxtune.discovery.shares import energy, explained, explained_shares, open_gaps, speak
@@ -185,16 +185,19 @@ def _proved(
 ) -> tuple[Candidate, tuple[AcceptedTerm, ...], dict[str, np.ndarray], tuple[DroppedTerm, ...]]:
     """The cheapest model without the effects that do not pass, which are taken out one by one, the weakest first."""
     at, dropped = floor[problem.main_horizon], []
+
+    def of_effect(effect: Hypothesis) -> Thresholds:
+        return Thresholds(state.price * effect.worth)
+
     (fit,) = polish([state.best.fit], at.residuals["train"], 0)
     best = replace(state.best, fit=fit)
-    of_effect = Thresholds(state.price)
     # Much of what forms are about ends at its bounds: friction can be all at the motor, a limit as soft as it gets.
     of_form = Thresholds(0.5 * state.price, floors=0.0, of_left=0.0, inside=False, horizons=1, size=0.0)
     fitted = {one.key: one for one in state.candidates}
     while True:
         weighed = {h.key: (h, *weigh_evidence(problem, floor, best, h, fitted)) for h in best.hypotheses}
         failed = {
-            key: tuple(n for n, passed in passes(evidence, of_form if h.form else of_effect).items() if not passed)
+            key: tuple(n for n, passed in passes(evidence, of_form if h.form else of_effect(h)).items() if not passed)
             for key, (h, evidence, _) in weighed.items()
         }
         wrong = [key for key, tests in failed.items() if tests]
@@ -211,7 +214,7 @@ def _proved(
         best = replace(best, fit=fit)
     # What explains most is named first.
     ranked = sorted((row for row in weighed.values() if not row[0].form), key=lambda row: -row[1].gain)
-    terms = tuple(AcceptedTerm(h, evidence, of_effect, forms=best.forms_of(h)) for h, evidence, _ in ranked)
+    terms = tuple(AcceptedTerm(h, evidence, of_effect(h), forms=best.forms_of(h)) for h, evidence, _ in ranked)
     return best, terms, {h.key: ablated.fit.vector for h, _, ablated in ranked}, tuple(dropped)
 
 

@@ -55,7 +55,8 @@ def _keys(group: Group) -> list[_Key]:
     if not forms:
         return [(int(axis),) for axis in np.flatnonzero((hypothesis.directions != 0).any(axis=0))]
     # Places are in the same order on the axes of every effect.
-    return list(zip(*(np.flatnonzero(one.directions[0]).tolist() for one in group), strict=True))
+    axes = [np.flatnonzero(one.directions[: 1 + one.more_sizes].any(axis=0)).tolist() for one in group]
+    return list(zip(*axes, strict=True))
 
 
 @dataclass(frozen=True)

@@ -44,7 +44,7 @@ class Evidence:
     interval: tuple[float, float]
     """95 % interval of the coordinate that is clearest of zero."""
     inside: bool
-    """True if all coordinates are inside their bounds."""
+    """True if all coordinates are inside their bounds, or zero."""
     horizons: int
     """Number of horizons at which `train` and `select` cost less with it, prior included."""
     size: float
@@ -116,7 +116,8 @@ def weigh_evidence(
             float(values[clearest] - 1.96 * errors[clearest]),
             float(values[clearest] + 1.96 * errors[clearest]),
         ),
-        inside=bool(((low < values) & (values < high)).all()),
+        # Of several places one may have nothing of it.
+        inside=bool((((low < values) & (values < high)) | (values == 0.0)).all()),
         horizons=_horizons_better(floor, candidate.fit, ablated.fit),
         size=_in_smallest(values, hypothesis.probes),
     )

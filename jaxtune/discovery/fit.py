@@ -257,9 +257,9 @@ def taken_over(free: Free, hypothesis: Hypothesis) -> np.ndarray:
     prior, and beside it the old coordinate would be the same direction twice. Only a hypothesis with a single parameter
     can be a nominal one.
     """
-    if len(hypothesis.directions) > 1:
+    if len(hypothesis.directions) > 1 and not hypothesis.each:
         return np.zeros(len(free.sd), bool)
-    mine = hypothesis.directions[0] != 0
+    mine = hypothesis.directions.any(axis=0)
     within = np.array([not (direction[~mine] != 0).any() for direction in free.directions])
     return within & free.nominal
 

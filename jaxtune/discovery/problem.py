@@ -22,7 +22,7 @@ inputs are padded to the longest segment; rows after the last step may hold anyt
 
 @dataclass(frozen=True, kw_only=True)
 class Hypothesis:
-    """One effect at one or several places, with the same size at each of them.
+    """One effect at one or several places, with the same size at each of them or (`each`) one of its own.
 
     A hypothesis has a coordinate for each parameter of the effect. With coordinates `c`, the model that has the effect
     is the nominal vector plus `c @ directions`. Discovery screens, fits and compares hypotheses, and an accepted one is
@@ -51,14 +51,26 @@ class Hypothesis:
     frees one parameter more, is tried only beside the effect, and is no name of its own."""
     screened: bool = False
     """True for a form without which its effect may not be seen: the screen tries both together as well."""
+    each: bool = False
+    """True where every place has a size of its own: `directions` has a row for each."""
 
     @property
     def key(self) -> str:
         """Name and places as one word, such as `coulomb@elbow`; it identifies the hypothesis in messages and files.
 
-        A form's is such as `coulomb(presliding)@elbow`.
+        A form's is such as `coulomb(presliding)@elbow`, and one with a size for each place `coulomb@shoulder&elbow`.
         """
-        return f"{self.name}{f'({self.form})' if self.form else ''}@{'+'.join(self.places)}"
+        return f"{self.name}{f'({self.form})' if self.form else ''}@{('&' if self.each else '+').join(self.places)}"
+
+    @property
+    def more_sizes(self) -> int:
+        """How many sizes it has beyond the first."""
+        return len(self.places) - 1 if self.each else 0
+
+    @property
+    def worth(self) -> float:
+        """How many prices it costs: one of an effect, half of one for a form and for every further size."""
+        return (0.5 if self.form else 1.0) + 0.5 * self.more_sizes
 
     def shapes(self, other: "Hypothesis") -> bool:
         """Says whether this is a form of another hypothesis."""

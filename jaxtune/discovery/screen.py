@@ -35,7 +35,7 @@ class Lead:
     start: np.ndarray
     """[coordinates] at which what is free in the model answers them."""
     cost: float
-    """What the model with them would cost on the screened segments."""
+    """What the model with them would cost on the screened segments, with half a price for every further size."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,9 @@ class Screen:
     """What the model costs as it is, on the screened segments."""
 
 
-def promising(at: Floor, base: Fit, groups: Sequence[Group], library: Library, count: int) -> list[Hypothesis]:
+def promising(
+    at: Floor, base: Fit, groups: Sequence[Group], library: Library, price: float, count: int
+) -> list[Hypothesis]:
     """Picks the hypotheses that would lower the cost of a model most, if it changed as the nominal model does.
 
     Args:
@@ -58,11 +60,12 @@ def promising(at: Floor, base: Fit, groups: Sequence[Group], library: Library, c
       base: the model, with slopes of all that is free in it.
       groups: of which to pick.
       library: of the nominal model.
+      price: of an effect.
       count: how many.
     """
     some = on_segments(at, base, library.segments)
     profile = profile_of(some, library.curves.changes, _shares(at, base, library.segments))
-    leads = _once([_best(profile, group, library.curves) for group in groups])
+    leads = _once([_best(profile, group, library.curves, price) for group in groups])
     return [lead.hypotheses[0] for lead in leads[:count]]
 
 
@@ -123,6 +126,7 @@ def screen(
     base: Fit,
     groups: Sequence[Group],
     *,
+    price: float,
     fitted: Fit | None = None,
     pairs: int,
     library: Library | None = None,
@@ -134,6 +138,7 @@ def screen(
       at: the floor at the main horizon.
       base: the model, fitted or nominal, with slopes of all that is free in it.
       groups: what may join it.
+      price: of an effect, which further sizes of one cost half of.
       fitted: the same model fitted, which tells how far each segment counts; None where the model is fitted itself.
       pairs: how many of the best hypotheses are tried with every other one.
       library: how the axes change this very model, where that is known.
@@ -144,10 +149,10 @@ def screen(
     some = on_segments(at, base, chosen)
     say("answers of the nominal parameters")
     profile = profile_of(some, curves.changes, _shares(at, fitted or base, chosen))
-    firsts = _once([_best(profile, group, curves) for group in groups])
+    firsts = _once([_best(profile, group, curves, price) for group in groups])
     # Partners come in the form in which they alone are best.
     partners = [lead.hypotheses for lead in firsts]
-    couples = [pair for lead in firsts[:pairs] for pair in _pairs_with(profile, lead, partners, curves)]
+    couples = [pair for lead in firsts[:pairs] for pair in _pairs_with(profile, lead, partners, curves, price)]
     firsts, couples = (tuple(_freed(base.free, lead) for lead in leads) for leads in (firsts, _once(couples)))
     return Screen(firsts, couples, _cost_now(profile))
 
@@ -192,32 +197,39 @@ def _freed(free: Free, lead: Lead) -> Lead:
 
 
 def _best(
-    profile: Profile, group: Group, curves: Curves, points: np.ndarray | None = None, reweighted: int = 4
+    profile: Profile,
+    group: Group,
+    curves: Curves,
+    price: float,
+    points: np.ndarray | None = None,
+    reweighted: int = 4,
 ) -> Lead:
     """The point, of some or of all that are worth a look, at which a group costs least beside a model."""
     points = _points(profile, group, curves) if points is None else points
     costs, starts = profile.costs(curves.at(group, points), reweighted)
-    costs = costs + _of_sizes(points, group)
+    costs = costs + _of_sizes(points, group, price)
     best = int(np.argmin(costs))
     return Lead(group, points[best], starts[best], float(costs[best]))
 
 
-def _of_sizes(points: np.ndarray, group: Group) -> np.ndarray:
-    """What the prior says against points [..., parameters] of a group, [...]."""
-    return of_size(points / np.concatenate([one.prior for one in group])).sum(axis=-1)
+def _of_sizes(points: np.ndarray, group: Group, price: float) -> np.ndarray:
+    """What the prior says against points [..., parameters] of a group and the price of its further sizes, [...]."""
+    further = 0.5 * price * sum(one.more_sizes for one in group)
+    return of_size(points / np.concatenate([one.prior for one in group])).sum(axis=-1) + further
 
 
 def _points(profile: Profile, group: Group, curves: Curves) -> np.ndarray:
     """Points [n, parameters] at which a group is answered: between its sizes, or where its slopes lead to."""
-    (hypothesis, *_), probes = group, probes_of(group)
+    (hypothesis, *forms), probes = group, probes_of(group)
     several = np.count_nonzero((hypothesis.probes != 0).any(axis=0)) > 1
     if several:
-        sizes, changes = np.abs(probes).max(axis=1)[:, None], curves.at(group, probes)
+        own, changes = hypothesis.probes, curves.at(group, probes)
+        sizes = np.abs(own).max(axis=1)[:, None]
         directions = replace(changes, weights=changes.weights / sizes)
         nothing = Changes(np.zeros(0, int), np.zeros((1, 0)))
         _, at = profile.with_directions(directions).costs(nothing)
-        wanted = at[:, len(profile.offset) :] @ (probes / sizes)
-        return np.clip(wanted, *hypothesis.bounds.T)
+        wanted = np.clip(at[:, len(profile.offset) :] @ (own / sizes), *hypothesis.bounds.T)
+        return np.concatenate([wanted, *(form.probes[:1] for form in forms)], axis=1)
     sizes = np.array(sorted([0.0, *probes[:, 0]]))
     between = [a + share * (b - a) for a, b in pairwise(sizes) for share in _BETWEEN]
     points = np.tile(probes[0], (len(between), 1))
@@ -225,7 +237,7 @@ def _points(profile: Profile, group: Group, curves: Curves) -> np.ndarray:
     return points[points[:, 0] != 0]
 
 
-def _pairs_with(profile: Profile, lead: Lead, groups: Sequence[Group], curves: Curves) -> list[Lead]:
+def _pairs_with(profile: Profile, lead: Lead, groups: Sequence[Group], curves: Curves, price: float) -> list[Lead]:
     """The best partners of a lead, whose size may still change a little."""
     first = lead.hypotheses
     change, further = curves.at(first, lead.point[None]), curves.at(first, 1.1 * lead.point[None])
@@ -233,10 +245,10 @@ def _pairs_with(profile: Profile, lead: Lead, groups: Sequence[Group], curves: C
     if (further.weights != change.weights).any():
         beside = beside.with_directions(replace(further, weights=further.weights - change.weights))
     others = [other for other in groups if all(are_distinct(one, two) for one in first for two in other)]
-    rough = sorted(others, key=lambda other: _best(beside, other, curves, probes_of(other), _ROUGH).cost)
+    rough = sorted(others, key=lambda other: _best(beside, other, curves, price, probes_of(other), _ROUGH).cost)
     found = []
-    for best in (_best(beside, other, curves) for other in rough[: 3 * _PARTNERS]):
+    for best in (_best(beside, other, curves, price) for other in rough[: 3 * _PARTNERS]):
         point, start = np.concatenate([lead.point, best.point]), best.start[: len(profile.offset)]
-        cost = best.cost + float(_of_sizes(lead.point, first))
+        cost = best.cost + float(_of_sizes(lead.point, first, price))
         found.append(Lead((*first, *best.hypotheses), point, start, cost))
     return _once(found)[:_PARTNERS]

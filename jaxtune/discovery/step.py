@@ -81,12 +81,12 @@ def step(
     # A form may be another one of an effect that is there.
     forms = [form for form in problem.forms if all(are_distinct(form, other) for other in base.hypotheses)]
     if state.screened:
-        found = screen(at, base.fit, _again(settings, at, base.fit, free, forms, library), pairs=0, say=say)
+        again = _again(settings, at, base.fit, free, forms, library, state.price)
+        found = screen(at, base.fit, again, price=state.price, pairs=0, say=say)
     else:
-        found = screen(
-            at, base.fit, groups_of(free, forms), fitted=fit, pairs=settings.firsts, library=library, say=say
-        )
         state = state.with_seen(settings, problem, *seen(at, state.nominal, every, library))
+        groups, how = groups_of(free, forms), {"price": state.price, "pairs": settings.firsts}
+        found = screen(at, base.fit, groups, fitted=fit, library=library, say=say, **how)
     leads = shortlist(settings, found, state.price)
     leads = leads[: settings.swaps] if swapping else leads + shaped(_unfree(problem, at), free, leads, settings.shaped)
     if base.fit is state.nominal:
@@ -143,11 +143,12 @@ def _again(
     free: Sequence[Hypothesis],
     forms: Sequence[Hypothesis],
     library: Library,
+    price: float,
 ) -> list[Group]:
     """Picks what is screened again beside a model that has effects: all forms of these, and the other effects that
     would lower its cost most if they changed it as they change the nominal model."""
     own, effects = ([h for h in free if bool(h.form) == shaping] for shaping in (True, False))
-    more = promising(at, base, groups_of(effects, forms), library, settings.again) if effects else []
+    more = promising(at, base, groups_of(effects, forms), library, price, settings.again) if effects else []
     return groups_of([*own, *more], forms)
 
 

@@ -185,7 +185,7 @@ def test_a_size_at_two_places_is_the_same_physical_size(spec, plain):
     rig = Rig(spec, JOINTS, 1000.0)
     rig = rig.scaled(measure_scales(rig, plain.runs))
     rows = {name: rig.effects[name] for name in ("coulomb", "torque_limit", "torque_scale")}
-    for hypothesis in hypotheses(rig.axes, rig.places, rows):
+    for hypothesis in (one for one in hypotheses(rig.axes, rig.places, rows) if not one.each):
         row = rig.effects[hypothesis.name]
         # A form's parameter is not among its directions.
         parameter, (direction,) = row.parameters[0], hypothesis.directions
@@ -198,6 +198,22 @@ def test_a_size_at_two_places_is_the_same_physical_size(spec, plain):
         np.testing.assert_allclose(values, values[0], rtol=1e-5)
 
 
+def test_what_joints_have_in_sizes_of_their_own_is_tried_so(spec, plain):
+    from envs.rig import Rig
+
+    rig = Rig(spec, JOINTS, 1000.0)
+    rig = rig.scaled(measure_scales(rig, plain.runs))
+    rows = {name: rig.effects[name] for name in ("coulomb", "command_delay")}
+    (each,) = [one for one in hypotheses(rig.axes, rig.places, rows) if one.each]
+    assert (each.key, each.joints) == ("coulomb@shoulder&elbow", (0, 1))
+    alone = {one.key: one for one in hypotheses(rig.axes, rig.places, rows) if len(one.places) == 1}
+    for row, place in enumerate(JOINTS):
+        one = alone[f"coulomb@{place}"]
+        np.testing.assert_array_equal(each.directions[row], one.directions[0])
+        np.testing.assert_array_equal(each.bounds[row], one.bounds[0])
+        assert np.abs(one.probes).min() == each.probes[row, row]
+
+
 def test_no_place_loses_more_than_it_has(spec):
     """Armatures of 0.1 and 0.01 at once: coordinates are in the unit of the first."""
     from envs.rig import Rig
@@ -207,7 +223,7 @@ def test_no_place_loses_more_than_it_has(spec):
         spec.joint(name).armature = armature
     rig = Rig(spec, JOINTS, 1000.0).scaled({"inertia": np.array([0.25, 0.08])})
     rows = {"armature": rig.effects["armature"]}
-    (both,) = [one for one in hypotheses(rig.axes, rig.places, rows) if len(one.places) == 2]
+    (both,) = [one for one in hypotheses(rig.axes, rig.places, rows) if len(one.places) == 2 and not one.each]
     vector = (both.bounds[:, 0] @ both.directions).astype(np.float32)
     left = np.asarray(rig.model(rig.values(rig.tree(vector))).dof_armature)
     assert (left > 0).all()
@@ -281,7 +297,8 @@ def test_every_form_moves_the_axes_of_its_parameter_at_the_places_of_its_effect(
     found = forms(rig.axes, rig.effects, every)
     assert {(one.name, one.form) for one in found} >= {("coulomb", "presliding"), ("torque_limit", "soft")}
     for one in found:
-        (parent,) = [other for other in every if one.shapes(other)]
+        parent, *others = [other for other in every if one.shapes(other)]
+        assert all(other.each for other in others)
         (mine,) = [form for form in LIBRARY[one.name].forms if form.name == one.form]
         parameters = [mine.parameter] if mine.parameter else [p.name for p in rig.effects[mine.effect].parameters]
         for parameter, direction in zip(parameters, one.directions, strict=True):

@@ -15,7 +15,7 @@ from experiments.discovery.blind_cases import ARM
 from experiments.discovery.blind_robots import Truth, record
 from experiments.discovery.excitation import excitation
 from experiments.discovery.question import build_question
-from experiments.discovery.summary import _far_off, details, free_runs, summarise
+from experiments.discovery.summary import _effect, _far_off, details, free_runs, summarise
 from jaxtune.discovery.evidence import Evidence, Thresholds, passes
 from jaxtune.discovery.fit import Fit, Free
 from jaxtune.discovery.result import AcceptedTerm, DroppedTerm, Result, Suspect
@@ -204,3 +204,16 @@ def test_a_name_that_leaves_much_is_doubted(verdict, left, doubted):
 
 def test_every_test_that_an_effect_may_fail_has_words():
     assert set(report.FAILED) == set(passes(EVIDENCE, Thresholds(10.0)))
+
+
+def test_an_effect_with_a_size_for_each_place_is_told_of_those_that_are_clear(asked):
+    _, question = asked
+    (each,) = [one for one in question.problem.hypotheses if one.key == "coulomb@shoulder&elbow"]
+    free = Free(each.directions, np.ones(2), each.bounds, np.zeros(2, bool))
+    fit = Fit(free, np.array([0.01, 0.5]), np.zeros(0), np.zeros((0, 2)), None)
+    effect = _effect(question.rig, AcceptedTerm(each, EVIDENCE, Thresholds(10.0)), fit, np.array([0.02, 0.02]))
+    assert effect["places"] == ["elbow"]
+    assert list(effect["parameters"]) == ["torque_nm.elbow"]
+    size = effect["parameters"]["torque_nm.elbow"]
+    assert size["low"] < size["value"] < size["high"]
+    assert report.brief_keys(question, f"beside {each.key}") == "beside coulomb@each joint"

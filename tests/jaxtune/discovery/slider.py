@@ -61,6 +61,20 @@ HYPOTHESES = (
 WILD = hypothesis("wild", (0.0, 1.0), [0.1], "external")
 
 
+# Friction and a push stand for one effect at two places, which may have one size or a size each.
+ROWS = np.array([[float(axis == name) for axis in AXES] for name in ("coulomb", "push")])
+ONE_SIZE = replace(HYPOTHESES[2], name="both", places=("one", "two"), directions=ROWS.sum(axis=0, keepdims=True))
+EACH = replace(
+    ONE_SIZE,
+    directions=ROWS,
+    probes=0.2 * np.eye(2),
+    bounds=np.concatenate([HYPOTHESES[2].bounds, HYPOTHESES[3].bounds]),
+    prior=np.ones(2),
+    each=True,
+)
+BOTH = (*HYPOTHESES[:2], ONE_SIZE, EACH)
+
+
 def measured(truth, seed, split=0, count=40, motion=None):
     """Segments by horizon: the truth's motion with noise, from states that are known to within the noise."""
     rng, moved = np.random.default_rng((seed, 1)), np.random.default_rng(seed if motion is None else motion)

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from slider import AXES, HELD, HYPOTHESES, problem
+from slider import AXES, EACH, HELD, HYPOTHESES, ONE_SIZE, problem
 
 from jaxtune.discovery import fit, noise_floor, state
 from jaxtune.discovery.curves import groups_of, simulate_library
@@ -14,13 +14,13 @@ from jaxtune.discovery.profile import Changes, profile_of
 from jaxtune.discovery.screen import _smallest, promising, screen
 
 
-def screened(truth, pairs=0, forms=(), unknowns=None):
-    asked = problem(truth, forms=forms)
+def screened(truth, pairs=0, forms=(), unknowns=None, hypotheses=HYPOTHESES):
+    asked = problem(truth, forms=forms, hypotheses=hypotheses)
     if unknowns is not None:
         asked = replace(asked, unknowns=unknowns, unknown_bounds=np.tile([0.0, 2.0], (len(unknowns), 1)))
     floor, begun = state.begin(asked, noise_floor.measure(asked, lambda text: None))
     at = floor[asked.main_horizon]
-    return screen(at, begun.nominal, groups_of(HYPOTHESES, forms), pairs=pairs, say=lambda text: None)
+    return screen(at, begun.nominal, groups_of(hypotheses, forms), price=10.0, pairs=pairs, say=lambda text: None)
 
 
 def test_the_best_lead_is_what_is_hidden_at_about_its_size():
@@ -45,6 +45,19 @@ def test_an_effect_that_shows_in_one_form_alone_is_screened_in_that_form():
     assert len(screened({"coulomb": 0.6}, forms=(HELD,)).leads[0].hypotheses) == 1
 
 
+def test_sizes_of_their_own_are_screened_in_a_form_too():
+    # Damping, which nothing holds, and friction.
+    rows = np.concatenate([HYPOTHESES[1].directions, HYPOTHESES[2].directions])
+    bounds = np.concatenate([HYPOTHESES[1].bounds, HYPOTHESES[2].bounds])
+    each = replace(EACH, directions=rows, bounds=bounds)
+    one_size = replace(ONE_SIZE, directions=rows.sum(axis=0, keepdims=True), bounds=bounds[1:])
+    held = replace(HELD, name="both", places=EACH.places, directions=HELD.directions + HYPOTHESES[4].directions)
+    truth = {"damping": 1.0, "coulomb": 0.6, "held": 0.5}
+    lead = screened(truth, forms=(held,), hypotheses=(one_size, each)).leads[0]
+    assert [one.key for one in lead.hypotheses] == ["both@one&two", "both(held)@one+two"]
+    np.testing.assert_allclose(lead.point, [1.0, 0.6, 0.5], rtol=0.4)
+
+
 def test_a_form_that_is_free_anyway_is_where_a_lead_begins():
     lead = screened({"coulomb": 0.6, "held": 0.5}, forms=(HELD,), unknowns=0.25 * HELD.directions).leads[0]
     assert [one.key for one in lead.hypotheses] == ["coulomb@slider"]
@@ -65,8 +78,8 @@ def test_the_changes_of_the_nominal_model_find_what_to_screen_beside_another_mod
     base = fit.begin(begun.nominal, [(coulomb,)], [np.array([0.8])], [begun.nominal.coordinates], at.residuals["train"])
     library = simulate_library(at, begun.nominal, groups_of(HYPOTHESES, ()), lambda text: None)
     others = groups_of([h for h in HYPOTHESES if h is not coulomb], ())
-    assert [h.name for h in promising(at, base[0], others, library, 1)] == ["push"]
-    assert len(promising(at, base[0], others, library, 3)) == 3
+    assert [h.name for h in promising(at, base[0], others, library, 10.0, 1)] == ["push"]
+    assert len(promising(at, base[0], others, library, 10.0, 3)) == 3
 
 
 EVEN = np.ones((1, 2))

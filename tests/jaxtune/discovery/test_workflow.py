@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from slider import AXES, DIRECTION, HYPOTHESES, LEARNED, WARPED, WILD, problem
+from slider import AXES, BOTH, DIRECTION, EACH, HYPOTHESES, LEARNED, ONE_SIZE, WARPED, WILD, problem
 
 from jaxtune.discovery import noise_floor, state, step, workflow
 from jaxtune.discovery.candidate import Candidate
@@ -74,6 +74,23 @@ def test_the_bar_moves_in_every_further_step():
     assert shares == sorted(set(shares))
     assert shares[-1] < workflow._STAGES["evidence"]
     assert workflow.share_done(["4602.3 before"]) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("sizes", "key"), [((0.6, 0.6), "both@one+two"), ((0.9, -0.5), "both@one&two"), ((0.0, 0.7), "both@one&two")]
+)
+def test_places_have_sizes_of_their_own_only_where_they_differ(sizes, key):
+    result = discover(dict(zip(("coulomb", "push"), sizes, strict=True)), hypotheses=BOTH)
+    assert result.verdict == "named"
+    assert [term.hypothesis.key for term in result.terms] == [key]
+    np.testing.assert_allclose(sizes, result.fit.vector[[AXES.index(name) for name in ("coulomb", "push")]], atol=0.03)
+    # Both are one suspect.
+    assert [one.hypothesis.name for one in result.suspects].count("both") == 1
+
+
+def test_a_model_pays_for_every_further_size():
+    assert (ONE_SIZE.worth, EACH.worth, replace(EACH, places=tuple("abcde")).worth) == (1.0, 1.5, 3.0)
+    assert replace(DIRECTION).worth == 0.5
 
 
 def test_two_effects_are_named_one_after_the_other():
