@@ -62,9 +62,6 @@ def main(args: Args) -> None:
     sysid_parameters.package()
     _check(args)
     log, spec = read_logs(args.logs, robot=args.robot)
-    for one in log.runs:
-        if "target" not in one.signals:
-            raise ValueError(f"{one.name}: column 'target.{log.joints[0]}': is missing, which the actuators need")
     begin = time.perf_counter()
     bench = Bench(log, sysid_parameters.robot_of(spec, log))
     with bars() as progress:

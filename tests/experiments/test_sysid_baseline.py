@@ -171,14 +171,3 @@ def test_parameters_of_a_passive_joint_have_a_unit():
     np.testing.assert_allclose(robot.stiffness, 3.0)
     for kind in ("armature", "damping", "friction"):
         assert sysid_parameters._unit(robot, robot.spec.compile(), 1, kind) > 0
-
-
-@needs_sysid
-def test_a_log_without_targets_is_refused(tmp_path):
-    log = pendulum()
-    runs = [replace(run, signals=run.signals | {"tau": run.signals["q"]}) for run in log.runs]
-    for run in runs:
-        del run.signals["target"]
-    write(replace(log, runs=tuple(runs)), tmp_path / "log")
-    with pytest.raises(ValueError, match=r"column 'target.hinge': is missing"):
-        sysid_baseline.main(sysid_baseline.Args(logs=(tmp_path / "log",), out=tmp_path / "out.json"))
