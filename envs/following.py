@@ -14,13 +14,22 @@ import numpy as np
 from envs.logs import Log, Run
 from envs.models import suspended
 from envs.smoothing import smoothed
+from jaxtune.types import Effect
 
 # How fast it settles: within a fifth of the shortest segments, and stable with ten steps of 1 ms in its period.
 _FOLLOW_RAD_S = 150.0
 _POSES = 20
 
-OF_CONTROLLER = ("command", "error", "speed", "torque")
-"""What effects enter (`jaxtune.types.Effect.enters`) that stand between targets and the torques at the joints."""
+_OF_CONTROLLER = ("command", "error", "speed", "torque")
+_OF_SENSORS = ("constant_push",)  # the offset of a torque sensor looks like it
+
+
+def tells(effect: Effect) -> bool:
+    """Whether a log of an unknown controller can tell of an effect.
+
+    It cannot of those that stand between targets and torques, nor of those that are as a torque sensor's own error.
+    """
+    return effect.enters not in _OF_CONTROLLER and effect.name not in _OF_SENSORS
 
 
 def followed(log: Log, spec: mujoco.MjSpec) -> Log:

@@ -13,6 +13,7 @@ from jaxtune.types import Effect, Form, Parameter
 _LARGE = 0.7  # of the bounds: the largest size that is screened
 _TRAVEL_RAD, _MOST_TRAVELS = 0.002, 5.0  # over which dry friction sets in, and how many of these at most
 _TORQUE_SHARE, _MOST_SHARES = 0.2, 3.0  # by which recorded torques are off, and how many of these at most
+_OFFSET = 0.2  # of a torque sensor, in rms torques, and as many of these at most
 _BENT, _STRAIGHT = 6, 3  # sizes of an effect without a slope at zero, and of one with
 
 
@@ -115,7 +116,7 @@ def unknown_directions(
       control_hz: rate of the controller in Hz.
       signals: that are compared.
       follows: whether the controller is one that follows measured motion (`envs.following`), of which all is known.
-        What it asks for was measured, so joints get an unknown share of that.
+        What it asks for was measured, by sensors of unknown scale and offset.
 
     Returns:
       [unknowns, axes] of the size of half a period, of half of the way between rows, of a typical travel, or of a
@@ -132,6 +133,7 @@ def unknown_directions(
     for effect, size, bounds, places in (
         ("presliding", _TRAVEL_RAD, (0.0, _MOST_TRAVELS), rubbing),
         ("torque_scale" if follows else "torque_reading", _TORQUE_SHARE, (-_MOST_SHARES, _MOST_SHARES), recorded),
+        ("constant_push", _OFFSET, (-_MOST_SHARES, _MOST_SHARES), recorded if follows else set()),
     ):
         mine = [number for number, axis in enumerate(axes) if axis.effect == effect and axis.place in places]
         found += [(size * np.eye(len(axes))[number], bounds) for number in mine]

@@ -9,7 +9,7 @@ import numpy as np
 
 from envs import readings, segments
 from envs.effects import LEARNED, LIBRARY
-from envs.following import OF_CONTROLLER, followed
+from envs.following import followed, tells
 from envs.logs import Log, Run, splits, with_splits
 from envs.null_logs import simulate_null_logs
 from envs.regimes import REGIMES
@@ -91,10 +91,9 @@ def build_question(
     rig = plain.scaled(measure_scales(plain, unsealed))
     signals, partly = _compared(log)
     axes = {(axis.effect, axis.place): number for number, axis in enumerate(rig.axes)}
-    # Of a controller of our own all is known.
     follows = log.runs[0].controller.kind == "unknown"
-    exact = {name for name, row in rig.effects.items() if follows and row.enters in OF_CONTROLLER}
-    library = {name: row for name, row in rig.effects.items() if name in LIBRARY and name not in exact}
+    told = {name for name, row in rig.effects.items() if not follows or tells(row)}
+    library = {name: row for name, row in rig.effects.items() if name in LIBRARY and name in told}
     every = hypotheses(rig.axes, rig.places, library)
     unknowns, unknown_bounds = unknown_directions(rig.axes, rig.control_hz, signals, follows)
     bin_rows = segments.rows_together(1.0 / log.rate_hz, BIN_S)
@@ -107,7 +106,7 @@ def build_question(
         values=rig.inner,
         axes=len(rig.axes),
         hypotheses=every,
-        prior=np.array([0.0 if axis.effect in exact else axis.prior_sd for axis in rig.axes]),
+        prior=np.array([axis.prior_sd if axis.effect in told else 0.0 for axis in rig.axes]),
         unknowns=unknowns,
         unknown_bounds=unknown_bounds,
         trees=rig.trees,

@@ -43,7 +43,8 @@ def summarise(question: Question, log: Log, folder: Path, result: Result) -> dic
             changes.append(effect)
         else:
             effects.append(effect)
-    not_there = [name for name in LIBRARY if name not in question.rig.effects]
+    asked = {hypothesis.name for hypothesis in question.problem.hypotheses}
+    not_there = [name for name in LIBRARY if name not in asked]
     return {
         "verdict": result.verdict,
         "effects": effects,

@@ -150,7 +150,14 @@ def test_what_a_controller_does_is_no_question_where_ours_follows(spec):
     problem = build_question(log, spec, (0.05, 0.1, 0.2), null_logs=2).problem
     names = {hypothesis.name for hypothesis in problem.hypotheses}
     assert {"coulomb", "payload", "encoder_bias", "sensor_delay"} <= names
-    assert not {"command_delay", "gain_error", "deadband", "torque_scale", "torque_limit"} & names
+    assert not {"command_delay", "gain_error", "deadband", "torque_scale", "torque_limit", "constant_push"} & names
+    # Scales and offsets of the torque sensors are free, and gains of our own controller are known.
+    free = {axis: np.abs(problem.unknowns).sum(axis=0)[axis] for axis in range(problem.axes)}
+    rig = Rig(spec, ARM_JOINTS, UNKNOWN.rate_hz)
+    of = {(axis.effect, axis.place): number for number, axis in enumerate(rig.axes)}
+    for name in ("torque_scale", "constant_push"):
+        assert all(free[of[name, joint]] > 0 for joint in ARM_JOINTS)
+    assert problem.prior[of["gain_error", "elbow"]] == 0 < problem.prior[of["armature", "elbow"]]
     for null in problem.null_logs:
         for own, measured in zip(null["train"].values(), problem.data["train"].values(), strict=True):
             # Null logs are followed by their own readings, and share the rest.
