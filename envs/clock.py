@@ -40,14 +40,15 @@ def clock_of(run: Run, dt: float) -> Clock:
 
     Rows that are a whole number of ticks apart go with the ticks, and only their stamps jitter. These are put on a line
     then, since a row that seems a little late would miss its tick. Rows that are not, or are off the line by half a
-    tick and more, have what their stamps say.
+    tick and more, have what their stamps say. So have those of an unknown controller, whose targets follow from
+    readings (`envs.following`).
 
     Args:
       run: the run.
       dt: step of the simulation in s; ticks are whole steps apart.
     """
     rate_hz, (even, row_s) = run.controller.rate_hz, _line(run.time)
-    ticks = round(row_s * rate_hz)
+    ticks = 0 if run.controller.kind == "unknown" else round(row_s * rate_hz)
     if ticks >= 1 and abs(row_s * rate_hz / ticks - 1.0) < _WHOLE and _off(run.time, even) < 0.5 / rate_hz:
         # The line's slope is not exact either.
         return Clock(even, ticks / row_s, 0.25 * dt)

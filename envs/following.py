@@ -11,7 +11,7 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 
-from envs.logs import Log, Run
+from envs.logs import Controller, Log, Run
 from envs.models import suspended
 from envs.smoothing import smoothed
 from jaxtune.types import Effect
@@ -20,8 +20,10 @@ from jaxtune.types import Effect
 _FOLLOW_RAD_S = 150.0
 _POSES = 20
 
+OF_SENSORS = ("torque_scale", "constant_push")
+"""Effects that are alike to an error of a torque sensor, its scale and its offset, and stand for it."""
+
 _OF_CONTROLLER = ("command", "error", "speed", "torque")
-_OF_SENSORS = ("constant_push",)  # the offset of a torque sensor looks like it
 
 
 def tells(effect: Effect) -> bool:
@@ -29,13 +31,13 @@ def tells(effect: Effect) -> bool:
 
     It cannot of those that stand between targets and torques, nor of those that are as a torque sensor's own error.
     """
-    return effect.enters not in _OF_CONTROLLER and effect.name not in _OF_SENSORS
+    return effect.enters not in _OF_CONTROLLER and effect.name not in OF_SENSORS
 
 
-def followed(log: Log, spec: mujoco.MjSpec) -> Log:
-    """Gives the runs of an unknown controller targets and gains with which the model moves as measured.
+def follower(log: Log, spec: mujoco.MjSpec) -> Controller | None:
+    """Makes the controller that follows the motion of a log whose own one is unknown; None where that is known.
 
-    Critically damped for every joint alone, it has, with smoothed measurements,
+    Critically damped for every joint alone, in the pose of its least inertia, it has, with smoothed measurements,
 
         torque = kp (target - q) - kd dq,   target = q_measured + kd / kp dq_measured + tau_measured / kp
 
@@ -43,18 +45,15 @@ def followed(log: Log, spec: mujoco.MjSpec) -> Log:
     far the motion is off.
 
     Args:
-      log: as it was read, or followed before: targets follow from its present readings anew.
+      log: without sealed runs.
       spec: the nominal model.
-
-    Returns:
-      The log, unchanged where its controller is known.
 
     Raises:
       ValueError: the controller is unknown in some runs only.
     """
     unknown = [run.controller.kind == "unknown" for run in log.runs]
     if not any(unknown):
-        return log
+        return None
     if not all(unknown):
         name = log.runs[unknown.index(False)].name
         raise ValueError(f"{name}: controller.type: got a known one, expected 'unknown' as in others, or in none")
@@ -64,15 +63,26 @@ def followed(log: Log, spec: mujoco.MjSpec) -> Log:
         "kd": 2.0 * inertia * _FOLLOW_RAD_S,
         "torque_limit_nm": np.full(len(inertia), np.inf),
     }
-    return replace(log, runs=tuple(_followed(run, gains) for run in log.runs))
+    return replace(log.runs[0].controller, gains=gains, between_rows="linear")
 
 
-def _followed(run: Run, gains: dict[str, np.ndarray]) -> Run:
-    states = smoothed(run)
+def followed(log: Log, controller: Controller | None) -> Log:
+    """Gives the runs of an unknown controller the one that follows them, and targets from their own readings.
+
+    Args:
+      log: as it was read, or followed before.
+      controller: of `follower`; the log is unchanged where there is none.
+    """
+    if controller is None:
+        return log
+    return replace(log, runs=tuple(_followed(run, controller) for run in log.runs))
+
+
+def _followed(run: Run, controller: Controller) -> Run:
+    states, gains = smoothed(run), controller.gains
     # Noise of the torques would shake the model.
     torque = smoothed(replace(run, signals={"q": run.signals["tau"]}, known={"q": run.known.get("tau", {})}))[:, 0]
     target = states[:, 0] + (gains["kd"] * states[:, 1] + torque) / gains["kp"]
-    controller = replace(run.controller, gains=gains, between_rows="linear")
     return replace(run, controller=controller, signals={**run.signals, "target": target})
 
 

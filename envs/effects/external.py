@@ -45,7 +45,6 @@ ROWS = (
         parameters=(Parameter(name="nm", scale="torque", bounds=(-5.0, 5.0), prior=0.3),),
         sizes=(0.03,),
         act=_constant_push,
-        differs=True,
         sentence="A constant torque acts on the joint.",
         excited_by="postures on both sides of the vertical at two controller gains",
         **_EXTERNAL,

@@ -201,7 +201,7 @@ class Meta:
         between = entry.get("target_between_rows", "unknown")
         return Controller(
             kind=kind,
-            rate_hz=self._rate(f"{where}.rate_hz", entry.get("rate_hz", FOLLOWING_HZ)),
+            rate_hz=FOLLOWING_HZ if kind == "unknown" else self._rate(f"{where}.rate_hz", entry["rate_hz"]),
             gains={name: self._gain(f"{where}.{name}", entry.get(name, np.inf), name) for name in there},
             between_rows=self._one_of(f"{where}.target_between_rows", between, BETWEEN_ROWS),
         )

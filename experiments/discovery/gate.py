@@ -52,12 +52,11 @@ def check(log: Log, spec: mujoco.MjSpec, horizons: Sequence[float] | None = None
         raise ValueError(f"{'; '.join(refused)}: correct the log, or use --trust-log where it is right")
     # After the doctor, because everything is at its limit in wrong units.
     _check_saturation(log)
-    silent = [run for run in log.runs if "target" not in run.signals]
-    unknown, sent = ([run.name for run in silent if (run.controller.kind == "unknown") == yes] for yes in (True, False))
-    taken = []
+    taken, unknown = [], log.runs[0].controller.kind == "unknown"
+    sent = [run.name for run in log.runs if "target" not in run.signals]
     if unknown:
         taken.append("the controller is unknown, so torques that were measured are compared, along the measured motion")
-    if sent:
+    elif sent:
         taken.append(
             f"no targets, so torques are taken as sent to the motors ({_some(sent)}); if they were measured, write "
             "controller: {type: unknown} into meta.yaml"

@@ -34,9 +34,10 @@ def hypotheses(
     index = {(axis.effect, axis.parameter, axis.place): number for number, axis in enumerate(axes)}
     found = []
     for row in rows.values():
-        found += [_hypothesis(axes, index, row, chosen) for chosen in place_sets(places[row.on])]
+        sets = place_sets(places[row.on])
+        found += [_hypothesis(axes, index, row, chosen) for chosen in sets]
         if row.differs and len(places[row.on]) > 1:
-            found.append(_each(axes, index, row, tuple(places[row.on])))
+            found.append(_each(axes, index, row, max(sets, key=len)))
     return tuple(found)
 
 
@@ -204,7 +205,7 @@ def _each(axes: Sequence[Axis], index: Mapping, row: Effect, places: tuple[str, 
         probes=row.sizes[0] * np.eye(len(places)),
         bounds=np.concatenate([one.bounds for one in alone]),
         prior=np.full(len(places), parameter.prior),
-        joints=tuple(sorted({joint for one in alone for joint in one.joints})),
+        joints=tuple(joint for one in alone for joint in one.joints),
         each=True,
     )
 

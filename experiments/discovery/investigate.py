@@ -5,8 +5,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from envs import corrected
-from envs.following import followed
 from envs.logs import Log
 from experiments.common import checkpoint
 from experiments.common.checkpoint import read_json, write_json
@@ -74,10 +75,11 @@ def investigate(
         save=lambda state: write_json(saved, state),
         say=say,
     )
-    free = free_runs(followed(log, spec), question, result)
+    free = free_runs(question, result)
     stamp = {"seconds": time.monotonic() - began, "versions": checkpoint.versions()}
     summary = summarise(question, log, logs[0], result) | stamp
-    corrected.save(out / "model", spec, question.rig, result.model)
+    # A robot is no weaker for a sensor that reads too little.
+    corrected.save(out / "model", spec, question.rig, np.where(question.sensed, 0.0, result.model))
     write_json(out / "details.json", details(question, result, free))
     # Last: a discovery with this file is finished.
     write_json(out / "summary.json", summary)

@@ -213,12 +213,14 @@ def _drop_declared(log: Log) -> tuple[Log, list[str]]:
     for name in segments.COMPARED:
         # One column's filter counts for the signal.
         corners = [corner for run in log.runs if name in run.signals for corner in run.fact(name, "filter_hz")]
-        sent = name == "tau" and not all("target" in run.signals for run in log.runs)
-        if sent or not np.isfinite(corners).any():
+        silent = name == "tau" and not all("target" in run.signals for run in log.runs)
+        needed = name == "q" or (silent and log.runs[0].controller.kind == "unknown")
+        # Torques that were sent were not read.
+        if (silent and not needed) or not np.isfinite(corners).any():
             continue
         corner = f"{name} was filtered at {np.nanmin(corners):g} Hz, as the log says"
-        notes.append(f"{corner}; the delay is taken out" if name == "q" else f"{corner}, and is not used")
-        log = log if name == "q" else _without(log, name)
+        notes.append(f"{corner}; the delay is taken out" if needed else f"{corner}, and is not used")
+        log = log if needed else _without(log, name)
     return log, notes
 
 

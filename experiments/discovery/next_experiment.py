@@ -32,7 +32,8 @@ def deciding_experiment(question: Question, log: Log, folder: Path, result: Resu
       A sentence with the command that writes the targets; None where there are no two models with an effect, where no
       motion can be simulated with both, where a slide joint has no range, or where no joint follows its target.
     """
-    if len(result.rivals) < 2 or unlimited_slides(question.rig.mj_model, log.joints):
+    controller = controller_of(log)
+    if controller.kind == "unknown" or len(result.rivals) < 2 or unlimited_slides(question.rig.mj_model, log.joints):
         return None
     (one, other), vectors = (key for key, _ in result.rivals), np.stack([vector for _, vector in result.rivals])
 
@@ -41,9 +42,6 @@ def deciding_experiment(question: Question, log: Log, folder: Path, result: Resu
         # Of the joint in which they differ most.
         return float(np.sqrt(np.mean([(a - b) ** 2 for a, b in simulated], axis=(0, 1)).max()))
 
-    controller = controller_of(log)
-    if controller.kind == "unknown":
-        return None
     still = passive(controller)
     if still.all():
         return None

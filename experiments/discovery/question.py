@@ -9,7 +9,7 @@ import numpy as np
 
 from envs import readings, segments
 from envs.effects import LEARNED, LIBRARY
-from envs.following import followed, tells
+from envs.following import OF_SENSORS, followed, follower, tells
 from envs.logs import Log, Run, splits, with_splits
 from envs.null_logs import simulate_null_logs
 from envs.regimes import REGIMES
@@ -31,6 +31,11 @@ class Question:
     """The nominal model."""
     rig: Rig
     """The simulator with every effect built in, which gives coordinates their names and units."""
+    log: Log
+    """What is compared: without signals that were filtered, and with a controller that follows an unknown one's motion
+    (`envs.following`)."""
+    sensed: np.ndarray
+    """[axes] True where a coordinate stands for an error of a torque sensor, and not for what the robot does."""
     splits: Mapping[str, tuple[str, ...]]
     """Names of the runs by split: train, select (validation) and sealed (held-out test)."""
     notes: tuple[str, ...]
@@ -44,7 +49,7 @@ class _Simulator:
     rig: Rig = field(compare=False)
     layout: Hashable
     signals: tuple[str, ...]
-    follows: bool
+    follows: bool = False
     """Whether the controller follows measured motion (`envs.following`): `tau` is then what it asks for, and what a
     motor makes of that is between the measured torque and the joint."""
 
@@ -84,24 +89,27 @@ def build_question(
     horizons = fitting_horizons(log, horizons)
     rate = check_simulatable(log, spec, horizons)
     log, notes = drop_filtered(with_splits(log))
-    log = followed(replace(log, runs=readings.with_noise(log.runs, without_sealed(log).runs)), spec)
+    log = replace(log, runs=readings.with_noise(log.runs, without_sealed(log).runs))
+    ours = follower(without_sealed(log), spec)
+    log = followed(log, ours)
     unsealed = without_sealed(log).runs
     plain = plain or Rig(spec, log.joints, rate)
     plain.check_matches(log.joints, rate)
     rig = plain.scaled(measure_scales(plain, unsealed))
     signals, partly = _compared(log)
+    # Errors of torque sensors are free, and no form of friction.
+    sensed = np.array([ours is not None and axis.effect in OF_SENSORS for axis in rig.axes])
     axes = {(axis.effect, axis.place): number for number, axis in enumerate(rig.axes)}
-    follows = log.runs[0].controller.kind == "unknown"
-    told = {name for name, row in rig.effects.items() if not follows or tells(row)}
+    told = {name for name, row in rig.effects.items() if ours is None or tells(row)}
     library = {name: row for name, row in rig.effects.items() if name in LIBRARY and name in told}
     every = hypotheses(rig.axes, rig.places, library)
-    unknowns, unknown_bounds = unknown_directions(rig.axes, rig.control_hz, signals, follows)
+    unknowns, unknown_bounds = unknown_directions(rig.axes, rig.control_hz, signals, ours is not None)
     bin_rows = segments.rows_together(1.0 / log.rate_hz, BIN_S)
     measured = cut_log(log, rig.dt, signals, horizons)
-    simulated = [followed(one, spec) for one in simulate_null_logs(log, spec, null_logs, seed)]
-    nulls = [told_alike(cut_log(one, rig.dt, signals, horizons), measured, follows) for one in simulated]
+    simulated = [followed(one, ours) for one in simulate_null_logs(log, spec, null_logs, seed)]
+    nulls = [told_alike(cut_log(one, rig.dt, signals, horizons), measured, ours is not None) for one in simulated]
     problem = Problem(
-        simulate=_Simulator(plain, plain.layout, signals, follows),
+        simulate=_Simulator(plain, plain.layout, signals, ours is not None),
         system=plain.system,
         values=rig.inner,
         axes=len(rig.axes),
@@ -118,11 +126,11 @@ def build_question(
         components={name: tuple("xyz") if name == "gravity" else rig.joints for name in signals},
         least_floor=_least_floor(unsealed[0], signals, bin_rows),
         push={joint: axes["constant_push", joint] for joint in rig.joints},
-        forms=forms(rig.axes, rig.effects, every),
+        forms=[form for form in forms(rig.axes, rig.effects, every) if not (form.directions[:, sensed] != 0).any()],
         residual=learned_torque(rig.axes, LEARNED),
     )
     names = {split: tuple(run.name for run in runs) for split, runs in splits(log).items()}
-    return Question(problem, spec, rig, names, (*log.notes, *notes, *partly, *stale_notes(unsealed)))
+    return Question(problem, spec, rig, log, sensed, names, (*log.notes, *notes, *partly, *stale_notes(unsealed)))
 
 
 def _compared(log: Log) -> tuple[tuple[str, ...], tuple[str, ...]]:

@@ -114,7 +114,8 @@ def _changed(question: Question, result: Result) -> list[AcceptedTerm]:
 
 def _effect(rig: Rig, term: AcceptedTerm, fit: Fit, errors: np.ndarray) -> dict:
     """Describes a fitted effect: physical values with 95 % intervals, and what would distinguish it from its rivals."""
-    hypothesis, parameters, places = term.hypothesis, {}, []
+    hypothesis, parameters = term.hypothesis, {}
+    places = hypothesis.places if term.clear is None else term.clear
     rows = [(part.form, row) for part in (hypothesis, *term.forms) for row in part.directions]
     for form, direction in rows:
         mine = [i for i, free in enumerate(fit.free.directions) if ((free != 0) & (direction != 0)).any()]
@@ -130,11 +131,9 @@ def _effect(rig: Rig, term: AcceptedTerm, fit: Fit, errors: np.ndarray) -> dict:
         ends = np.clip([value - error, value + error], low, high)
         ends = sorted(float(parameter.value(float(end), scale)) for end in ends)
         name = parameter.name
-        if hypothesis.each and not form:
-            # Only where it is clear of nothing.
-            if abs(value) <= error:
+        if term.clear is not None and not form:
+            if axis.place not in term.clear:
                 continue
-            places.append(axis.place)
             name = f"{name}.{axis.place}"
         # A delay that is filtered has two times.
         name = f"{form}.{name}" if name in parameters else name
@@ -142,11 +141,11 @@ def _effect(rig: Rig, term: AcceptedTerm, fit: Fit, errors: np.ndarray) -> dict:
     return {
         "name": hypothesis.name,
         "family": hypothesis.family,
-        "places": places or list(hypothesis.places),
+        "places": list(places),
         "parameters": parameters,
         "form": _names(term.forms),
         "confusable_with": list(term.confusable_with),
-        "split_by": f"{rig.effects[hypothesis.name].excited_by} on {', '.join(hypothesis.places)}",
+        "split_by": f"{rig.effects[hypothesis.name].excited_by} on {', '.join(places)}",
     }
 
 
@@ -155,15 +154,14 @@ def _names(forms: Sequence[Hypothesis]) -> str | None:
     return ", ".join(form.form for form in forms) or None
 
 
-def free_runs(log: Log, question: Question, result: Result) -> dict:
+def free_runs(question: Question, result: Result) -> dict:
     """Simulates every run from its first state to its end, with the nominal, the fitted and the corrected model.
 
     Discovery works on short segments. Whole runs show how well the model predicts a motion without being corrected by
     measured states, which is what a user of the model needs.
 
     Args:
-      log: what was measured.
-      question: the problem that discovery worked on.
+      question: the problem that discovery worked on, with its log.
       result: what was found.
 
     Returns:
@@ -171,10 +169,10 @@ def free_runs(log: Log, question: Question, result: Result) -> dict:
       mean absolute errors; `error_rad`: means of these errors by split and model.
     """
     vectors = {"before": np.zeros(len(question.rig.axes)), "null": result.null.vector, "after": result.proposed}
-    rows, simulated = simulate_runs(question, log.runs, np.stack(list(vectors.values())))
+    rows, simulated = simulate_runs(question, question.log.runs, np.stack(list(vectors.values())))
     splits = {name: split for split, names in question.splits.items() for name in names}
     runs = []
-    for recorded, own, positions in zip(log.runs, rows, simulated, strict=True):
+    for recorded, own, positions in zip(question.log.runs, rows, simulated, strict=True):
         measured, found = recorded.signals["q"][own], dict(zip(vectors, positions, strict=True))
         runs.append(
             {

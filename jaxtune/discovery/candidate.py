@@ -41,8 +41,13 @@ class Candidate:
         return tuple(hypothesis for hypothesis in self.hypotheses if hypothesis.shapes(effect))
 
     def price(self, of_effect: float) -> float:
-        """Returns what its hypotheses cost; a form costs half, as there are few to choose from."""
+        """Returns what its hypotheses cost; a form or a further size costs half, as there are few to choose from."""
         return of_effect * sum(hypothesis.worth for hypothesis in self.hypotheses)
+
+
+def of_further_sizes(hypotheses: Sequence[Hypothesis], price: float) -> float:
+    """What sizes cost that hypotheses have beyond their first, with a price for every effect."""
+    return 0.5 * price * sum(hypothesis.more_sizes for hypothesis in hypotheses)
 
 
 def key_of(hypotheses: Sequence[Hypothesis]) -> str:

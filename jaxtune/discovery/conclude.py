@@ -11,7 +11,7 @@ from jaxtune.discovery.candidate import Candidate, cost, key_of, measures, squar
 from jaxtune.discovery.evaluate import is_worse, position_gap, rms
 from jaxtune.discovery.evidence import Thresholds, passes, weigh_evidence
 from jaxtune.discovery.fit import Fit, begin, polish, refine
-from jaxtune.discovery.naming import at_fewest_places, moved_forms, renamed, with_refinements
+from jaxtune.discovery.naming import at_fewest_places, clear_places, moved_forms, renamed, with_refinements
 from jaxtune.discovery.noise_floor import Floor, NoiseFloor, Say
 from jaxtune.discovery.problem import Hypothesis, Problem
 from jaxtune.discovery.resample import standard_errors
@@ -74,8 +74,7 @@ def conclude(settings: Settings, problem: Problem, floor: NoiseFloor, state: Sta
     )
     changed = _at_bounds(problem, best.fit, state.price) if explains else {}
     verdict = _verdict(problem, terms, changed) if explains else "unnamed"
-    unit = units_of(problem, at, squares(at, best))[: len(problem.data["train"][at.horizon].run)]
-    errors = standard_errors(best.fit, unit)
+    errors = _errors(problem, at, best)
     terms = tuple(
         replace(term, forms=(*term.forms, *moved_forms(problem, best.fit, errors, term.hypothesis))) for term in terms
     )
@@ -101,6 +100,12 @@ def conclude(settings: Settings, problem: Problem, floor: NoiseFloor, state: Sta
             for one, probability in zip(candidates, probabilities, strict=True)
         },
     )
+
+
+def _errors(problem: Problem, at: Floor, candidate: Candidate) -> np.ndarray:
+    """Standard errors of the coordinates of a model with fresh slopes, [coordinates]."""
+    unit = units_of(problem, at, squares(at, candidate))[: len(problem.data["train"][at.horizon].run)]
+    return standard_errors(candidate.fit, unit)
 
 
 def _shares(
@@ -214,7 +219,11 @@ def _proved(
         best = replace(best, fit=fit)
     # What explains most is named first.
     ranked = sorted((row for row in weighed.values() if not row[0].form), key=lambda row: -row[1].gain)
-    terms = tuple(AcceptedTerm(h, evidence, of_effect(h), forms=best.forms_of(h)) for h, evidence, _ in ranked)
+    errors = _errors(problem, at, best)
+    terms = tuple(
+        AcceptedTerm(h, evidence, of_effect(h), forms=best.forms_of(h), clear=clear_places(best.fit, errors, h))
+        for h, evidence, _ in ranked
+    )
     return best, terms, {h.key: ablated.fit.vector for h, _, ablated in ranked}, tuple(dropped)
 
 

@@ -44,7 +44,7 @@ class Evidence:
     interval: tuple[float, float]
     """95 % interval of the coordinate that is clearest of zero."""
     inside: bool
-    """True if all coordinates are inside their bounds, or zero."""
+    """True if all coordinates are inside their bounds; of sizes for each place, the one that is clearest of zero."""
     horizons: int
     """Number of horizons at which `train` and `select` cost less with it, prior included."""
     size: float
@@ -101,6 +101,7 @@ def weigh_evidence(
     # A parameter without a probe of its own means nothing alone.
     distance = np.where((hypothesis.probes != 0).any(axis=0), np.abs(values) / errors, 0.0)
     clearest = int(distance.argmax())
+    inside = (low < values) & (values < high)
     relief = ablated.fit.penalty - candidate.fit.penalty
     mean_squares = [finite(one) / at.counts.bins for one in (before, now)]
     falls = [_largest_fall(*(measure(one) for one in mean_squares)) for measure in measures(at)]
@@ -116,8 +117,8 @@ def weigh_evidence(
             float(values[clearest] - 1.96 * errors[clearest]),
             float(values[clearest] + 1.96 * errors[clearest]),
         ),
-        # Of several places one may have nothing of it.
-        inside=bool((((low < values) & (values < high)) | (values == 0.0)).all()),
+        # Of several places one may have nothing of it, or less than nothing.
+        inside=bool(inside[clearest] if hypothesis.each else inside.all()),
         horizons=_horizons_better(floor, candidate.fit, ablated.fit),
         size=_in_smallest(values, hypothesis.probes),
     )

@@ -115,6 +115,22 @@ def _size(candidate: Candidate, part: Hypothesis) -> float:
     return float(np.abs(candidate.fit.coordinates[candidate.fit.along(part)])[sized].max())
 
 
+def clear_places(fit: Fit, errors: np.ndarray, effect: Hypothesis) -> tuple[str, ...] | None:
+    """The places at which an effect with a size for each is clear of zero, the clearest in any case; None for others.
+
+    Args:
+      fit: of the model.
+      errors: [coordinates] standard errors.
+      effect: of the model.
+    """
+    if not effect.each:
+        return None
+    own = fit.along(effect)
+    distance = np.abs(fit.coordinates[own]) / errors[own]
+    clear = (distance > _CLEAR) | (distance == distance.max())
+    return tuple(place for place, yes in zip(effect.places, clear, strict=True) if yes)
+
+
 def with_refinements(terms: Sequence[AcceptedTerm], own: float) -> list[AcceptedTerm]:
     """Marks effects that may only refine a stronger one at the same joints, because no form of the library is exact.
 
@@ -132,11 +148,21 @@ def with_refinements(terms: Sequence[AcceptedTerm], own: float) -> list[Accepted
             one.hypothesis.key
             for one in marked
             if one.refines is None
-            and acts_within(term.hypothesis, one.hypothesis)
-            and term.evidence.gain < own * one.evidence.gain * _share_of_joints(term.hypothesis, one.hypothesis)
+            and acts_within(_shown(term), _shown(one))
+            and term.evidence.gain < own * one.evidence.gain * _share_of_joints(_shown(term), _shown(one))
         ]
         marked.append(replace(term, refines=over[0] if over else None))
     return marked
+
+
+def _shown(term: AcceptedTerm) -> Hypothesis:
+    """The hypothesis of a term at the joints where it is clear of zero."""
+    effect = term.hypothesis
+    if term.clear is None:
+        return effect
+    # On joints alone sizes are each place's own.
+    shown = zip(effect.joints, effect.places, strict=True)
+    return replace(effect, joints=tuple(joint for joint, place in shown if place in term.clear))
 
 
 def _share_of_joints(few: Hypothesis, many: Hypothesis) -> float:

@@ -52,7 +52,7 @@ class Hypothesis:
     screened: bool = False
     """True for a form without which its effect may not be seen: the screen tries both together as well."""
     each: bool = False
-    """True where every place has a size of its own: `directions` has a row for each."""
+    """True where every place has a size of its own: `directions` has a row for each, `joints` one joint."""
 
     @property
     def key(self) -> str:

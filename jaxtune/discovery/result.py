@@ -77,6 +77,8 @@ class AcceptedTerm:
     """Names of other effects that these logs cannot distinguish from it, or that explain nearly as much."""
     forms: tuple[Any, ...] = ()
     """Each a `problem.Hypothesis` about its form; none where its first form is as good."""
+    clear: tuple[str, ...] | None = None
+    """Of an effect with a size for each place, those where it is clear of zero; None for any other effect."""
     refines: str | None = None
     """Key of a stronger effect at the same joints that it may only refine; None for an effect that is named."""
 

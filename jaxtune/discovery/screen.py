@@ -12,6 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from jaxtune.discovery.candidate import of_further_sizes
 from jaxtune.discovery.curves import Curves, Group, Library, on_segments, probes_of, simulate_library
 from jaxtune.discovery.fit import Fit, Free, taken_over
 from jaxtune.discovery.least_squares import of_size
@@ -214,8 +215,7 @@ def _best(
 
 def _of_sizes(points: np.ndarray, group: Group, price: float) -> np.ndarray:
     """What the prior says against points [..., parameters] of a group and the price of its further sizes, [...]."""
-    further = 0.5 * price * sum(one.more_sizes for one in group)
-    return of_size(points / np.concatenate([one.prior for one in group])).sum(axis=-1) + further
+    return of_size(points / np.concatenate([one.prior for one in group])).sum(axis=-1) + of_further_sizes(group, price)
 
 
 def _points(profile: Profile, group: Group, curves: Curves) -> np.ndarray:
@@ -223,11 +223,15 @@ def _points(profile: Profile, group: Group, curves: Curves) -> np.ndarray:
     (hypothesis, *forms), probes = group, probes_of(group)
     several = np.count_nonzero((hypothesis.probes != 0).any(axis=0)) > 1
     if several:
-        own, changes = hypothesis.probes, curves.at(group, probes)
+        own, none = hypothesis.probes, probes.copy()
+        none[:, : own.shape[1]] = 0.0
+        # A form may change what the nominal model has of it.
+        changes, alone = curves.at(group, probes), curves.at(group, none)
         sizes = np.abs(own).max(axis=1)[:, None]
-        directions = replace(changes, weights=changes.weights / sizes)
+        directions = replace(changes, weights=(changes.weights - alone.weights) / sizes)
         nothing = Changes(np.zeros(0, int), np.zeros((1, 0)))
-        _, at = profile.with_directions(directions).costs(nothing)
+        beside = profile.moved(replace(alone, weights=alone.weights[:1]))
+        _, at = beside.with_directions(directions).costs(nothing)
         wanted = np.clip(at[:, len(profile.offset) :] @ (own / sizes), *hypothesis.bounds.T)
         return np.concatenate([wanted, *(form.probes[:1] for form in forms)], axis=1)
     sizes = np.array(sorted([0.0, *probes[:, 0]]))

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from jaxtune.discovery.candidate import Candidate, key_of, total_cost
+from jaxtune.discovery.candidate import Candidate, key_of, of_further_sizes, total_cost
 from jaxtune.discovery.curves import Group, Library, groups_of, on_segments, simulate_library, spread_segments
 from jaxtune.discovery.evaluate import usual
 from jaxtune.discovery.evidence import ablate, or_known
@@ -85,14 +85,14 @@ def step(
         found = screen(at, base.fit, again, price=state.price, pairs=0, say=say)
     else:
         state = state.with_seen(settings, problem, *seen(at, state.nominal, every, library))
-        groups, how = groups_of(free, forms), {"price": state.price, "pairs": settings.firsts}
-        found = screen(at, base.fit, groups, fitted=fit, library=library, say=say, **how)
+        groups, pairs = groups_of(free, forms), settings.firsts
+        found = screen(at, base.fit, groups, price=state.price, fitted=fit, pairs=pairs, library=library, say=say)
     leads = shortlist(settings, found, state.price)
     leads = leads[: settings.swaps] if swapping else leads + shaped(_unfree(problem, at), free, leads, settings.shaped)
     if base.fit is state.nominal:
         leads = leads + stuck(state.null.fit, [h for h in free if problem.is_nominal(h)], leads)
     say(f"fit {len(leads)}")
-    fitted = fit_leads(settings, at, base.fit, base.hypotheses, leads)
+    fitted = fit_leads(settings, at, base.fit, base.hypotheses, leads, state.price)
     broken = {key_of((*base.hypotheses, *lead.hypotheses)) for lead in leads} - {one.key for one in fitted}
     state = replace(state.with_candidates(fitted), not_finite=(*state.not_finite, *sorted(broken)))
     cost = {one.key: total_cost(at, one, state.price) for one in (*fitted, best)}
@@ -228,7 +228,7 @@ def stuck(null: Fit, hypotheses: Sequence[Hypothesis], leads: Sequence[Lead]) ->
 
 
 def fit_leads(
-    settings: Settings, at: Floor, base: Fit, present: Sequence[Hypothesis], leads: Sequence[Lead]
+    settings: Settings, at: Floor, base: Fit, present: Sequence[Hypothesis], leads: Sequence[Lead], price: float
 ) -> list[Candidate]:
     """Fits leads beside a model: all of them on the screened segments, the best on the whole of `train`.
 
@@ -238,6 +238,7 @@ def fit_leads(
       base: the model without them.
       present: the effects that the model has.
       leads: what joins it.
+      price: of an effect.
 
     Returns:
       Models that could be simulated, on `train` and `select`; of the finalists with fresh slopes.
@@ -252,9 +253,11 @@ def fit_leads(
     if not order:
         return []
     whole = _on_all(at, [fits[index] for index in order])
-    whole.sort(key=lambda pair: pair[1].cost)
+    costs = [fit.cost + of_further_sizes(groups[order[index]], price) for index, fit in whole]
+    cheapest = np.argsort(costs, kind="stable")
+    whole, costs = [whole[index] for index in cheapest], [costs[index] for index in cheapest]
     every = [fit for _, fit in whole]
-    chosen = _finalists(settings, base.cost, [groups[order[index]] for index, _ in whole], [fit.cost for fit in every])
+    chosen = _finalists(settings, base.cost, [groups[order[index]] for index, _ in whole], costs)
     # A further round costs little beside the slopes.
     for number, fit in zip(
         chosen, polish([every[n] for n in chosen], at.residuals["train"], 3 * settings.rounds), strict=True

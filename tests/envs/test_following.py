@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from envs import segments
-from envs.following import followed
+from envs.clock import clock_of
+from envs.following import followed, follower
 from envs.logs import Controller, Log, Run, read, write
 from envs.rig import Rig
 from experiments.discovery.question import build_question
@@ -54,6 +55,10 @@ def recorded(friction_nm=0.0, names=("run_000",)):
     return Log(robot="arm.xml", base="fixed", rate_hz=500.0, joints=ARM_JOINTS, policy=None, runs=tuple(runs))
 
 
+def follow(log, spec):
+    return followed(log, follower(log, spec))
+
+
 @pytest.fixture(scope="module")
 def spec():
     return mujoco.MjSpec.from_string(ARM)
@@ -65,7 +70,7 @@ def needed(spec):
     rig = Rig(spec, ARM_JOINTS, UNKNOWN.rate_hz)
     player, found = Player(rig), {}
     for friction in (0.0, FRICTION_NM):
-        log = followed(recorded(friction), spec)
+        log = follow(recorded(friction), spec)
         cut = segments.cut(log.runs, 0.1, rig.dt)
         pieces = [jax.tree.map(lambda leaf, n=n: leaf[n], cut.segments) for n in range(len(cut.run))]
         read = [player.play(piece) for piece in pieces]
@@ -95,12 +100,35 @@ def test_what_a_model_lacks_shows_in_the_torque_of_its_joint(needed):
 
 
 def test_following_twice_follows_the_readings_that_are_there(spec):
-    log = followed(recorded(), spec)
-    again = followed(log, spec)
+    log = follow(recorded(), spec)
+    again = follow(log, spec)
     np.testing.assert_array_equal(again.runs[0].signals["target"], log.runs[0].signals["target"])
     moved = replace(log.runs[0], signals=log.runs[0].signals | {"q": log.runs[0].signals["q"] + 0.1})
-    moved = followed(replace(log, runs=(moved,)), spec).runs[0]
+    moved = follow(replace(log, runs=(moved,)), spec).runs[0]
     np.testing.assert_allclose(moved.signals["target"] - log.runs[0].signals["target"], 0.1, atol=1e-6)
+
+
+def test_rows_of_a_followed_run_keep_their_jittering_stamps(spec):
+    log = recorded()
+    run, rng = log.runs[0], np.random.default_rng(0)
+    time = run.time + 3e-4 * rng.uniform(-1, 1, len(run.time))
+    at = lambda values: np.stack([np.interp(time, run.time, column) for column in values.T], 1)  # noqa: E731
+    shaken = replace(run, time=time, signals={name: at(values) for name, values in run.signals.items()})
+    run = follow(replace(log, runs=(shaken,)), spec).runs[0]
+    # Its targets are readings, which were taken when they were stamped.
+    np.testing.assert_array_equal(clock_of(run, 0.001).rows, time)
+
+
+def test_sealed_runs_have_no_say_in_the_gains(spec):
+    log = recorded(names=tuple(f"run_{number:03d}" for number in range(4)))
+    splits = ("train", "train", "select", "sealed")
+    runs = [replace(run, split=split) for run, split in zip(log.runs, splits, strict=True)]
+    bent = replace(runs[3], signals=runs[3].signals | {"q": runs[3].signals["q"] + [0.0, 1.2]})
+    ours, other = (
+        build_question(replace(log, runs=(*runs[:3], last)), spec, (0.05, 0.1, 0.2), null_logs=0).log.runs[0].controller
+        for last in (runs[3], bent)
+    )
+    np.testing.assert_array_equal(ours.gains["kp"], other.gains["kp"])
 
 
 def test_a_known_controller_stays_and_a_mixture_is_refused(spec):
@@ -108,9 +136,9 @@ def test_a_known_controller_stays_and_a_mixture_is_refused(spec):
     gains = {name: np.ones(2) for name in ("kp", "kd", "torque_limit_nm")}
     known = replace(log.runs[1], controller=Controller(kind="pd", rate_hz=1000.0, gains=gains))
     driven = replace(log, runs=(known,))
-    assert followed(driven, spec) is driven
+    assert follow(driven, spec) is driven
     with pytest.raises(ValueError, match=r"run_001: controller\.type: got a known one, expected 'unknown'"):
-        followed(replace(log, runs=(log.runs[0], known)), spec)
+        follower(replace(log, runs=(log.runs[0], known)), spec)
 
 
 def written(folder, log):
@@ -119,13 +147,25 @@ def written(folder, log):
     return folder
 
 
-def test_only_the_type_of_an_unknown_controller_is_needed(tmp_path):
+@pytest.mark.parametrize("said", ["{type: unknown}", "{type: unknown, rate_hz: 100}"])
+def test_only_the_type_of_an_unknown_controller_counts(tmp_path, said):
     meta = written(tmp_path, recorded()) / "meta.yaml"
     assert read(tmp_path).runs[0].controller.kind == "unknown"
     text = meta.read_text()
     start, end = text.index("controller:"), text.index("runs:")
-    meta.write_text(f"{text[:start]}controller: {{type: unknown}}\n{text[end:].split('    controller')[0]}")
+    meta.write_text(f"{text[:start]}controller: {said}\n{text[end:].split('    controller')[0]}")
+    # The one that follows is too hard for slow ticks.
     assert read(tmp_path).runs[0].controller.rate_hz == 1000.0
+
+
+def test_currents_of_an_unknown_controller_are_torques(tmp_path):
+    log = recorded()
+    run = log.runs[0]
+    signals = {name: run.signals[name] for name in ("q", "dq")} | {"current": run.signals["tau"] / 0.5}
+    controller = replace(UNKNOWN, gains={"kt": np.full(2, 0.5)})
+    run = replace(run, signals=signals, controller=controller)
+    found = read(written(tmp_path, replace(log, runs=(run,)))).runs[0]
+    np.testing.assert_allclose(found.signals["tau"], log.runs[0].signals["tau"], rtol=1e-6)
 
 
 def test_targets_of_an_unknown_controller_are_not_used_and_said_so(tmp_path):
@@ -147,7 +187,8 @@ def test_an_unknown_controller_without_measured_torques_is_refused(tmp_path):
 
 def test_what_a_controller_does_is_no_question_where_ours_follows(spec):
     log = recorded(names=tuple(f"run_{number:03d}" for number in range(4)))
-    problem = build_question(log, spec, (0.05, 0.1, 0.2), null_logs=2).problem
+    question = build_question(log, spec, (0.05, 0.1, 0.2), null_logs=2)
+    problem = question.problem
     names = {hypothesis.name for hypothesis in problem.hypotheses}
     assert {"coulomb", "payload", "encoder_bias", "sensor_delay"} <= names
     assert not {"command_delay", "gain_error", "deadband", "torque_scale", "torque_limit", "constant_push"} & names
@@ -157,7 +198,11 @@ def test_what_a_controller_does_is_no_question_where_ours_follows(spec):
     of = {(axis.effect, axis.place): number for number, axis in enumerate(rig.axes)}
     for name in ("torque_scale", "constant_push"):
         assert all(free[of[name, joint]] > 0 for joint in ARM_JOINTS)
+    assert not {form.key for form in problem.forms if form.form == "direction_dependent"}
     assert problem.prior[of["gain_error", "elbow"]] == 0 < problem.prior[of["armature", "elbow"]]
+    # A corrected model is no weaker for a sensor that reads too little.
+    sensed = {question.rig.axes[number].effect for number in np.flatnonzero(question.sensed)}
+    assert sensed == {"torque_scale", "constant_push"}
     for null in problem.null_logs:
         for own, measured in zip(null["train"].values(), problem.data["train"].values(), strict=True):
             # Null logs are followed by their own readings, and share the rest.

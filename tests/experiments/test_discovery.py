@@ -198,6 +198,11 @@ def test_a_size_at_two_places_is_the_same_physical_size(spec, plain):
         np.testing.assert_allclose(values, values[0], rtol=1e-5)
 
 
+def renamed_joints(spec):
+    text = spec.to_xml().replace('name="shoulder"', 'name="right_wheel"').replace('name="elbow"', 'name="left_wheel"')
+    return mujoco.MjSpec.from_string(text)
+
+
 def test_what_joints_have_in_sizes_of_their_own_is_tried_so(spec, plain):
     from envs.rig import Rig
 
@@ -212,6 +217,13 @@ def test_what_joints_have_in_sizes_of_their_own_is_tried_so(spec, plain):
         np.testing.assert_array_equal(each.directions[row], one.directions[0])
         np.testing.assert_array_equal(each.bounds[row], one.bounds[0])
         assert np.abs(one.probes).min() == each.probes[row, row]
+    # Places are in the order of those with one size, whose forms it has.
+    wheels = Rig(renamed_joints(spec), ("right_wheel", "left_wheel"), 1000.0)
+    every = [
+        one for one in hypotheses(wheels.axes, wheels.places, rows) if len(one.places) == 2 and one.name == "coulomb"
+    ]
+    assert len({one.places for one in every}) == 1
+    assert {one.each for one in every} == {False, True}
 
 
 def test_no_place_loses_more_than_it_has(spec):

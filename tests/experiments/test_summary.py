@@ -18,6 +18,7 @@ from experiments.discovery.question import build_question
 from experiments.discovery.summary import _effect, _far_off, details, free_runs, summarise
 from jaxtune.discovery.evidence import Evidence, Thresholds, passes
 from jaxtune.discovery.fit import Fit, Free
+from jaxtune.discovery.naming import clear_places
 from jaxtune.discovery.result import AcceptedTerm, DroppedTerm, Result, Suspect
 
 JOINTS = ("shoulder", "elbow")
@@ -140,7 +141,7 @@ def test_page_and_console_say_what_was_found(tmp_path, asked, withdrawn):
     result = found(question)
     if withdrawn:
         result = replace(result, verdict="unnamed", withdrawn=True, model_is="null", model=result.null.vector)
-    summary, free = summarise(question, log, Path("logs"), result), free_runs(log, question, result)
+    summary, free = summarise(question, log, Path("logs"), result), free_runs(question, result)
     assert {run["split"] for run in details(question, result, free)["free_runs"]} == {"train", "select", "sealed"}
     # What was proposed is simulated, whether or not it was withdrawn.
     assert abs(free["error_rad"]["train"]["after"] - free["error_rad"]["train"]["null"]) > 1e-3
@@ -164,7 +165,7 @@ def test_page_and_console_say_what_was_found(tmp_path, asked, withdrawn):
 def test_names_with_brackets_are_printed_as_they_are(asked):
     log, question = asked
     result = found(question)
-    summary, free = summarise(question, log, Path("logs"), result), free_runs(log, question, result)
+    summary, free = summarise(question, log, Path("logs"), result), free_runs(question, result)
     for kind in ("effects", "not_named", "dropped", "suspects"):
         summary[kind] = [one | {"places": [f"[red]{place}" for place in one["places"]]} for one in summary[kind]]
     console = Console(record=True, width=400)
@@ -211,9 +212,14 @@ def test_an_effect_with_a_size_for_each_place_is_told_of_those_that_are_clear(as
     (each,) = [one for one in question.problem.hypotheses if one.key == "coulomb@shoulder&elbow"]
     free = Free(each.directions, np.ones(2), each.bounds, np.zeros(2, bool))
     fit = Fit(free, np.array([0.01, 0.5]), np.zeros(0), np.zeros((0, 2)), None)
-    effect = _effect(question.rig, AcceptedTerm(each, EVIDENCE, Thresholds(10.0)), fit, np.array([0.02, 0.02]))
+    errors = np.array([0.02, 0.02])
+    clear = clear_places(fit, errors, each)
+    effect = _effect(question.rig, AcceptedTerm(each, EVIDENCE, Thresholds(10.0), clear=clear), fit, errors)
     assert effect["places"] == ["elbow"]
     assert list(effect["parameters"]) == ["torque_nm.elbow"]
     size = effect["parameters"]["torque_nm.elbow"]
     assert size["low"] < size["value"] < size["high"]
     assert report.brief_keys(question, f"beside {each.key}") == "beside coulomb@each joint"
+    # One place is told of in any case.
+    assert clear_places(fit, np.array([1.0, 1.0]), each) == ("elbow",)
+    assert clear_places(fit, errors, replace(each, each=False)) is None

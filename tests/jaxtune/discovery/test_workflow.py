@@ -90,7 +90,7 @@ def test_places_have_sizes_of_their_own_only_where_they_differ(sizes, key):
 
 def test_a_model_pays_for_every_further_size():
     assert (ONE_SIZE.worth, EACH.worth, replace(EACH, places=tuple("abcde")).worth) == (1.0, 1.5, 3.0)
-    assert replace(DIRECTION).worth == 0.5
+    assert DIRECTION.worth == 0.5
 
 
 def test_two_effects_are_named_one_after_the_other():
@@ -344,7 +344,7 @@ def test_an_effect_gives_way_to_another_that_stands_in_its_place_better():
     first, _ = step.step(Settings(), asked, floor, begun)
     at, wrong = floor[asked.main_horizon], (HYPOTHESES[2], HYPOTHESES[4])
     lead = Lead(wrong, np.array([0.8, 0.1]), begun.nominal.coordinates, 0.0)
-    (bad,) = step.fit_leads(Settings(), at, begun.nominal, (), [lead])
+    (bad,) = step.fit_leads(Settings(), at, begun.nominal, (), [lead], 10.0)
     alone = [one for one in first.candidates if len(one.hypotheses) < 2]
     stuck = replace(first, best=bad, candidates=(*alone, bad), tried=("null", bad.key))
     found, info = step.step(Settings(), asked, floor, stuck)
