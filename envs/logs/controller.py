@@ -77,7 +77,7 @@ class Controller:
                 torque = kt (duty volts - kt dq) / resistance_ohm
                        = clip(gain stall e, -stall, stall) - kt^2 / resistance_ohm dq
 
-    `impedance` brings both into one form. Where the controller is unknown, `envs.following` puts one of its own in its
+    `impedance` brings these into one form. Where the controller is unknown, `envs.following` puts one of its own in its
     place, with the gains of a `pd` controller.
     """
 
@@ -93,7 +93,7 @@ class Controller:
     """How targets go on between two rows, one of `BETWEEN_ROWS`."""
 
     def impedance(self, enabled: np.ndarray | None = None, volts: np.ndarray | None = None) -> Impedance:
-        """Writes the controller as a limited spring and damper, the same form for both types.
+        """Writes the controller as a limited spring and damper, the same form for all types.
 
         Args:
           enabled: [rows], 0 where the motors are switched off and 1 elsewhere; always on where None.

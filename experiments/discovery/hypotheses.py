@@ -13,7 +13,7 @@ from jaxtune.types import Effect, Form, Parameter
 _LARGE = 0.7  # of the bounds: the largest size that is screened
 _TRAVEL_RAD, _MOST_TRAVELS = 0.002, 5.0  # over which dry friction sets in, and how many of these at most
 _TORQUE_SHARE, _MOST_SHARES = 0.2, 3.0  # by which recorded torques are off, and how many of these at most
-_OFFSET = 0.2  # of a torque sensor, in rms torques, and as many of these at most
+_OFFSET = 0.2  # typical offset of a torque sensor, as a share of the rms torque
 _BENT, _STRAIGHT = 6, 3  # sizes of an effect without a slope at zero, and of one with
 
 
@@ -108,9 +108,10 @@ def unknown_directions(
 
     They are a delay of all readings, of all targets, and of velocities beside positions, the share in which targets
     move on between two rows, the travel over which the dry friction of the nominal model sets in, and the scale of
-    recorded torques. A log does not say when within its period the controller read and acted, and no model says what
-    friction does at a reversal. So discovery leaves these free under every hypothesis; otherwise a delay, a friction or
-    a weak motor would be named for a robot that has none.
+    recorded torques, with their offset where they are all that says how the robot was driven. A log does not say when
+    within its period the controller read and acted, and no model says what friction does at a reversal. So discovery
+    leaves these free under every hypothesis; otherwise a delay, a friction or a weak motor would be named for a robot
+    that has none.
 
     Args:
       axes: coordinates of the rig.
@@ -121,7 +122,7 @@ def unknown_directions(
 
     Returns:
       [unknowns, axes] of the size of half a period, of half of the way between rows, of a typical travel, or of a
-      typical error of a motor's constant; and [unknowns, 2] least and largest coordinate.
+      typical error of a motor's constant or of a sensor's offset; and [unknowns, 2] least and largest coordinate.
     """
     # Nothing acts before it is time, and nothing is later than a whole period.
     common = {"sensor_delay": 0.5 / control_hz}
