@@ -16,17 +16,17 @@ DRAWS = np.random.default_rng(5).standard_normal((12, 2)).clip(-2, 2)
 
 
 def simulate(system, vector, segment, steps):
-    """A slider of `system` kg and 1 N s/m pushed by a force [steps]; coordinates are what is added to them."""
+    """A slider of 1 kg, 1 N s/m and `system` N of friction pushed by a force [steps]; coordinates are what is added."""
     del steps
     mass, damping, coulomb, push, _, cubic, wild, held = vector
 
     def step(state, force):
         x, v = state
         # Held, the slider is pulled back to the middle by what else would brake it.
-        rub = coulomb * jnp.tanh(jnp.where(held > 0, x, v) / 0.02) + cubic * x**3
+        rub = (system + coulomb) * jnp.tanh(jnp.where(held > 0, x, v) / 0.02) + cubic * x**3
         # A hypothesis that breaks the simulation wherever it is tried.
         broken = jnp.where(wild > 0, jnp.nan, 0.0)
-        v = v + DT * (force + push - (1.0 + damping) * v - rub) / (system * jnp.exp(mass)) + broken
+        v = v + DT * (force + push - (1.0 + damping) * v - rub) / jnp.exp(mass) + broken
         x = x + DT * v
         return (x, v), (x, v)
 
@@ -34,7 +34,7 @@ def simulate(system, vector, segment, steps):
     return {"q": x[:, None], "dq": v[:, None]}
 
 
-play = jax.jit(jax.vmap(lambda vector, segment: simulate(1.0, vector, segment, 0), (None, 0)))
+play = jax.jit(jax.vmap(lambda system, vector, segment: simulate(system, vector, segment, 0), (None, None, 0)))
 
 
 def hypothesis(name, bounds, probes, family="friction"):
@@ -75,7 +75,7 @@ EACH = replace(
 BOTH = (*HYPOTHESES[:2], ONE_SIZE, EACH)
 
 
-def measured(truth, seed, split=0, count=40, motion=None):
+def measured(truth, seed, split=0, count=40, motion=None, rubs=0.0):
     """Segments by horizon: the truth's motion with noise, from states that are known to within the noise."""
     rng, moved = np.random.default_rng((seed, 1)), np.random.default_rng(seed if motion is None else motion)
     vector = np.array([truth.get(axis, 0.0) for axis in AXES], np.float32)
@@ -87,7 +87,7 @@ def measured(truth, seed, split=0, count=40, motion=None):
         )
         start = {"x": moved.normal(0, 0.5, count), "v": moved.normal(0, 0.7, count), "force": force}
         start = {name: value.astype(np.float32) for name, value in start.items()}
-        read = {name: np.asarray(value) for name, value in play(vector, start).items()}
+        read = {name: np.asarray(value) for name, value in play(rubs, vector, start).items()}
         read = {name: value + NOISE * rng.standard_normal(value.shape) for name, value in read.items()}
         inputs = start | {name: start[name] + np.float32(NOISE) * rng.standard_normal(count) for name in ("x", "v")}
         inputs = {name: value.astype(np.float32) for name, value in inputs.items()}
@@ -113,19 +113,19 @@ HELD = replace(hypothesis("held", (0.0, 1.0), [0.5, 1.0]), name="coulomb", form=
 LEARNED = hypothesis("cubic", (-30.0, 30.0), [1.0])
 
 
-def problem(truth, seed=0, hypotheses=HYPOTHESES, forms=(), residual=None, sealed=None):
+def problem(truth, seed=0, hypotheses=HYPOTHESES, forms=(), residual=None, sealed=None, rubs=0.0):
     truths = {"train": truth, "select": truth, "sealed": truth if sealed is None else sealed}
     prior = np.array([0.1, 0.1, *np.zeros(len(AXES) - 2)])
     # Nobody knows the nominal parameters better than to a tenth.
     drawn = [{"mass": 0.1 * m, "damping": 0.1 * d} for m, d in DRAWS]
     splits = ("train", "select", "sealed")
     null_logs = [
-        {split: measured(one, 900 + 100 * k + i, k, motion=10 * seed + k) for k, split in enumerate(splits)}
+        {split: measured(one, 900 + 100 * k + i, k, motion=10 * seed + k, rubs=rubs) for k, split in enumerate(splits)}
         for i, one in enumerate(drawn)
     ]
     return Problem(
         simulate=simulate,
-        system=np.float32(1.0),
+        system=np.float32(rubs),
         axes=len(AXES),
         hypotheses=hypotheses,
         forms=forms,
@@ -134,7 +134,7 @@ def problem(truth, seed=0, hypotheses=HYPOTHESES, forms=(), residual=None, seale
         unknown_bounds=np.zeros((0, 2)),
         trees=np.array([0]),
         axis_trees=np.zeros(len(AXES), int),
-        data={split: measured(one, 10 * seed + i, i) for i, (split, one) in enumerate(truths.items())},
+        data={split: measured(one, 10 * seed + i, i, rubs=rubs) for i, (split, one) in enumerate(truths.items())},
         null_logs=null_logs,
         bin_rows=2,
         regimes=("steady",),

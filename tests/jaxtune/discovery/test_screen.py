@@ -14,8 +14,8 @@ from jaxtune.discovery.profile import Changes, profile_of
 from jaxtune.discovery.screen import _smallest, promising, screen
 
 
-def screened(truth, pairs=0, forms=(), unknowns=None, hypotheses=HYPOTHESES):
-    asked = problem(truth, forms=forms, hypotheses=hypotheses)
+def screened(truth, pairs=0, forms=(), unknowns=None, hypotheses=HYPOTHESES, rubs=0.0):
+    asked = problem(truth, forms=forms, hypotheses=hypotheses, rubs=rubs)
     if unknowns is not None:
         asked = replace(asked, unknowns=unknowns, unknown_bounds=np.tile([0.0, 2.0], (len(unknowns), 1)))
     floor, begun = state.begin(asked, noise_floor.measure(asked, lambda text: None))
@@ -53,9 +53,11 @@ def test_sizes_of_their_own_are_screened_in_a_form_too():
     one_size = replace(ONE_SIZE, directions=rows.sum(axis=0, keepdims=True), bounds=bounds[1:])
     held = replace(HELD, name="both", places=EACH.places, directions=HELD.directions + HYPOTHESES[4].directions)
     truth = {"damping": 1.0, "coulomb": 0.6, "held": 0.5}
-    lead = screened(truth, forms=(held,), hypotheses=(one_size, each)).leads[0]
-    assert [one.key for one in lead.hypotheses] == ["both@one&two", "both(held)@one+two"]
-    np.testing.assert_allclose(lead.point, [1.0, 0.6, 0.5], rtol=0.4)
+    # A form also holds the friction that the nominal model has.
+    for rubs in (0.0, 0.4):
+        lead = screened(truth, forms=(held,), hypotheses=(one_size, each), rubs=rubs).leads[0]
+        assert [one.key for one in lead.hypotheses] == ["both@one&two", "both(held)@one+two"]
+        np.testing.assert_allclose(lead.point, [1.0, 0.6, 0.5], rtol=0.4)
 
 
 def test_a_form_that_is_free_anyway_is_where_a_lead_begins():

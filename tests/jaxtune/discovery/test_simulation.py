@@ -20,7 +20,7 @@ def two_trees() -> tuple[Problem, Segments]:
     none = np.zeros((3, 4, 2))
     segments = Segments(inputs={"x": x}, signals={"q": none}, steps=4, run=np.arange(3), regimes=none.astype(int))
     fields = {name: value for name, value in vars(problem({})).items() if name not in ("data", "components")}
-    fields |= {"simulate": simulate, "axes": 3, "bin_rows": 2, "trees": np.array([0, 1])}
+    fields |= {"simulate": simulate, "system": np.float32(1.0), "axes": 3, "bin_rows": 2, "trees": np.array([0, 1])}
     fields |= {"axis_trees": np.array([0, 1, -1]), "components": {"q": ("one", "two")}}
     return Problem(**fields, data={"train": dict.fromkeys((0.1, 0.2, 0.4), segments)}), segments
 
