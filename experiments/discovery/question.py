@@ -2,6 +2,7 @@
 
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import jax.numpy as jnp
 import mujoco
@@ -97,26 +98,19 @@ def build_question(
     plain.check_matches(log.joints, rate)
     rig = plain.scaled(measure_scales(plain, unsealed))
     signals, partly = _compared(log)
-    # Errors of torque sensors are free, and no form of friction.
-    sensed = np.array([ours is not None and axis.effect in OF_SENSORS for axis in rig.axes])
-    axes = {(axis.effect, axis.place): number for number, axis in enumerate(rig.axes)}
-    told = {name for name, row in rig.effects.items() if ours is None or tells(row)}
-    library = {name: row for name, row in rig.effects.items() if name in LIBRARY and name in told}
-    every = hypotheses(rig.axes, rig.places, library)
-    unknowns, unknown_bounds = unknown_directions(rig.axes, rig.control_hz, signals, ours is not None)
+    follows = ours is not None
+    sensed = np.array([follows and axis.effect in OF_SENSORS for axis in rig.axes])
+    pushes = {axis.place: number for number, axis in enumerate(rig.axes) if axis.effect == "constant_push"}
     bin_rows = segments.rows_together(1.0 / log.rate_hz, BIN_S)
     measured = cut_log(log, rig.dt, signals, horizons)
     simulated = [followed(one, ours) for one in simulate_null_logs(log, spec, null_logs, seed)]
-    nulls = [told_alike(cut_log(one, rig.dt, signals, horizons), measured, ours is not None) for one in simulated]
+    nulls = [told_alike(cut_log(one, rig.dt, signals, horizons), measured, follows) for one in simulated]
     problem = Problem(
-        simulate=_Simulator(plain, plain.layout, signals, ours is not None),
+        simulate=_Simulator(plain, plain.layout, signals, follows),
         system=plain.system,
         values=rig.inner,
         axes=len(rig.axes),
-        hypotheses=every,
-        prior=np.array([axis.prior_sd if axis.effect in told else 0.0 for axis in rig.axes]),
-        unknowns=unknowns,
-        unknown_bounds=unknown_bounds,
+        **_free_or_asked(rig, signals, follows, sensed),
         trees=rig.trees,
         axis_trees=np.array([_one_tree(rig.trees[list(axis.joints)]) for axis in rig.axes]),
         data=measured,
@@ -125,12 +119,27 @@ def build_question(
         regimes=REGIMES,
         components={name: tuple("xyz") if name == "gravity" else rig.joints for name in signals},
         least_floor=_least_floor(unsealed[0], signals, bin_rows),
-        push={joint: axes["constant_push", joint] for joint in rig.joints},
-        forms=[form for form in forms(rig.axes, rig.effects, every) if not (form.directions[:, sensed] != 0).any()],
+        push=pushes,
         residual=learned_torque(rig.axes, LEARNED),
     )
     names = {split: tuple(run.name for run in runs) for split, runs in splits(log).items()}
     return Question(problem, spec, rig, log, sensed, names, (*log.notes, *notes, *partly, *stale_notes(unsealed)))
+
+
+def _free_or_asked(rig: Rig, signals: Sequence[str], follows: bool, sensed: np.ndarray) -> dict[str, Any]:
+    """What is free under every hypothesis, and what the hypotheses and their forms are: fields of the problem."""
+    told = {name: row for name, row in rig.effects.items() if not follows or tells(row)}
+    every = hypotheses(rig.axes, rig.places, {name: row for name, row in told.items() if name in LIBRARY})
+    unknowns, bounds = unknown_directions(rig.axes, rig.control_hz, signals, follows)
+    shapes = forms(rig.axes, rig.effects, every)
+    return {
+        "hypotheses": every,
+        # An error of a torque sensor is free, and no form of friction.
+        "forms": tuple(form for form in shapes if not (form.directions[:, sensed] != 0).any()),
+        "prior": np.array([axis.prior_sd if axis.effect in told else 0.0 for axis in rig.axes]),
+        "unknowns": unknowns,
+        "unknown_bounds": bounds,
+    }
 
 
 def _compared(log: Log) -> tuple[tuple[str, ...], tuple[str, ...]]:
