@@ -274,6 +274,7 @@ class Effect:
     forms: tuple[Form, ...] = ()
     """Other forms that it may have."""
     differs: bool = False
-    """True where robots often have it at all joints, in another size at each: no gears rub alike."""
+    """True where robots often have it at all joints, in another size at each: no two gears rub alike. What would stand
+    for any misfit of a joint, such as a scale of its torque, is better left out."""
     needs: Literal["", "free", "gravity"] = ""
     """What the log must offer: a robot with a free base, or a recorded gravity vector."""

@@ -189,7 +189,6 @@ ROWS = (
         parameters=(Parameter(name="ratio", form="ratio", bounds=(-1.0, 1.0), prior=0.3),),
         sizes=(0.05,),
         act=_torque_scale,
-        differs=True,
         sentence="The motor gives a fixed share of the commanded torque.",
         excited_by="a motor-off swing beside driven motion, which distinguishes torque from mass",
         **_ACTUATOR,
