@@ -167,6 +167,15 @@ def test_torques_that_were_sent_need_no_gain(good):
     assert any("torques are taken as sent to the motors" in note for note in check(sent, trust=True))
 
 
+def test_a_sign_that_looks_flipped_in_few_runs_alone_is_a_note(good):
+    again = [replace(run, name=f"{run.name}_again", condition=f"{run.condition} again") for run in good.runs]
+    first = signals(replace(good, runs=good.runs[:1]), q=lambda v: v * [1, -1], dq=lambda v: v * [1, -1])
+    log = replace(good, runs=(*first.runs, *good.runs[1:], *again))
+    assert any("flipped sign" in note for note in check(log))
+    with pytest.raises(ValueError, match="flipped sign"):
+        check(replace(log, runs=(*first.runs, *good.runs[1:])))
+
+
 def test_torques_beside_an_unknown_controller_were_measured(good):
     runs = []
     for run in without(good, "target").runs:
