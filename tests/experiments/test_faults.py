@@ -102,7 +102,7 @@ def found(monkeypatch):
 
     summary = {"verdict": "named", "effects": [{"name": "coulomb"}], "parameter_changes": []}
     monkeypatch.setattr(investigate, "read_logs", lambda *_: (None, None))
-    monkeypatch.setattr(investigate, "build_question", lambda *_: SimpleNamespace(problem=None, rig=None))
+    monkeypatch.setattr(investigate, "build_question", lambda *_: SimpleNamespace(problem=None, rig=None, sensed=False))
     monkeypatch.setattr(investigate.workflow, "discover", discover)
     monkeypatch.setattr(investigate, "free_runs", lambda *_: {})
     monkeypatch.setattr(
