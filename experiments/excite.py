@@ -130,11 +130,12 @@ def _described(args: Args) -> tuple[str, tuple[str, ...], Controller, Convention
 def _alike(folder: Path, robot: str | None) -> tuple[str, tuple[str, ...], Controller, Convention]:
     """Robot, joints, controller, units and signs of a log, which may be read with another model."""
     log = read_any(folder, robot and Path(robot))
-    if controller_of(log).kind == "unknown":
+    controller = controller_of(log)
+    if controller.kind == "unknown":
         raise ValueError(
             f"{folder}: controller.type: got unknown, expected one that plays targets: give --robot, --kp, ..."
         )
-    return log.robot, log.joints, controller_of(log), log.convention
+    return log.robot, log.joints, controller, log.convention
 
 
 def _check(args: Args) -> None:
