@@ -47,7 +47,7 @@ class Candidate:
 
 def of_further_sizes(hypotheses: Sequence[Hypothesis], price: float) -> float:
     """What sizes cost that hypotheses have beyond their first, with a price for every effect."""
-    return 0.5 * price * sum(hypothesis.more_sizes for hypothesis in hypotheses)
+    return price * sum(hypothesis.further for hypothesis in hypotheses)
 
 
 def key_of(hypotheses: Sequence[Hypothesis]) -> str:

@@ -60,6 +60,9 @@ def conclude(settings: Settings, problem: Problem, floor: NoiseFloor, state: Sta
     say("evidence")
     state = _where_it_shows(problem, at, _with_one_name(problem, at, state))
     best, terms, ablated, dropped = _proved(settings, problem, floor, state)
+    unit = units_of(problem, at, squares(at, best))[: len(problem.data["train"][at.horizon].run)]
+    errors = standard_errors(best.fit, unit)
+    terms = tuple(replace(term, clear=clear_places(best.fit, errors, term.hypothesis)) for term in terms)
     candidates, probabilities = _compared(problem, at, replace(state, best=best))
     terms = tuple(
         replace(term, confusable_with=rivals(at, candidates, probabilities, best, term.hypothesis, settings))
@@ -74,7 +77,6 @@ def conclude(settings: Settings, problem: Problem, floor: NoiseFloor, state: Sta
     )
     changed = _at_bounds(problem, best.fit, state.price) if explains else {}
     verdict = _verdict(problem, terms, changed) if explains else "unnamed"
-    errors = _errors(problem, at, best)
     terms = tuple(
         replace(term, forms=(*term.forms, *moved_forms(problem, best.fit, errors, term.hypothesis))) for term in terms
     )
@@ -100,12 +102,6 @@ def conclude(settings: Settings, problem: Problem, floor: NoiseFloor, state: Sta
             for one, probability in zip(candidates, probabilities, strict=True)
         },
     )
-
-
-def _errors(problem: Problem, at: Floor, candidate: Candidate) -> np.ndarray:
-    """Standard errors of the coordinates of a model with fresh slopes, [coordinates]."""
-    unit = units_of(problem, at, squares(at, candidate))[: len(problem.data["train"][at.horizon].run)]
-    return standard_errors(candidate.fit, unit)
 
 
 def _shares(
@@ -219,11 +215,7 @@ def _proved(
         best = replace(best, fit=fit)
     # What explains most is named first.
     ranked = sorted((row for row in weighed.values() if not row[0].form), key=lambda row: -row[1].gain)
-    errors = _errors(problem, at, best)
-    terms = tuple(
-        AcceptedTerm(h, evidence, of_effect(h), forms=best.forms_of(h), clear=clear_places(best.fit, errors, h))
-        for h, evidence, _ in ranked
-    )
+    terms = tuple(AcceptedTerm(h, evidence, of_effect(h), forms=best.forms_of(h)) for h, evidence, _ in ranked)
     return best, terms, {h.key: ablated.fit.vector for h, _, ablated in ranked}, tuple(dropped)
 
 

@@ -55,8 +55,8 @@ def _keys(group: Group) -> list[_Key]:
     if not forms:
         return [(int(axis),) for axis in np.flatnonzero((hypothesis.directions != 0).any(axis=0))]
     # Places are in the same order on the axes of every effect.
-    axes = [np.flatnonzero(one.directions[: 1 + one.more_sizes].any(axis=0)).tolist() for one in group]
-    return list(zip(*axes, strict=True))
+    rows = (one.directions if one.each else one.directions[:1] for one in group)
+    return list(zip(*(np.flatnonzero(row.any(axis=0)).tolist() for row in rows), strict=True))
 
 
 @dataclass(frozen=True)

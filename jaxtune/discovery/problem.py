@@ -63,14 +63,14 @@ class Hypothesis:
         return f"{self.name}{f'({self.form})' if self.form else ''}@{('&' if self.each else '+').join(self.places)}"
 
     @property
-    def more_sizes(self) -> int:
-        """How many sizes it has beyond the first."""
-        return len(self.places) - 1 if self.each else 0
+    def further(self) -> float:
+        """How many prices of an effect its sizes beyond the first cost: half of one each."""
+        return 0.5 * (len(self.places) - 1) if self.each else 0.0
 
     @property
     def worth(self) -> float:
-        """How many prices it costs: one of an effect, half of one for a form and for every further size."""
-        return (0.5 if self.form else 1.0) + 0.5 * self.more_sizes
+        """How many prices of an effect it costs: one, or half of one for a form, and its further sizes."""
+        return (0.5 if self.form else 1.0) + self.further
 
     def shapes(self, other: "Hypothesis") -> bool:
         """Says whether this is a form of another hypothesis."""
