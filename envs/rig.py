@@ -25,7 +25,7 @@ from envs.effects.memory import LONGEST_S
 from envs.held import unread_joints
 from envs.models import links, suspended
 from envs.segments import Segment
-from jaxtune.mjx import parameters
+from jaxtune.mjx import parameters, set_const
 from jaxtune.types import Effect, Parameter
 
 ByEffect = Mapping[str, Mapping[str, jax.Array]]
@@ -252,16 +252,15 @@ class Rig:
         return tuple(found)
 
     def model(self, values: ByEffect) -> mjx.Model:
-        """Makes the MJX model whose fields have the values of the effects that enter the model.
+        """Makes the MJX model that the effects change that enter the model, with its derived fields recomputed.
 
-        Every parameter of such an effect becomes a row of a table for `jaxtune.mjx.apply`, which recomputes the derived
-        fields as well.
+        Every parameter that names fields becomes a row of a table for `jaxtune.mjx.apply`. What has a function of its
+        own acts on the model that comes out.
         """
         entries, params = {}, {}
-        for name, row in self.effects.items():
-            if row.enters != "model":
-                continue
-            for parameter in row.parameters:
+        rows = {name: row for name, row in self.effects.items() if row.enters == "model"}
+        for name, row in rows.items():
+            for parameter in row.parameters if row.act is None else ():
                 key = f"{name}.{parameter.name}"
                 entries[key] = parameters.Entry(
                     kind=row.on,
@@ -272,7 +271,11 @@ class Rig:
                 )
                 inner = values[name][parameter.name]
                 params[key] = jnp.exp(inner) if parameter.form == "ratio" else inner
-        return parameters.apply(self._model, params, entries)
+        model = parameters.apply(self._model, params, entries)
+        for name, row in rows.items():
+            if row.act is not None:
+                model = row.act(values[name], model, self._bodies)
+        return set_const(model)
 
     def inner(self, vectors: np.ndarray) -> np.ndarray:
         """Translates vectors of coordinates [n, axes] into values [n, axes], the form that effects read.

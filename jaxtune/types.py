@@ -213,9 +213,9 @@ class Form:
 
     name: str
     effect: str
-    """Row that has the parameter: the effect itself, or another one that acts beside it at the same places."""
-    parameter: str | None = None
-    """None for all parameters of that row."""
+    """Row that has the parameters: the effect itself, or another one that acts beside it at the same places."""
+    parameters: tuple[str, ...] = ()
+    """Empty for all parameters of that row."""
     screened: bool = False
     """True where the effect may show in this form alone: it is screened with the form's smallest size too."""
 
@@ -224,8 +224,13 @@ class Form:
 class Effect:
     """A physical effect that a model may lack, such as friction, delay or play: one row of the discovery library.
 
-    An effect either changes fields of the model (`enters="model"`; its parameters name the fields) or acts on a signal
-    on its way between controller and joint. In that case
+    An effect either changes the model (`enters="model"`) or acts on a signal on its way between controller and joint.
+    Of the first kind the parameters name the model's fields, to which they add or which they multiply. Where that does
+    not describe it, there is
+
+        act(values, model, bodies) -> model
+
+    with the ids of the bodies that are its places. Of the second kind there is always
 
         act(values, signal, now, memory) -> (signal, memory)
 

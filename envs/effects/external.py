@@ -33,7 +33,7 @@ ROWS = (
             Parameter(name="n_s2_per_m2", scale="air", bounds=(-5.0, 5.0), prior=0.3),
         ),
         sizes=(0.03,),
-        forms=(Form("quadratic", "drag", "n_s2_per_m2"),),
+        forms=(Form("quadratic", "drag", ("n_s2_per_m2",)),),
         act=_drag,
         sentence="A cable or the air drags on the link in proportion to its speed.",
         excited_by="a motor-off swing and fast motion of several joints at once",

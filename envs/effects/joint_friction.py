@@ -11,11 +11,11 @@ from jaxtune.types import Effect, Form, Parameter
 
 _JOINT_FRICTION = {"family": "joint_friction", "on": "joint"}
 # The engine's own friction creeps under load, where a robot's joint holds: a fit with it may gain nothing.
-_PRESLIDING = Form("presliding", "presliding", "travel_rad", screened=True)
+_PRESLIDING = Form("presliding", "presliding", ("travel_rad",), screened=True)
 # While a joint slides, friction that differs between directions is symmetric friction and a constant torque.
-_DIRECTION = Form("direction_dependent", "constant_push", "nm")
+_DIRECTION = Form("direction_dependent", "constant_push", ("nm",))
 # A joint may stick harder and slide with the rest. The larger part gives the name.
-_STICTION, _SLIDING = Form("stiction", "stribeck"), Form("sliding", "coulomb", "torque_nm")
+_STICTION, _SLIDING = Form("stiction", "stribeck"), Form("sliding", "coulomb", ("torque_nm",))
 
 
 def _coulomb(values, bound, now, memory):
@@ -54,7 +54,7 @@ ROWS = (
             Parameter(name="nm_s_per_rad", scale="damping", bounds=(-0.5, 5.0), prior=0.3, fields=("dof_damping",)),
         ),
         sizes=(0.03,),
-        forms=(Form("quadratic", "learned_torque", "square_nm_s2_per_rad2"),),
+        forms=(Form("quadratic", "learned_torque", ("square_nm_s2_per_rad2",)),),
         differs=True,
         sentence="The joint loses a torque in proportion to its speed.",
         excited_by="a motor-off swing, or chirps at two amplitudes",

@@ -174,10 +174,10 @@ ROWS = (
         act=_backlash,
         start=_taken_up,
         forms=(
-            Form("compliant", "compliance", "nm_per_rad"),
-            Form("motor_friction", "backlash", "at_motor"),
+            Form("compliant", "compliance", ("nm_per_rad",)),
+            Form("motor_friction", "backlash", ("at_motor",)),
             # All that shows then is that the joint is not driven for a moment.
-            Form("joint_encoder", "joint_encoder", "at_joint", screened=True),
+            Form("joint_encoder", "joint_encoder", ("at_joint",), screened=True),
         ),
         sentence="The gears have backlash: the motor turns a little before the joint does.",
         excited_by="slow triangular reversals through the posture without gravity torque",
@@ -196,9 +196,9 @@ ROWS = (
         act=_compliance,
         start=_wound_up,
         forms=(
-            Form("hardening", "compliance", "hardening_per_rad2"),
-            Form("damped", "compliance", "nm_s_per_rad"),
-            Form("motor_friction", "compliance", "at_motor"),
+            Form("hardening", "compliance", ("hardening_per_rad2",)),
+            Form("damped", "compliance", ("nm_s_per_rad",)),
+            Form("motor_friction", "compliance", ("at_motor",)),
         ),
         sentence="A spring sits between motor and joint.",
         excited_by="a chirp through its resonance, and postures of high gravity torque",

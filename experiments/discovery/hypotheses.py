@@ -51,7 +51,7 @@ def forms(axes: Sequence[Axis], rows: Mapping[str, Effect], every: Sequence[Hypo
     """
     index = {(axis.effect, axis.parameter, axis.place): number for number, axis in enumerate(axes)}
     return tuple(
-        _as_form(_hypothesis(axes, index, rows[form.effect], one.places, form.parameter), one, form)
+        _as_form(_hypothesis(axes, index, rows[form.effect], one.places, form.parameters), one, form)
         for one in every
         # They are those of the same effect with one size.
         if not one.each
@@ -166,11 +166,11 @@ def learned_torque(axes: Sequence[Axis], row: Effect) -> Hypothesis:
 
 
 def _hypothesis(
-    axes: Sequence[Axis], index: Mapping, row: Effect, places: tuple[str, ...], parameter: str | None = None
+    axes: Sequence[Axis], index: Mapping, row: Effect, places: tuple[str, ...], names: Sequence[str] = ()
 ) -> Hypothesis:
-    """Makes the hypothesis of an effect in its first form, or of one of its parameters alone."""
-    later = {form.parameter for form in row.forms if form.effect == row.name}
-    parameters = [one for one in row.parameters if (one.name == parameter if parameter else one.name not in later)]
+    """Makes the hypothesis of an effect in its first form, or of some of its parameters alone."""
+    later = {name for form in row.forms if form.effect == row.name for name in form.parameters}
+    parameters = [one for one in row.parameters if (one.name in names if names else one.name not in later)]
     directions = np.zeros((len(parameters), len(axes)))
     bounds = np.array([one.bounds for one in parameters], float)
     for number, one in enumerate(parameters):

@@ -502,7 +502,8 @@ FIELDS = (*reference.FIELDS[:9], "body_inertia")
 INERTIAL = {
     "link_mass": {"upper": {"ratio": 0.8}, "lower": {"ratio": 1.3}},
     "com_offset": {"upper": {"x_m": 0.01, "y_m": -0.02, "z_m": 0.03}, "lower": {"x_m": -0.02, "z_m": 0.05}},
-    "payload": {"upper": {"kg": 0.3}, "lower": {"kg": 0.1}},
+    # At the end of an oblique arm, so that the principal axes turn.
+    "payload": {"upper": {"kg": 0.3}, "lower": {"kg": 0.1, "x_m": 0.08, "y_m": -0.05, "z_m": 0.1, "gyration_m": 0.02}},
     "armature": {"shoulder": {"kg_m2": 0.004}, "elbow": {"kg_m2": 0.03}},
     "viscous": {"shoulder": {"nm_s_per_rad": 0.07}, "elbow": {"nm_s_per_rad": -0.02}},
 }
@@ -517,7 +518,9 @@ def test_effects_of_the_model_are_the_model_recompiled(arm, names):
         for place, values in places.items():
             change(spec, nominal, name, place, values)
     expected, got = spec.compile(), arm.model(**wrong)
-    for field in FIELDS:
+    np.testing.assert_allclose(tensors(got), tensors(expected), rtol=1e-5, atol=1e-5 * tensors(expected).max())
+    # Principal axes have no order.
+    for field in (field for field in FIELDS if field != "body_inertia"):
         own = getattr(expected, field)
         np.testing.assert_allclose(getattr(got, field), own, rtol=1e-5, atol=1e-7 * np.abs(own).max(), err_msg=field)
     np.testing.assert_allclose(got.stat.meaninertia, expected.stat.meaninertia, rtol=1e-5)
@@ -542,9 +545,34 @@ def change(spec, nominal, effect, place, values):
         body.mass *= values["ratio"]
         body.inertia = body.inertia * values["ratio"]
     elif effect == "payload":
-        body.mass += values["kg"]
+        # About the link's frame: mass, first and second moment of both.
+        turn = np.zeros(9)
+        mujoco.mju_quat2Mat(turn, body.iquat)
+        turn = turn.reshape(3, 3)
+        second = turn @ np.diag(body.inertia) @ turn.T + body.mass * about_origin(body.ipos)
+        centre = body.ipos + [values.get(f"{axis}_m", 0.0) for axis in "xyz"]
+        second += values["kg"] * (about_origin(centre) + values.get("gyration_m", 0.0) ** 2 * np.eye(3))
+        whole = body.mass + values["kg"]
+        body.ipos = (body.mass * body.ipos + values["kg"] * centre) / whole
+        own = second - whole * about_origin(body.ipos)
+        body.mass, body.iquat, body.inertia = whole, [1.0, 0.0, 0.0, 0.0], np.zeros(3)
+        body.fullinertia = own[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
     else:
         body.ipos = body.ipos + [values.get(f"{axis}_m", 0.0) for axis in "xyz"]
+
+
+def about_origin(point):
+    """Second moment of a unit mass at a point, [3, 3]."""
+    return point @ point * np.eye(3) - np.outer(point, point)
+
+
+def tensors(model):
+    """Inertia of every body along the axes of its frame, [bodies, 3, 3]."""
+    turns = np.zeros((model.nbody, 9))
+    for turn, quat in zip(turns, np.asarray(model.body_iquat, float), strict=True):
+        mujoco.mju_quat2Mat(turn, quat)
+    turns = turns.reshape(-1, 3, 3)
+    return (turns * np.asarray(model.body_inertia)[:, None]) @ turns.swapaxes(1, 2)
 
 
 def test_without_effects_the_model_is_the_robots(arm):

@@ -312,16 +312,16 @@ def test_every_form_moves_the_axes_of_its_parameter_at_the_places_of_its_effect(
         parent, *others = [other for other in every if one.shapes(other)]
         assert all(other.each for other in others)
         (mine,) = [form for form in LIBRARY[one.name].forms if form.name == one.form]
-        parameters = [mine.parameter] if mine.parameter else [p.name for p in rig.effects[mine.effect].parameters]
+        parameters = mine.parameters or [p.name for p in rig.effects[mine.effect].parameters]
         for parameter, direction in zip(parameters, one.directions, strict=True):
             moved = [axis for axis, move in zip(rig.axes, direction, strict=True) if move]
             assert [(axis.effect, axis.parameter) for axis in moved] == [(mine.effect, parameter)] * len(parent.places)
             assert [axis.place for axis in moved] == list(parent.places)
         assert are_distinct(one, parent) and one.key != parent.key
-    # What a load beside the centre of mass adds is what an offset of the centre is on its own.
-    (beside,) = [one for one in found if one.key == "payload(off_centre)@lower"]
-    (offset,) = [one for one in every if one.key == "com_offset@lower"]
-    np.testing.assert_array_equal(beside.directions, offset.directions)
+    # Sticking friction that slides is what dry friction is on its own.
+    (part,) = [one for one in found if one.key == "stribeck(sliding)@elbow"]
+    (whole,) = [one for one in every if one.key == "coulomb@elbow"]
+    np.testing.assert_array_equal(part.directions, whole.directions)
 
 
 def test_sizes_hide_what_the_library_has_and_what_it_has_not():

@@ -16,7 +16,7 @@ from jaxtune.mjx import parameters
 WRONG = {
     "link_mass": {"upper": {"ratio": 1.2}},
     "com_offset": {"lower": {"x_m": 0.02, "y_m": -0.01}},
-    "payload": {"lower": {"kg": 0.2}},
+    "payload": {"lower": {"kg": 0.2, "x_m": 0.03, "z_m": -0.05}},
     "armature": {"elbow": {"kg_m2": 0.013}},
     "viscous": {"shoulder": {"nm_s_per_rad": 0.11}},
     "coulomb": {"elbow": {"torque_nm": 0.07}},
@@ -82,9 +82,9 @@ def test_saved_and_loaded_it_moves_the_same(arm, folder):
 
 def test_what_mujoco_has_a_form_for_is_in_the_mjcf(folder):
     model = mujoco.MjModel.from_xml_path(str(folder / "model.xml"))
-    # 1.2 kg x 1.2, and 0.6 + 0.2.
+    # 1.2 kg x 1.2, and 0.6 + 0.2, the latter at the end of an arm.
     np.testing.assert_allclose(model.body_mass[1:], [1.44, 0.8], rtol=1e-5)
-    np.testing.assert_allclose(model.body("lower").ipos, [0.02, -0.01, -0.125], atol=1e-6)
+    np.testing.assert_allclose(model.body("lower").ipos, [0.0275, -0.01, -0.1375], atol=1e-6)
     np.testing.assert_allclose(model.dof_armature, [0.01, 0.023], rtol=1e-5)
     np.testing.assert_allclose(model.dof_damping, [0.16, 0.05], rtol=1e-5)
     np.testing.assert_allclose(model.dof_frictionloss, [0.0, 0.07], rtol=1e-5)
