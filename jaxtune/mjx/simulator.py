@@ -21,13 +21,12 @@ from typing import Any
 import chex
 import jax
 import jax.numpy as jnp
-import mujoco
 from jax.tree_util import Partial
 from mujoco import mjx
 
 from jaxtune import dist as dists
 from jaxtune.mjx import environments, parameters
-from jaxtune.mjx.derived_fields import DERIVED
+from jaxtune.mjx.engine import Engine, value_of
 from jaxtune.mjx.entry import Entry
 from jaxtune.mjx.environments import WithModel, data_of, model_of, with_data, with_model
 from jaxtune.mjx.episodes import replay, rollout
@@ -86,25 +85,13 @@ class Simulator:
             object.__setattr__(self, "model", model_of(self.env))
         if not isinstance(self.steps, int) or self.steps < 1:
             raise ValueError(f"steps: got {self.steps!r}, expected at least 1, a whole number")
-        parameters.check(self._nominal, self.parameters)
-        self._check_warp()
+        self._engine.check()
         if not self.parameters:
             raise ValueError("parameters: got none, expected a row for each that may be wrong")
         environments.check_delay(self.env, self.parameters, self.steps)
         environments.check_reach(self.env, self.model, self.with_model)
         self._check_reset()
         self._check_influence()
-
-    def _check_warp(self) -> None:
-        """Checks that robots that Warp simulates side by side may differ in what the table changes."""
-        if not self._is_warp:
-            return
-        for name, entry in self.parameters.items():
-            for changed in sorted(set(entry.field_names) - set(self._written(self.parameters))):
-                raise ValueError(
-                    f"parameter '{name}', fields: got '{changed}', which MJX's Warp implementation has once for all "
-                    "robots; expected another field, or an environment with impl='jax'"
-                )
 
     def _check_reset(self) -> None:
         """Checks what an environment starts with, by shape: one robot, and the observation that `observe` names."""
@@ -334,14 +321,14 @@ class Simulator:
                     f"parameter '{name}': it is not part of the model, so no randomization_fn can draw it; expected it "
                     f"in leave_out=('{name}',), or a training that draws it itself"
                 )
-        changed = self._written(table)
+        changed = self._engine.written(table)
 
         def randomize(model: mjx.Model, rng: jax.Array) -> tuple[mjx.Model, mjx.Model]:
             def fields(key):
                 drawn = {name: draws[0] for name, draws in dists.sample(key, dist, 1).items() if name in table}
-                nominal = self._nominal if self._is_warp else model
+                nominal = self._engine.nominal if self._engine.is_warp else model
                 robot = parameters.apply(nominal, parameters.from_coords(table, drawn), table)
-                return {name: _get(robot, name) for name in changed}
+                return {name: value_of(robot, name) for name in changed}
 
             axes = jax.tree.map(lambda _: None, model).tree_replace(dict.fromkeys(changed, 0))
             return model.tree_replace(jax.vmap(fields)(rng)), axes
@@ -355,39 +342,11 @@ class Simulator:
         return (self.observe,) if isinstance(self.observe, str) else tuple(self.observe or ())
 
     def _env(self, params: Params) -> Any:
-        model = parameters.apply(self._nominal, params, self.parameters)
-        if self._is_warp:
-            model = self.model.tree_replace({name: _get(model, name) for name in self._written(self.parameters)})
-        return self.with_model(self.env, model)
-
-    @property
-    def _is_warp(self) -> bool:
-        return getattr(self.model, "impl", None) == mjx.Impl.WARP
+        return self.with_model(self.env, self._engine.robot(params))
 
     @cached_property
-    def _nominal(self) -> mjx.Model:
-        """The nominal model in the implementation whose stages JAX traces, which make the derived fields."""
-        if not self._is_warp:
-            return self.model
-        source = getattr(self.env, "mj_model", None)
-        if not isinstance(source, mujoco.MjModel):
-            raise ValueError(
-                f"env: got {type(self.env).__name__} with a model of impl='warp' but no mj_model, expected the MjModel "
-                "that it was made of, or impl='jax'"
-            )
-        made = mjx.put_model(source, impl="jax")
-        # What was changed after the model was made counts.
-        return made.tree_replace({name: _get(self.model, name) for name in self._written(self.parameters)})
-
-    def _written(self, table: Mapping[str, Entry]) -> tuple[str, ...]:
-        """Fields that differ between robots: those of a table, and what follows from them."""
-        every = {*DERIVED, *(changed for entry in table.values() for changed in entry.field_names)}
-        if self._is_warp:
-            # Warp reads neither the diagonal of the inertia nor its mean.
-            from mujoco.mjx.warp import types
-
-            every = {name for name in every if types._BATCH_DIM["Model"].get(name.replace(".", "__"))}
-        return tuple(sorted(every))
+    def _engine(self) -> Engine:
+        return Engine(self.env, self.model, self.parameters)
 
     @staticmethod
     def _as_state(own, *, reward, **fields) -> State:
@@ -406,9 +365,3 @@ class Simulator:
 def _check_act(act: Any) -> None:
     if not callable(act):
         raise ValueError(f"act: got {type(act).__name__}, expected a function (policy, observation, key) -> action")
-
-
-def _get(model: mjx.Model, path: str) -> jax.Array:
-    for name in path.split("."):
-        model = getattr(model, name)
-    return model
