@@ -42,6 +42,11 @@ class Question:
     notes: tuple[str, ...]
     """Sentences about what was made of the log: signals that are not used, and why, and how it was split."""
 
+    @property
+    def of_whole_runs(self) -> str:
+        """The signal by which whole runs are judged: positions, or torques where motion is followed in any case."""
+        return "tau" if self.problem.simulate.follows else "q"
+
 
 @dataclass(frozen=True)
 class _Simulator:

@@ -43,6 +43,7 @@ FAILED = {
 }
 """Why an effect was taken out of the model again, by the test of `jaxtune.discovery.evidence.passes` that it failed."""
 
+_UNITS = {"q": ("rad", "m"), "tau": ("Nm", "N")}  # of hinges and slides
 _SHOWN = 4  # suspects on the console
 _MUCH = 5.0  # floor units; of 16 answers that left as much in the benchmarks, 7 were wrong or lacked an effect
 _HARDLY = 0.2  # share of the gap
@@ -61,7 +62,8 @@ def write(path: Path, log: Log, question: Question, result: Result, summary: dic
       summary: of `experiments.discovery.summary.summarise`.
       free: of `experiments.discovery.summary.free_runs`.
     """
-    pictures = {"where": plots.heat_map(result.where), "traces": plots.traces(free["runs"], log.joints)}
+    traces = plots.traces(free["runs"], log.joints, _UNITS[free["signal"]][0])
+    pictures = {"where": plots.heat_map(result.where), "traces": traces}
     brief = partial(brief_keys, question)
     if result.terms:
         pictures["terms"] = plots.accepted_terms(result.terms, [brief(term.hypothesis.key) for term in result.terms])
@@ -85,6 +87,7 @@ def write(path: Path, log: Log, question: Question, result: Result, summary: dic
         failed=partial(_failed, summary),
         reasons=_reasons,
         named=_named,
+        whole_runs=_whole_runs(free),
         free=free,
         pictures={name: plots.embedded(figure) for name, figure in pictures.items()},
     )
@@ -122,9 +125,9 @@ def show(console: Console, question: Question, summary: dict, free: dict) -> Non
             why = f"may only make up for the form of {brief_keys(question, effect['refines'])}"
         say(f"accepted, not named: {name}, which {why}")
     table = Table("error on held-out runs", "nominal model", "parameters fitted", "corrected model")
-    gap, error = summary["gap"], free["error_rad"]["sealed"]
+    gap, error = summary["gap"], free["error"]["sealed"]
     table.add_row("short segments, floor units", *(f"{gap[name]:.2f}" for name in ("before", "null", "after")))
-    table.add_row("whole runs, mean in rad or m", *(f"{error[name]:.4f}" for name in ("before", "null", "after")))
+    table.add_row(_whole_runs(free), *(f"{error[name]:.4f}" for name in ("before", "null", "after")))
     console.print(table)
     if summary["effects"] or summary["not_named"]:
         say(f"explained: {summary['explained_share']:.0%} of what can be explained")
@@ -151,6 +154,10 @@ def show(console: Console, question: Question, summary: dict, free: dict) -> Non
         say("the corrected model was withdrawn: on held-out runs it was worse than the one that is saved")
     if summary["not_testable"]:
         say(f"effects that these logs could not show: {', '.join(summary['not_testable'])}")
+
+
+def _whole_runs(free: dict) -> str:
+    return f"whole runs, mean absolute error in {' or '.join(_UNITS[free['signal']])}"
 
 
 def _doubt(summary: dict) -> str:

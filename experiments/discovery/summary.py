@@ -165,15 +165,16 @@ def free_runs(question: Question, result: Result) -> dict:
       result: what was found.
 
     Returns:
-      `runs`: name, split, time in s, positions in rad [rows, joints] (`measured`, `before`, `null`, `after`) and their
-      mean absolute errors; `error_rad`: means of these errors by split and model.
+      `signal`: what is compared (`Question.of_whole_runs`); `runs`: name, split, time in s, values of the signal
+      [rows, joints] (`measured`, `before`, `null`, `after`) and their mean absolute errors (`error`), in rad, Nm or
+      what slides have; `error`: means of these errors by split and model.
     """
     vectors = {"before": np.zeros(len(question.rig.axes)), "null": result.null.vector, "after": result.proposed}
     rows, simulated = simulate_runs(question, question.log.runs, np.stack(list(vectors.values())))
     splits = {name: split for split, names in question.splits.items() for name in names}
     runs = []
-    for recorded, own, positions in zip(question.log.runs, rows, simulated, strict=True):
-        measured, found = recorded.signals["q"][own], dict(zip(vectors, positions, strict=True))
+    for recorded, own, played in zip(question.log.runs, rows, simulated, strict=True):
+        measured, found = recorded.signals[question.of_whole_runs][own], dict(zip(vectors, played, strict=True))
         runs.append(
             {
                 "run": recorded.name,
@@ -181,17 +182,15 @@ def free_runs(question: Question, result: Result) -> dict:
                 "time": recorded.time[own] - recorded.time[own[0]],
                 "measured": measured,
                 **found,
-                "error_rad": {name: float(np.abs(values - measured).mean()) for name, values in found.items()},
+                "error": {name: float(np.abs(values - measured).mean()) for name, values in found.items()},
             }
         )
-    return {"runs": runs, "error_rad": _mean_errors(runs, list(vectors))}
+    return {"signal": question.of_whole_runs, "runs": runs, "error": _mean_errors(runs, list(vectors))}
 
 
 def _mean_errors(runs: Sequence[Mapping], names: Sequence[str]) -> dict[str, dict[str, float]]:
     return {
-        split: {
-            name: float(np.mean([run["error_rad"][name] for run in runs if run["split"] == split])) for name in names
-        }
+        split: {name: float(np.mean([run["error"][name] for run in runs if run["split"] == split])) for name in names}
         for split in ("train", "select", "sealed")
     }
 
@@ -204,6 +203,7 @@ def details(question: Question, result: Result, free: dict) -> dict:
       result: what was found.
       free: whole simulated runs, of `free_runs`.
     """
+    unit = {"q": "rad", "tau": "nm"}[free["signal"]]
     return {
         "notes": question.notes,
         "ladder": [
@@ -225,6 +225,8 @@ def details(question: Question, result: Result, free: dict) -> dict:
         "needs_torque": result.needs_torque,
         "not_finite": result.not_finite,
         "proof": result.proof,
-        "free_run_error_rad": free["error_rad"],
-        "free_runs": [{name: run[name] for name in ("run", "split", "error_rad")} for run in free["runs"]],
+        f"free_run_error_{unit}": free["error"],
+        "free_runs": [
+            {"run": run["run"], "split": run["split"], f"error_{unit}": run["error"]} for run in free["runs"]
+        ],
     }

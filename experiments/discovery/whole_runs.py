@@ -30,7 +30,7 @@ def simulate_runs(
       vectors: [vectors, axes] coordinates.
 
     Returns:
-      By run: its rows that are simulated [rows], and their positions in rad, [vectors, rows, joints].
+      By run: its rows that are simulated [rows], and there `Question.of_whole_runs`, [vectors, rows, joints].
     """
     rig, problem = question.rig, question.problem
     cut = segments.whole(runs, rig.dt)
@@ -43,7 +43,8 @@ def simulate_runs(
         # The last call is filled up: another width would be another program.
         mine = np.resize(np.arange(start, min(start + _WIDTH, len(which))), _WIDTH)
         some = jax.tree.map(lambda leaf, mine=mine: leaf[piece[mine]], inputs)
-        found.append(_play(problem.simulate, problem.system, values[which[mine]], some, steps))
+        signal = question.of_whole_runs
+        found.append(_play(problem.simulate, signal, problem.system, values[which[mine]], some, steps))
     every = np.concatenate(found)[: len(which)].reshape(len(vectors), len(runs), *found[0].shape[1:])
     rows = [np.unique(row) for row in cut.row]
     return rows, [
@@ -55,10 +56,10 @@ def simulate_runs(
 
 
 @devices.on_all
-@partial(jax.jit, static_argnums=0)
-def _play(simulate, system, values, inputs, steps):
+@partial(jax.jit, static_argnums=(0, 1))
+def _play(simulate, signal, system, values, inputs, steps):
     def some(system, steps, values, inputs):
-        return jax.vmap(lambda value, one: simulate(system, value, one, steps)["q"])(values, inputs)
+        return jax.vmap(lambda value, one: simulate(system, value, one, steps)[signal])(values, inputs)
 
     return devices.spread(some, (values, inputs), shared=(system, steps))
 

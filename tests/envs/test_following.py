@@ -13,6 +13,7 @@ from envs.following import followed, follower
 from envs.logs import Controller, Log, Run, read, write
 from envs.rig import Rig
 from experiments.discovery.question import build_question
+from experiments.discovery.whole_runs import simulate_runs
 from tests.rigs import ARM, ARM_JOINTS, Player
 
 UNKNOWN = Controller(kind="unknown", rate_hz=1000.0, gains={})
@@ -208,3 +209,11 @@ def test_what_a_controller_does_is_no_question_where_ours_follows(spec):
             # Null logs are followed by their own readings, and share the rest.
             assert np.abs(own.inputs.target - measured.inputs.target).max() > 0
             assert own.inputs.feed is measured.inputs.feed
+    # Positions would say nothing of whole runs.
+    assert question.of_whole_runs == "tau"
+    rubbing = np.array([0.5 * (axis.effect == "coulomb" and axis.place == "elbow") for axis in question.rig.axes])
+    rows, found = simulate_runs(question, question.log.runs[:1], np.stack([0.0 * rubbing, rubbing]))
+    measured = log.runs[0].signals["tau"][rows[0]]
+    nominal, rubbed = (np.abs(torque - measured).mean(axis=0) for torque in found[0])
+    assert (nominal < 0.1 * np.abs(measured).mean(axis=0)).all()
+    assert rubbed[1] > 3.0 * nominal[1]

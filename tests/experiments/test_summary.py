@@ -144,7 +144,7 @@ def test_page_and_console_say_what_was_found(tmp_path, asked, withdrawn):
     summary, free = summarise(question, log, Path("logs"), result), free_runs(question, result)
     assert {run["split"] for run in details(question, result, free)["free_runs"]} == {"train", "select", "sealed"}
     # What was proposed is simulated, whether or not it was withdrawn.
-    assert abs(free["error_rad"]["train"]["after"] - free["error_rad"]["train"]["null"]) > 1e-3
+    assert abs(free["error"]["train"]["after"] - free["error"]["train"]["null"]) > 1e-3
     report.write(tmp_path / "page.html", log, question, result, summary, free)
     page = (tmp_path / "page.html").read_text()
     assert ("was withdrawn" in page) is withdrawn

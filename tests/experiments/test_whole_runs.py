@@ -35,7 +35,8 @@ def asked():
     short = replace(first, time=first.time[:120], signals={name: v[:120] for name, v in first.signals.items()})
     rig = Rig(spec, JOINTS, 1000.0)
     problem = SimpleNamespace(simulate=_Simulator(rig, rig.layout, ("q",)), system=rig.system)
-    return SimpleNamespace(rig=rig, problem=problem, spec=spec), replace(log, runs=(short, *log.runs[1:3]))
+    question = SimpleNamespace(rig=rig, problem=problem, spec=spec, of_whole_runs="q")
+    return question, replace(log, runs=(short, *log.runs[1:3]))
 
 
 def vector(rig, **coordinates):

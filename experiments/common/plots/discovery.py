@@ -77,13 +77,14 @@ def heat_map(cells: Sequence[dict]) -> plt.Figure:
     return figure
 
 
-def traces(runs: Sequence[dict], joints: Sequence[str], most: int = 6) -> plt.Figure:
-    """Draws measured and simulated positions of whole runs, in each run for the joint with the largest error.
+def traces(runs: Sequence[dict], joints: Sequence[str], unit: str = "rad", most: int = 6) -> plt.Figure:
+    """Draws what was measured and simulated in whole runs, in each run for the joint with the largest error.
 
     Args:
       runs: rows of `experiments.discovery.summary.free_runs`. Sealed runs (the held-out test) come first and have a red
         frame.
       joints: names in the log's order.
+      unit: of the signal.
       most: largest number of runs that are drawn.
     """
     shown = sorted(runs, key=lambda run: run["split"] != "sealed")[:most]
@@ -97,12 +98,12 @@ def traces(runs: Sequence[dict], joints: Sequence[str], most: int = 6) -> plt.Fi
         axis.plot(run["time"], run["measured"][:, joint], color="black", lw=1.5, label="measured")
         axis.plot(run["time"], run["null"][:, joint], color="tab:orange", lw=1.0, label="nominal parameters fitted")
         axis.plot(run["time"], run["after"][:, joint], color="tab:blue", lw=1.0, label="corrected model")
-        error = run["error_rad"]
+        error = run["error"]
         axis.set_title(
-            f"{run['run']} ({run['split']}): {joints[joint]}, {error['null']:.3f} -> {error['after']:.3f} rad",
+            f"{run['run']} ({run['split']}): {joints[joint]}, {error['null']:.3f} -> {error['after']:.3f} {unit}",
             fontsize=9,
         )
-        axis.set(xlabel="s", ylabel="rad")
+        axis.set(xlabel="s", ylabel=unit)
         axis.grid(alpha=0.3)
         if run["split"] == "sealed":
             for spine in axis.spines.values():
