@@ -186,8 +186,9 @@ def _presented(summary: dict, question: Question) -> list[dict]:
 
 def _failed(summary: dict, suspect: Mapping) -> list[str]:
     """The tests that a suspect failed when it was taken out of the model again; none where it was not."""
-    same = [one for one in summary["dropped"] if not one["form"] and one["name"] == suspect["name"]]
-    return next((one["failed"] for one in same if one["places"] == suspect["places"]), [])
+    identity = ("name", "places", "each")
+    same = [one for one in summary["dropped"] if all(one[key] == suspect[key] for key in identity)]
+    return next((one["failed"] for one in same if not one["form"]), [])
 
 
 def _named(effect: Mapping) -> str:
@@ -200,8 +201,13 @@ def _reasons(failed: Sequence[str]) -> str:
 
 
 def place_in_words(question: Question, effect: Mapping) -> str:
-    """Names the places of an effect, suspect or family of the summary, such as `all joints` for six names."""
-    return brief_keys(question, f"@{'+'.join(effect['places'])}")[1:].replace("+", ", ")
+    """Names the places of an effect, suspect or family of the summary, such as `all joints` for six names.
+
+    Of one that has a size of its own at every place it is `each joint`.
+    """
+    between = "&" if effect.get("each") else "+"
+    words = brief_keys(question, f"@{between.join(effect['places'])}")[1:]
+    return f"each of {words.replace('&', ', ')}" if "&" in words else words.replace("+", ", ")
 
 
 def brief_keys(question: Question, text: str) -> str:

@@ -54,6 +54,7 @@ def summarise(question: Question, log: Log, folder: Path, result: Result) -> dic
             {
                 "name": one.hypothesis.name,
                 "places": list(one.hypothesis.places),
+                "each": one.hypothesis.each,
                 "form": one.hypothesis.form or None,
                 "failed": list(one.failed),
             }
@@ -71,6 +72,7 @@ def summarise(question: Question, log: Log, folder: Path, result: Result) -> dic
             {
                 "name": one.hypothesis.name,
                 "places": list(one.hypothesis.places),
+                "each": one.hypothesis.each,
                 "form": _names(one.forms),
                 "probability": one.probability,
             }

@@ -151,6 +151,9 @@ def test_a_page_names_all_places_at_once():
     assert report.place_in_words(question, {"name": "coulomb", "places": ["knee"]}) == "knee"
     assert report.place_in_words(question, {"name": "coulomb", "places": ["hip", "knee"]}) == "all joints"
     assert report.place_in_words(question, {"name": "link_mass", "places": ["shank", "thigh"]}) == "shank, thigh"
+    own = {"name": "coulomb", "each": True}
+    assert report.place_in_words(question, own | {"places": ["hip", "knee"]}) == "each joint"
+    assert report.place_in_words(question, own | {"places": ["hip", "ankle"]}) == "each of hip, ankle"
 
 
 @pytest.mark.parametrize(
