@@ -18,7 +18,8 @@ from envs.logs import Controller, Log, write
 from experiments.common.checkpoint import write_json
 from experiments.discovery.benchmark import Benchmark
 from experiments.discovery.blind_cases import SIZE_BOUNDS, SIZES, Case
-from experiments.discovery.blind_robots import Truth, record
+from experiments.discovery.blind_drive import Truth
+from experiments.discovery.blind_robots import record
 from experiments.discovery.cutting import HORIZONS_S
 from experiments.discovery.excitation import excitation
 from experiments.discovery.question import Question, build_question

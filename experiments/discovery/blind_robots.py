@@ -8,34 +8,20 @@ Readings are noisy and rounded.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 
 from envs.logs import Controller, Log, Run
 from envs.models import suspended
+from experiments.discovery.blind_drive import STEP_S, Bristles, Control, Motors, Sensors, Truth
 from experiments.discovery.target_runs import TargetRun, scaled
 
-_STEP_S = 0.0004
-_BRISTLE = 2000.0  # 1/rad: one over the displacement at which bristles slip
 _ENCODER_RAD = 2 * np.pi / 2**14  # 14 bits, common for joint encoders
 _SPEED_NOISE, _SPEED_QUANTUM = 0.01, 0.005  # standard deviation and rounding of joint velocities, rad/s
 
 OUTSIDE = ("cogging", "temperature_fade", "cable_stiffness", "loose_foot")
 """Effects that the library does not have, so that the right verdict is `unnamed`."""
-
-
-@dataclass(frozen=True)
-class Truth:
-    """What is hidden in a robot. Only the scorer reads it; discovery never does."""
-
-    effect: str | None
-    """Name of the effect, of the library or of `OUTSIDE`; None hides nothing."""
-    places: tuple[str, ...] = ()
-    """Names of the joints or bodies that have it."""
-    size: float = 0.0
-    """Value of the effect's first parameter, in its unit."""
 
 
 def record(
@@ -111,7 +97,7 @@ class _Robot:
             # What the joint carried stays with the motor; the spare hinge is light.
             model.dof_armature[model.joint(f"{name}_play").dofadr[0]] = 1e-4
             model.dof_damping[model.joint(f"{name}_play").dofadr[0]] = 0.02
-        model.opt.timestep = _STEP_S
+        model.opt.timestep = STEP_S
         model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICIT
         model.opt.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION
@@ -120,7 +106,7 @@ class _Robot:
         model.dof_armature[self.dof] *= [off() for _ in joints]
         model.dof_damping[self.dof] *= [off() for _ in joints]
         self._friction = model.dof_frictionloss[self.dof] * np.array([off() for _ in joints])
-        model.dof_frictionloss[:] = 0.0  # `_rub` has it, as a bristle model
+        model.dof_frictionloss[:] = 0.0  # `Bristles` has it
         # Gains are set and not measured: they are taken to be wrong by a third as much.
         self._gain = np.array([off() for _ in joints]) ** 0.3
         self._at = np.array([name in truth.places for name in joints], float)
@@ -182,132 +168,29 @@ class _Robot:
         Returns:
           Positions in rad and speeds in rad/s as the sensors see them, [rows, joints] each, before noise.
         """
-        truth, model, at = self._truth, self._model, self._at
-        effect, size = truth.effect, truth.size
+        truth, at, model = self._truth, self._at, self._model
         data = mujoco.MjData(model)
         data.qpos[self.qpos] = motion.target[0]
-        count = int(np.ceil(motion.time[-1] / _STEP_S)) + 2
-        period = 1.0 / controller.rate_hz
-        gains = {name: np.asarray(values) for name, values in controller.gains.items()}
-        kp = gains["kp"] * self._gain * (np.where(at > 0, size, 1.0) if effect == "gain_error" else 1.0)
-        limit, kd = gains["torque_limit_nm"], gains["kd"]
-        seconds = size if effect in ("command_delay", "sensor_delay") else 0.0
-        behind = round(seconds / _STEP_S)
-        read = np.empty((count, 2, len(at)))
-        # Real controllers are late by a part of their period; discovery has to find the timing by itself.
-        tick, jitter = 0.0, rng.uniform(0, 0.3) * period
-        held = np.zeros(len(at))
-        slewed = motion.target[0].copy()
-        lag, lag_read = np.zeros((2, len(at))), None
-        bristle = np.zeros(len(at))
-        rate = 1.0 / float(np.median(np.diff(motion.time)))
-
-        def row_of(time: float) -> int:
-            return min(max(int(time * rate + 1e-6), 0), len(motion.target) - 1)
-
-        torque = np.zeros(len(at))
-        for step in range(count):
-            now = step * _STEP_S
+        read, control = Sensors(truth, at), Control(truth, at, motion, controller, self._gain, rng)
+        drive, rub = Motors(truth, at, control.limit), Bristles(truth, at, self._friction)
+        grid = np.arange(int(np.ceil(motion.time[-1] / STEP_S)) + 2) * STEP_S
+        seen = np.empty((len(grid), 2, len(at)))
+        for step, now in enumerate(grid):
             position, speed = data.qpos[self.qpos], data.qvel[self.dof]
-            seen = np.stack([position, speed])
-            if effect == "encoder_bias":
-                seen[0] += size * at
-            if effect == "sensor_lag":
-                lag_read = np.stack([seen, seen]) if lag_read is None else lag_read
-                share = _STEP_S / (0.5 * size)  # two equal stages, each with half of the time constant
-                lag_read[0] += share * (seen - lag_read[0])
-                lag_read[1] += share * (lag_read[0] - lag_read[1])
-                seen = np.where(at > 0, lag_read[1], seen)
-            read[step] = seen
-            if effect == "sensor_delay":
-                read[step] = np.where(at > 0, self._past(read_true := seen, step, behind), read_true)
-            seen = read[step]
-            enabled = motion.enabled[row_of(now)]
-            if now >= tick + jitter:
-                tick += period
-                jitter = rng.uniform(0, 0.3) * period
-                target = motion.target[row_of(now)]
-                if effect == "command_delay":
-                    target = np.where(at > 0, motion.target[row_of(now - size)], target)
-                if effect == "target_slew":
-                    slewed = slewed + np.clip(target - slewed, -size * period, size * period)
-                    target = np.where(at > 0, slewed, target)
-                error = target - seen[0]
-                if effect == "deadband":
-                    soft = np.where(np.abs(error) > size / 2, error - np.sign(error) * size / 2, 0.0)
-                    error = np.where(at > 0, soft, error)
-                held = enabled * np.clip(kp * error - kd * seen[1], -limit, limit)
-            torque = self._motor(held, speed, limit, lag, now / motion.time[-1])
-            bristle, friction = self._rub(bristle, speed, torque)
-            outside = self._outside(position, now)
-            data.qfrc_applied[self.dof] = torque - friction + outside
+            seen[step] = read(position, speed)
+            torque = drive(control(now, seen[step]), speed, now / motion.time[-1])
+            data.qfrc_applied[self.dof] = torque - rub(speed, torque) + self._outside(position)
             for body, drag in self._drag:
                 velocity = np.zeros(6)
                 mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, body, velocity, 0)
                 data.xfrc_applied[body, :3] = -drag * velocity[3:]
             mujoco.mj_step(model, data)
-        grid = np.arange(count) * _STEP_S
         position, speed = (
-            np.stack([np.interp(motion.time, grid, column) for column in read[:, kind].T], axis=1) for kind in (0, 1)
+            np.stack([np.interp(motion.time, grid, column) for column in seen[:, kind].T], axis=1) for kind in (0, 1)
         )
         return position, speed
 
-    def _past(self, seen, step, behind):
-        """Returns the readings of `behind` steps ago; before the start, those of the first step."""
-        if step == 0:
-            self._line = [seen] * (behind + 1)
-        self._line.append(seen)
-        return self._line[-1 - behind]
-
-    def _motor(self, held, speed, limit, lag, share) -> np.ndarray:
-        """Returns the torque that the motors give for the torque that the controller holds, `share` into the run."""
-        effect, size, at = self._truth.effect, self._truth.size, self._at
-        torque = held
-        if effect == "torque_lag":
-            step = _STEP_S / (0.5 * size)
-            lag[0] += step * (torque - lag[0])
-            lag[1] += step * (lag[0] - lag[1])
-            torque = np.where(at > 0, lag[1], torque)
-        if effect == "torque_limit":
-            torque = np.where(at > 0, size * np.tanh(torque / size), torque)
-        if effect == "torque_speed":
-            most = np.maximum(limit - size * np.abs(speed), 0.0)
-            driving = torque * speed > 0
-            torque = np.where((at > 0) & driving, np.clip(torque, -most, most), torque)
-        if effect == "torque_scale":
-            torque = np.where(at > 0, size * torque, torque)
-        if effect == "temperature_fade":
-            torque = np.where(at > 0, (1.0 - size * share) * torque, torque)
-        return torque
-
-    def _rub(self, bristle, speed, torque) -> tuple[np.ndarray, np.ndarray]:
-        """Moves the bristles of the LuGre model by a step.
-
-        With deflection z and speed v: dz/dt = v - s |v| z / g(v), torque = s z + d dz/dt. The level is
-        g(v) = slide + (stick - slide) exp(-(v / 0.15)^2), which holds Coulomb, load and Stribeck friction.
-
-        Returns:
-          The bristles' deflection and the torque of friction in Nm, [joints] each.
-        """
-        effect, size, at = self._truth.effect, self._truth.size, self._at
-        slides = self._friction.copy()
-        if effect == "coulomb":
-            slides = slides + size * at
-        if effect == "load_friction":
-            slides = slides + size * at * np.abs(torque)
-        sticks = slides.copy()
-        if effect == "stribeck":
-            sticks = sticks + size * at
-        level = slides + (sticks - slides) * np.exp(-((speed / 0.15) ** 2))
-        there = level > 1e-9
-        stiffness = _BRISTLE * np.maximum(level, 1e-9)
-        rate = speed - stiffness * np.abs(speed) / np.maximum(level, 1e-9) * bristle
-        # Implicit in the bristle: the explicit form is unstable where speed is high.
-        bristle = np.where(there, (bristle + _STEP_S * speed) / (1 + _STEP_S * _BRISTLE * np.abs(speed)), 0.0)
-        damping = 0.3 * np.sqrt(stiffness * 1e-3)
-        return bristle, np.where(there, stiffness * bristle + damping * np.where(np.abs(speed) < 0.05, rate, 0.0), 0.0)
-
-    def _outside(self, position, now) -> np.ndarray:
+    def _outside(self, position) -> np.ndarray:
         """Returns torques in Nm that depend on position alone: a push, cogging, or a cubic cable spring."""
         effect, size, at = self._truth.effect, self._truth.size, self._at
         if effect == "constant_push":

@@ -12,7 +12,8 @@ from envs.diagnosis import Finding, diagnose, shared_findings
 from envs.logs import Controller
 from envs.models import suspended
 from experiments.discovery.blind_cases import ARM
-from experiments.discovery.blind_robots import Truth, record
+from experiments.discovery.blind_drive import Truth
+from experiments.discovery.blind_robots import record
 from experiments.discovery.excitation import excitation
 
 JOINTS = ("shoulder", "elbow")

@@ -15,7 +15,8 @@ from experiments import discover
 from experiments.discovery import report
 from experiments.discovery.blind_bench import Bench
 from experiments.discovery.blind_cases import ARM, SIZE_BOUNDS, SIZES
-from experiments.discovery.blind_robots import OUTSIDE, Truth, record
+from experiments.discovery.blind_drive import Truth
+from experiments.discovery.blind_robots import OUTSIDE, record
 from experiments.discovery.excitation import excitation
 from experiments.discovery.hypotheses import forms, hypotheses, place_sets, unknown_directions
 from experiments.discovery.measured import drop_filtered, read_logs

@@ -14,7 +14,8 @@ from experiments import discover
 from experiments.common import checkpoint
 from experiments.discovery import gate
 from experiments.discovery.blind_cases import ARM
-from experiments.discovery.blind_robots import Truth, record
+from experiments.discovery.blind_drive import Truth
+from experiments.discovery.blind_robots import record
 from experiments.discovery.excitation import excitation
 from experiments.discovery.measured import digest, read_logs
 

@@ -12,7 +12,8 @@ from rich.console import Console
 from envs.logs import Controller
 from experiments.discovery import next_experiment, report
 from experiments.discovery.blind_cases import ARM
-from experiments.discovery.blind_robots import Truth, record
+from experiments.discovery.blind_drive import Truth
+from experiments.discovery.blind_robots import record
 from experiments.discovery.excitation import excitation
 from experiments.discovery.question import build_question
 from experiments.discovery.summary import _effect, _far_off, details, free_runs, summarise

@@ -14,7 +14,8 @@ from envs import segments
 from envs.logs import Controller
 from envs.rig import Rig
 from experiments.discovery.blind_cases import ARM
-from experiments.discovery.blind_robots import Truth, record
+from experiments.discovery.blind_drive import Truth
+from experiments.discovery.blind_robots import record
 from experiments.discovery.excitation import excitation
 from experiments.discovery.next_experiment import deciding_experiment
 from experiments.discovery.question import _Simulator
