@@ -80,9 +80,8 @@ def conclude(settings: Settings, problem: Problem, floor: NoiseFloor, state: Sta
     terms = tuple(
         replace(term, forms=(*term.forms, *moved_forms(problem, best.fit, errors, term.hypothesis))) for term in terms
     )
-    for term in terms:
-        inexact = settings.inexact * best.fit.coordinates * best.fit.along(term.hypothesis)
-        errors = np.hypot(errors, inexact)
+    for part in (part for term in terms for part in (term.hypothesis, *term.forms)):
+        errors = np.hypot(errors, settings.inexact * best.fit.coordinates * best.fit.along(part))
     return Conclusion(
         verdict=verdict,
         best=best,

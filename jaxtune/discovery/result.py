@@ -49,8 +49,8 @@ class Settings:
     possible: float = 0.05
     """Probability from which on another name may as well be right."""
     inexact: float = 0.08
-    """Standard deviation, as a share, by which the form of the library may shift the size of an effect. Intervals hold
-    it beside the noise."""
+    """Standard deviation, as a share, by which the form of the library may shift the parameters of an effect. Intervals
+    hold it beside the noise."""
     own: float = 0.5
     """Share of the evidence for a stronger effect at the same joints from which on an effect is a name of its own. With
     less it may make up for the form of that one."""

@@ -147,6 +147,10 @@ def test_a_form_is_found_with_its_effect_and_is_no_name_of_its_own():
     assert result.verdict == "named"
     (term,) = result.terms
     assert (term.hypothesis.name, [form.form for form in term.forms]) == ("coulomb", ["direction_dependent"])
+    # No form of the library is exact, so no parameter is as certain as noise alone would have it.
+    for part in (term.hypothesis, *term.forms):
+        mine = result.fit.along(part)
+        assert (result.errors[mine] >= 0.08 * np.abs(result.fit.coordinates[mine])).all() and mine.any()
     assert result.fit.vector[AXES.index("push")] == pytest.approx(0.6, abs=0.05)
     (form,) = result.suspects[0].forms
     assert (result.suspects[0].hypothesis.name, form.form) == ("coulomb", "direction_dependent")
