@@ -10,6 +10,7 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
+from mujoco import mjx
 
 from envs import go2, held, pendulum
 from envs.biteno import constants
@@ -104,7 +105,7 @@ def without_files(spec: mujoco.MjSpec) -> mujoco.MjSpec:
         # A primitive may be fitted to a mesh, which it then names.
         mine = [geom for geom in body.geoms if geom.type in filed or geom.meshname]
         if (mine or anew) and body.name != "world":
-            _write_inertia(body, model, compiled.id)
+            write_inertia(body, model, compiled.id)
         lost_geoms += mine
     _delete_geoms(spec, lost_geoms)
     compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
@@ -130,18 +131,31 @@ def _delete_geoms(spec: mujoco.MjSpec, geoms: Sequence[mujoco.MjsGeom]) -> None:
         spec.delete(element)
 
 
-def _write_inertia(body: mujoco.MjsBody, model: mujoco.MjModel, number: int) -> None:
+def write_inertia(body: mujoco.MjsBody, model: mujoco.MjModel | mjx.Model, number: int) -> None:
+    """Gives a body mass and inertia of its own, those of a body of a model, in whatever form they were before.
+
+    Args:
+      body: of a spec.
+      model: that has them.
+      number: of the body in the model. One without mass is left as it is.
+    """
     if not model.body_mass[number]:
         return
+    # Without this the compiler would compute mass and inertia from the geometries again.
     body.explicitinertial = True
-    body.mass = model.body_mass[number]
-    body.ipos, body.iquat, body.inertia = (
-        getattr(model, f"body_{field}")[number] for field in ("ipos", "iquat", "inertia")
-    )
-    # The compiler refuses a body that has both forms of inertia.
+    inertia = np.array(model.body_inertia[number], float)
+    # A disc has no less about its axis than about the two others together. Rounding would make it more, which the
+    # compiler refuses.
+    largest = inertia.argmax()
+    inertia[largest] = min(inertia[largest], (1.0 - _ROUNDING) * (inertia.sum() - inertia[largest]))
+    body.mass, body.inertia = float(model.body_mass[number]), inertia
+    body.ipos, body.iquat = (np.asarray(getattr(model, f"body_{field}")[number], float) for field in ("ipos", "iquat"))
+    # The compiler refuses a body that has both forms of inertia, and prefers other forms of an orientation.
     body.fullinertia = np.full(6, np.nan)
+    body.ialt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
 
 
+_ROUNDING = 2e-5  # relative, of three numbers of six digits
 _SMALL = 0.1  # of the mass of the largest body that a body is fixed to
 _PHYSICS = ("constraint", "equality", "frictionloss", "limit", "spring", "damper", "gravity")
 

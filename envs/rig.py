@@ -25,6 +25,7 @@ from envs.effects.memory import LONGEST_S
 from envs.held import unread_joints
 from envs.models import links, suspended
 from envs.segments import Segment
+from jaxtune import devices
 from jaxtune.mjx import parameters, set_const
 from jaxtune.types import Effect, Parameter
 
@@ -251,6 +252,7 @@ class Rig:
             body = self.mj_model.body_parentid[body]
         return tuple(found)
 
+    @devices.precisely
     def model(self, values: ByEffect) -> mjx.Model:
         """Makes the MJX model that the effects change that enter the model, with its derived fields recomputed.
 

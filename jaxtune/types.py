@@ -269,7 +269,7 @@ class Effect:
     excited_by: str
     """Experiment in which the effect shows and is distinguishable from similar ones."""
     act: Callable[..., Any] | None = None
-    """Transforms the stage's signal; None for an effect that changes fields of the model."""
+    """Transforms the stage's signal, or the model; None for an effect whose parameters name the model's fields."""
     start: Callable[..., Any] | None = None
     """`start(values, signal, dt) -> memory`: the memory after what the robot did before, which the stage's signal tells
     (`envs.chain.Chain.start`). None where the effect has no memory."""

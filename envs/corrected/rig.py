@@ -13,7 +13,7 @@ import numpy as np
 
 from envs.corrected.record import EFFECTS, MODEL, Effects
 from envs.effects import EVERY
-from envs.models import without_files
+from envs.models import without_files, write_inertia
 from envs.rig import Rig
 
 
@@ -41,14 +41,7 @@ def _corrected_spec(spec: mujoco.MjSpec, rig: Rig, vector: np.ndarray) -> mujoco
     model, device = rig.mj_model, jax.jit(rig.model)(values)
     spec = without_files(spec.copy())
     for name in rig.bodies:
-        body, number = spec.body(name), model.body(name).id
-        # Without this the compiler would compute mass and inertia from the geometries again.
-        body.explicitinertial = True
-        body.mass = float(device.body_mass[number])
-        for field in ("ipos", "iquat", "inertia"):
-            setattr(body, field, np.asarray(getattr(device, f"body_{field}")[number], float))
-        # The compiler refuses a body that has both forms of inertia.
-        body.fullinertia = np.full(6, np.nan)
+        write_inertia(spec.body(name), device, model.body(name).id)
     for number, name in enumerate(rig.joints):
         dof, joint = rig.dof[number], spec.joint(name)
         joint.armature = float(device.dof_armature[dof])

@@ -1,7 +1,8 @@
 """The library of effects that a model may lack, one file per family.
 
 An effect is a row (`jaxtune.types.Effect`) of a family's `ROWS`. To add one, add a row; whatever works with the library
-finds it there. An effect that enters the model names the model's fields. Every other effect is a function
+finds it there. An effect that enters the model names the model's fields, or is a function that changes it
+(`jaxtune.types.Effect`). Every other effect is a function
 `act(values, signal, now, memory) -> (signal, memory)` of the signal at one stage between the target and the reading of
 a joint; `now` is `envs.chain.Now`. The stages act in the order of this drawing, the effects of one stage in the order
 of their rows:

@@ -23,6 +23,8 @@ def _with_load(values, model: mjx.Model, bodies: np.ndarray) -> mjx.Model:
     frame = Rotation.from_quat(jnp.roll(model.body_iquat[bodies], -1, axis=-1)).as_matrix()
     own = (frame * model.body_inertia[bodies][:, None, :]) @ frame.mT
     moments, axes = jnp.linalg.eigh(own + turning)
+    # Rounding of a large load could make a small link's moments negative.
+    moments = jnp.maximum(moments, model.body_inertia[bodies].min(axis=-1, keepdims=True))
     # Eigenvectors may be a mirror image.
     axes *= jnp.linalg.det(axes)[:, None, None]
     changed = {

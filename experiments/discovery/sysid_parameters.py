@@ -165,6 +165,7 @@ def _inertia(robot: Robot, model: mujoco.MjModel, body: str, whole: bool):
         if whole:
             sysid.apply_body_inertia(spec, body, parameter)
             spec.body(body).iquat = [1.0, 0.0, 0.0, 0.0]
+            spec.body(body).ialt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
         else:
             mass = float(parameter.value[0])
             sysid.model_modifier.apply_body_mass_ipos(spec, body, mass=mass, rot_inertia_scale=True)

@@ -19,7 +19,7 @@ _ODDS = 10.0  # against the model with fewer places, up to which it is taken
 def renamed(problem: Problem, candidate: Candidate) -> Candidate:
     """Makes a form of an effect that may be one of another, and lets the larger part give the name to both.
 
-    A load and a shifted centre of mass are a load beside the centre; delay and filter may each be a form of the other.
+    Dry friction and stiction may each be a form of the other, as may delay and filter.
 
     Args:
       problem: the hypotheses and their forms.

@@ -48,7 +48,7 @@ class Hypothesis:
     """Joints that it acts at: its places, or for a link the joint that moves it; empty where it acts at none alone."""
     form: str = ""
     """Empty for an effect. Else the hypothesis is that the effect of this name, at the same places, has this form: it
-    frees one parameter more, is tried only beside the effect, and is no name of its own."""
+    frees further parameters, is tried only beside the effect, and is no name of its own."""
     screened: bool = False
     """True for a form without which its effect may not be seen: the screen tries both together as well."""
     each: bool = False

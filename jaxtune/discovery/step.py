@@ -196,13 +196,21 @@ def shaped(forms: Sequence[Hypothesis], free: Sequence[Hypothesis], leads: Seque
             found.append(replace(lead, hypotheses=(effect,), point=lead.point[: len(effect.directions)]))
         there = {one.key for one in others}
         for form in (form for form in forms if form.shapes(effect) and form.key not in there):
-            # The least size may be too small to have a slope.
-            point = form.probes[:2][-1]
+            point = _start(form)
             found.append(Lead((*lead.hypotheses, form), np.concatenate([lead.point, point]), lead.start, lead.cost))
             alone = [h for h in free if h.key not in known and np.array_equal(h.directions, form.directions)]
             found += [Lead((h,), point, lead.start, lead.cost) for h in alone]
             known.update(h.key for h in alone)
     return found
+
+
+def _start(form: Hypothesis) -> np.ndarray:
+    """The point at which the fit of a form begins, [parameters]."""
+    if np.count_nonzero((form.probes != 0).any(axis=0)) > 1:
+        # In no direction more than in another.
+        return form.probes.mean(axis=0)
+    # The least size may be too small to have a slope.
+    return form.probes[:2][-1]
 
 
 def stuck(null: Fit, hypotheses: Sequence[Hypothesis], leads: Sequence[Lead]) -> list[Lead]:

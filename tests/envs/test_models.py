@@ -1,5 +1,7 @@
 """Models of robots: from several files into one, and nothing switched off unnoticed."""
 
+from types import SimpleNamespace
+
 import mujoco
 import numpy as np
 import pytest
@@ -246,3 +248,15 @@ def test_shapes_whose_contacts_mjx_lacks_hang_on_a_rig():
     rig = Rig(spec, ("hip", "turn"), 500.0)
     # Neither the foot, a sixteenth of the link that it is fixed to, nor what a simulation moves without a joint.
     assert rig.bodies == ("thigh", "tool", "block")
+
+
+def test_a_flat_body_may_be_rounded(tmp_path):
+    spec = mujoco.MjSpec.from_string('<mujoco><worldbody><body name="disc"><freejoint/></body></worldbody></mujoco>')
+    # A third of one and a third of the other are two thirds, but not in single precision, nor in six digits.
+    thirds = np.float32([1 / 30, 1 / 30, 2 / 30 + 1e-8])
+    model = SimpleNamespace(body_mass=[0.7], body_ipos=[np.zeros(3)], body_iquat=[[1, 0, 0, 0]], body_inertia=[thirds])
+    models.write_inertia(spec.body("disc"), model, 0)
+    spec.compile()
+    (tmp_path / "disc.xml").write_text(spec.to_xml())
+    read = mujoco.MjModel.from_xml_path(str(tmp_path / "disc.xml"))
+    np.testing.assert_allclose(np.sort(read.body_inertia[1]), thirds, rtol=5e-5)

@@ -90,6 +90,32 @@ def test_what_mujoco_has_a_form_for_is_in_the_mjcf(folder):
     np.testing.assert_allclose(model.dof_frictionloss, [0.0, 0.07], rtol=1e-5)
 
 
+@pytest.mark.parametrize("turn", ['quat="0.9 0.1 0.3 -0.2"', 'euler="0.3 0.5 -0.7"'])
+def test_a_loaded_link_has_the_moments_of_both_whatever_its_axes(tmp_path, turn):
+    """A disc, whose moments rounding must not make impossible, in any form of its orientation."""
+    disc = f'<inertial pos="0.01 0 -0.1" mass="0.6" diaginertia="0.001 0.001 0.002" {turn}/>'
+    text = rigs.ARM.replace('<joint name="elbow"', f'{disc}<joint name="elbow"')
+    spec = mujoco.MjSpec.from_string(text)
+    rig = Rig(spec, rigs.ARM_JOINTS, rigs.CONTROL_HZ)
+    arm, at = np.array([0.1, -0.05, 0.02]), np.array([0.01, 0.0, -0.1])
+    for load, reach in ((0.3, arm), (0.3, 0.0 * arm), (0.0, arm)):
+        values = {"kg": load} | dict(zip(("x_m", "y_m", "z_m"), reach.tolist(), strict=True))
+        corrected.save(tmp_path, spec, rig, rigs.Player(rig).vector(payload={"lower": values}))
+        model = mujoco.MjModel.from_xml_path(str(tmp_path / "model.xml"))
+        about = lambda point: point @ point * np.eye(3) - np.outer(point, point)  # noqa: E731
+        whole, centre = 0.6 + load, at + load / (0.6 + load) * reach
+        second = tensor(spec.compile(), "lower") + 0.6 * about(at) + load * about(at + reach)
+        np.testing.assert_allclose(model.body("lower").ipos, centre, atol=1e-6)
+        np.testing.assert_allclose(tensor(model, "lower"), second - whole * about(centre), atol=1e-4 * 0.002)
+
+
+def tensor(model, name):
+    """Inertia of a body about its centre, along the axes of its frame, [3, 3]."""
+    turn, body = np.zeros(9), model.body(name)
+    mujoco.mju_quat2Mat(turn, body.iquat)
+    return turn.reshape(3, 3) * body.inertia @ turn.reshape(3, 3).T
+
+
 def test_the_rest_is_said_in_its_units(folder):
     said = json.loads((folder / "effects.json").read_text())
     assert (said["joints"], said["control_hz"]) == (["shoulder", "elbow"], 200.0)

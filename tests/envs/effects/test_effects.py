@@ -115,6 +115,13 @@ def test_a_row_acts_or_names_fields(row):
         assert bool(parameter.fields) == (row.act is None)
 
 
+@pytest.mark.parametrize("row", ROWS, ids=lambda row: row.name)
+def test_a_form_names_parameters_that_its_row_has(row):
+    for form in row.forms:
+        assert isinstance(form.parameters, tuple)
+        assert {*form.parameters} <= {parameter.name for parameter in EVERY[form.effect].parameters}
+
+
 @pytest.mark.parametrize("parameter", PARAMETERS)
 @pytest.mark.parametrize("scale", [1.0, 0.3])
 def test_a_coordinate_is_the_inverse_of_a_value(parameter, scale):

@@ -446,7 +446,7 @@ def test_a_nominal_parameter_that_moved_is_no_form_of_an_effect():
 
 def test_two_effects_of_which_one_is_a_form_of_the_other_are_one():
     coulomb, push = HYPOTHESES[2:4]
-    # As a shifted centre of mass is one of a load, and not the other way round.
+    # As a constant torque is one of dry friction, and not the other way round.
     beside = replace(push, name="coulomb", family=coulomb.family, form="beside")
     asked = problem({"coulomb": 0.8, "push": 0.4}, forms=(beside, WARPED))
     floor, begun = state.begin(asked, measured_floor(asked))
