@@ -25,7 +25,7 @@ from envs.biteno import constants
 from envs.logs import Controller, Log, Run, read, write
 from envs.logs.tables import WRITERS
 from envs.rig import Rig
-from experiments.common import checkpoint, compiler
+from experiments.common import checkpoint, compiler, files
 from experiments.common.cli import console, run
 from experiments.common.config import Preset, preset
 from experiments.walking import costs, foreign, memory
@@ -286,7 +286,7 @@ def main(args: Args) -> None:
         "peak_gib": peak,
         "versions": checkpoint.versions(),
     }
-    checkpoint.write_json(args.out / f"{args.what}.json", result)
+    files.write_json(args.out / f"{args.what}.json", result)
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ from rich.table import Table
 
 from envs.diagnosis import diagnose_log, shared_findings
 from envs.logs import read_any
-from experiments.common import checkpoint, plots
+from experiments.common import files, plots
 from experiments.common.cli import console, run
 
 
@@ -41,7 +41,7 @@ def main(args: Args) -> None:
         found = diagnose_log(log)
     said = shared_findings(found)
     out.mkdir(parents=True, exist_ok=True)
-    checkpoint.write_json(
+    files.write_json(
         out / "doctor.json",
         {"log": args.log, "runs": {name: [asdict(one) for one in findings] for name, findings in found.items()}},
     )

@@ -16,9 +16,9 @@ from rich.table import Table
 from envs.biteno import constants
 from envs.targets.protocol import Commands
 from experiments.common import checkpoint, compiler, film, plots
-from experiments.common.checkpoint import write_json
 from experiments.common.cli import console, run
 from experiments.common.config import PRESETS, named_values, preset
+from experiments.common.files import write_json
 from experiments.walking.learner import Learner
 from experiments.walking.policies import starting_policy
 from experiments.walking.quality import quality, record_walks

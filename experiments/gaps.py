@@ -13,7 +13,7 @@ from rich.table import Table
 
 from envs.biteno import constants
 from envs.targets.mjx import MjxTarget
-from experiments.common import checkpoint, compiler, plots
+from experiments.common import checkpoint, compiler, files, plots
 from experiments.common.cli import bars, console, run
 from experiments.common.config import preset
 from experiments.walking.learner import Learner
@@ -108,7 +108,7 @@ def main(args: Args) -> None:
         table.add_row(row["sweep"], f"{row['value']:g}", *(f"{row[name]:.2f}" for name in SHOWN))
     console.print(table)
     args.out.mkdir(parents=True, exist_ok=True)
-    checkpoint.write_json(args.out / "gaps.json", {"args": args, "rows": results, "versions": checkpoint.versions()})
+    files.write_json(args.out / "gaps.json", {"args": args, "rows": results, "versions": checkpoint.versions()})
     plots.gaps(args.out / "gaps.png", results, SHOWN, {"friction": friction, "mass": 1.0, "motor": 1.0})
 
 

@@ -18,9 +18,9 @@ import numpy as np
 from rich.table import Table
 
 from experiments.common import checkpoint
-from experiments.common.checkpoint import read_json, write_json
 from experiments.common.cli import console, run
 from experiments.common.config import preset
+from experiments.common.files import read_json, write_json
 
 GOALS = {"environment steps per second": 500e3, "walking policy, s": 300.0, "five tunings, s": 480.0}
 """What a data-centre GPU should reach, compilation apart."""

@@ -14,9 +14,9 @@ import numpy as np
 from rich.table import Table
 
 from experiments.common import checkpoint, compiler, plots
-from experiments.common.checkpoint import read_json, write_json
 from experiments.common.cli import bars, console, run
 from experiments.common.config import Preset, preset
+from experiments.common.files import read_json, write_json
 from experiments.walking import foreign
 from experiments.walking.cases import check_positive, check_seeds
 from jaxtune import dist as dists

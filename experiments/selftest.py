@@ -20,7 +20,7 @@ import numpy as np
 from rich.progress import Progress
 from rich.table import Table
 
-from experiments.common import checkpoint, compiler, plots
+from experiments.common import checkpoint, compiler, files, plots
 from experiments.common.cli import bars, console, count, run
 from experiments.common.config import preset
 from experiments.common.rates import interval
@@ -178,14 +178,14 @@ class Parts:
     def keep(self, name: str, compute: Callable[[], dict]) -> dict:
         """Computes a part, or reads it where it was computed before (`jaxtune.selftest.Keep`)."""
         path = self.folder / f"{name}.json"
-        if not checkpoint.exists(path):
+        if not files.exists(path):
             begin = time.monotonic()
             part = compute()
             self.folder.mkdir(parents=True, exist_ok=True)
-            checkpoint.write_json(path, {"seconds": time.monotonic() - begin, "part": part})
+            files.write_json(path, {"seconds": time.monotonic() - begin, "part": part})
             self.computed += 1
         # Read again in any case, so that the numbers are those of a run that was interrupted.
-        found = checkpoint.read_json(path)
+        found = files.read_json(path)
         if not {"seconds", "part"} <= found.keys():
             raise ValueError(f"{path}: is damaged: got {', '.join(found) or 'nothing'}, expected seconds and part")
         self.seconds += found["seconds"]
@@ -201,7 +201,7 @@ def digest(robot: str, policy: Any, table: Mapping[str, Entry], others: Mapping[
       table: of all parameters.
       others: coordinates of the cases.
     """
-    found = hashlib.sha256(json.dumps(checkpoint.as_json([table, others])).encode())
+    found = hashlib.sha256(json.dumps(files.as_json([table, others])).encode())
     file = Path(robot.rpartition(":")[0])
     if file.is_file():
         found.update(file.read_bytes())
@@ -318,7 +318,7 @@ def main(args: Args) -> None:
         "seconds": sum(parts.seconds for _, parts in found.values()),
         "versions": checkpoint.versions(),
     }
-    checkpoint.write_json(path, result)
+    files.write_json(path, result)
     plots.power(args.out / "power.png", reports, 1.0 - args.level)
 
 

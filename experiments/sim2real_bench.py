@@ -21,9 +21,9 @@ from envs import corrected, logs
 from envs.biteno import constants, walks
 from envs.targets import recorded
 from experiments.common import checkpoint, compiler, plots
-from experiments.common.checkpoint import as_json, from_json, read_json, write_json
 from experiments.common.cli import bars, console, count, run
 from experiments.common.config import preset
+from experiments.common.files import as_json, from_json, read_json, write_json
 from experiments.robot import policy_files
 from experiments.robot import transfer as transfers
 from experiments.robot.exchange import request, wait

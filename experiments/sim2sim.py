@@ -17,10 +17,10 @@ import jax
 from rich.progress import Progress, TaskID
 
 from envs.targets.protocol import Target
-from experiments.common import checkpoint, compiler, hosts, plots, report
-from experiments.common.checkpoint import as_json, read_json, write_json, write_text
+from experiments.common import checkpoint, compiler, files, hosts, plots, report
 from experiments.common.cli import bars, console, run
 from experiments.common.config import Preset, named_values, preset
+from experiments.common.files import as_json, read_json, write_json, write_text
 from experiments.walking import comparison, memory
 from experiments.walking.cases import Case, check_positive, check_seeds, checked_case, errors
 from experiments.walking.comparison import METHODS, UPDATES, contenders
@@ -154,7 +154,7 @@ class Runner:
         path = self._args.out / "results" / f"{name}_{seed}.json"
         tunings = self._learner.preset.tunings
         task = progress.add_task(f"{name} seed {seed}", total=tunings)
-        if not checkpoint.exists(path):
+        if not files.exists(path):
             with checkpoint.lock(path):
                 lines = self._play_tunings(name, seed, progress, task)
                 sets = self._contenders[name].sets * tunings
@@ -166,7 +166,7 @@ class Runner:
         lines = []
         for line in self._tunings(name, seed):
             lines.append(line)
-            checkpoint.append_line(self._args.out / "metrics.jsonl", line)
+            files.append_line(self._args.out / "metrics.jsonl", line)
             note = f" return {line['return']:.1f} {' '.join(line.get('verdicts', ()))}"
             progress.update(task, completed=line["tuning"], description=f"{name} seed {seed}{note}")
         return lines

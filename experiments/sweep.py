@@ -20,7 +20,7 @@ import numpy as np
 from rich.table import Table
 
 from envs.targets.mjx import MjxTarget
-from experiments.common import checkpoint, compiler, hosts, plots
+from experiments.common import checkpoint, compiler, files, hosts, plots
 from experiments.common.cli import bars, console, count, run
 from experiments.common.config import Preset, named_values, preset
 from experiments.walking import memory
@@ -219,15 +219,15 @@ def sweep(args: Args, learner: Learner, case: Case) -> None:
         pieces = []
         for start in range(0, len(rows), size):
             path = args.out / "lanes" / f"{start:04d}.json"
-            kept = checkpoint.exists(path)
+            kept = files.exists(path)
             if not kept:
                 # The last piece is filled up: another size would be another program.
                 some = rows[(start + np.arange(size)) % len(rows)]
                 begin = time.monotonic()
                 found = _results(learner, truth, off, *jax.device_get(tune(jnp.asarray(some))))
                 found = {name: values[: len(rows) - start] for name, values in found.items()}
-                checkpoint.write_json(path, found | {"seconds": time.monotonic() - begin})
-            pieces.append(checkpoint.read_json(path))
+                files.write_json(path, found | {"seconds": time.monotonic() - begin})
+            pieces.append(files.read_json(path))
             count(progress, task, min(start + size, len(rows)), kept)
     names = ("step_size", "widen_factor", "radius", "level")
     of_lanes = {name: np.concatenate([piece[name] for piece in pieces]).reshape(grid.shape[:-1]) for name in RESULTS}
@@ -249,7 +249,7 @@ def sweep(args: Args, learner: Learner, case: Case) -> None:
         "seconds": {"total": sum(piece["seconds"] for piece in pieces)},
         "versions": checkpoint.versions(),
     }
-    checkpoint.write_json(args.out / "summary.json", summary)
+    files.write_json(args.out / "summary.json", summary)
     _draw(args, of_lanes["error"].mean(axis=-1))
     _table(args, summary)
 

@@ -17,7 +17,7 @@ from rich.table import Table
 
 from envs.logs import Log, Run, splits
 from envs.segments import HISTORY_S
-from experiments.common import checkpoint
+from experiments.common import checkpoint, files
 from experiments.common.cli import bars, console, run
 from experiments.discovery import playback, sysid_fit, sysid_parameters
 from experiments.discovery.measured import read_logs
@@ -82,7 +82,7 @@ def main(args: Args) -> None:
         "candidates": [{"fit": one.name(), "seconds": one.seconds, "select": one.select} for one in tried],
         "chosen": chosen,
     }
-    checkpoint.write_json(args.out, report)
+    files.write_json(args.out, report)
     _show(report)
 
 

@@ -7,9 +7,9 @@ import jax
 
 from envs import corrected
 from experiments.common import compiler, hosts, plots
-from experiments.common.checkpoint import as_json, read_json
 from experiments.common.cli import console, run
 from experiments.common.config import preset
+from experiments.common.files import as_json, read_json
 from experiments.walking import memory
 from experiments.walking.learner import Learner
 from experiments.walking.policies import trained

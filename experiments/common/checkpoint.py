@@ -1,23 +1,18 @@
-"""Saving and loading: checkpoints, JSON, and the folder of a run with its config and versions.
+"""Checkpoints, and the folder of a run with its config, its versions and its locks.
 
-Every file is written whole or not at all: a run may be killed at any moment, and must be able to continue from its
-files. A draft is written, put on the disk (fsync), and renamed into place. In a run on several hosts the first one does
-all this (`experiments.common.hosts`).
+A run may be killed at any moment, and must be able to continue from its files (`experiments.common.files`). In a run on
+several hosts the first one writes and reads them all (`experiments.common.hosts`).
 """
 
 import contextlib
-import dataclasses
 import fcntl
 import hashlib
 import importlib.metadata
-import json
-import os
 import platform
 import re
 import secrets
 import shutil
 import subprocess
-import typing
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -28,10 +23,10 @@ import numpy as np
 import orbax.checkpoint as ocp
 
 from experiments.common import hosts
+from experiments.common.files import DRAFT, as_json, read_json, sync, write_json
 
 _PACKAGES = ("jaxtune", "jax", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "orbax-checkpoint", "numpy")
 
-_DRAFT = ".tmp"  # suffix of a file that is being written, or that a killed run left behind
 _LOCK = ".lock"  # suffix of a file whose lock says that a process works on a piece
 
 
@@ -56,115 +51,6 @@ def versions() -> dict[str, str]:
     if git.returncode == 0:
         found["revision"] = git.stdout.strip()
     return found
-
-
-def as_json(value: Any) -> Any:
-    """Converts dataclasses, arrays, paths and tuples to what `json` can write.
-
-    A dataclass becomes an object with its fields' names as keys, or `metadata["key"]` where a field has another name in
-    files. Numbers that are not finite become null: JSON has no form for them, and Python's own (`NaN`) is refused
-    elsewhere.
-    """
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {_key(field): as_json(getattr(value, field.name)) for field in dataclasses.fields(value)}
-    if isinstance(value, dict):
-        return {str(name): as_json(item) for name, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [as_json(item) for item in value]
-    if isinstance(value, Path):
-        return str(value)
-    if hasattr(value, "tolist"):
-        return as_json(value.tolist())
-    if isinstance(value, float) and value not in (float("inf"), float("-inf")) and value == value:
-        return value
-    return None if isinstance(value, float) else value
-
-
-def from_json(kind: Any, value: Any) -> Any:
-    """Rebuilds a dataclass from its JSON form; the inverse of `as_json`, guided by the types of the fields.
-
-    Args:
-      kind: a dataclass, or a type that one of its fields may have (`tuple[T, ...]`, `dict[str, T]`, numbers, texts).
-      value: what `json` has read.
-
-    Raises:
-      KeyError: a field is missing.
-    """
-    if dataclasses.is_dataclass(kind):
-        types = typing.get_type_hints(kind)
-        return kind(**{f.name: from_json(types[f.name], value[_key(f)]) for f in dataclasses.fields(kind)})
-    if typing.get_origin(kind) is tuple:
-        return tuple(from_json(typing.get_args(kind)[0], item) for item in value)
-    if typing.get_origin(kind) is dict:
-        return {name: from_json(typing.get_args(kind)[1], item) for name, item in value.items()}
-    return value
-
-
-def _key(field: dataclasses.Field) -> str:
-    return field.metadata.get("key", field.name)
-
-
-def write_json(path: Path, value: Any) -> None:
-    """Writes a value as JSON, whole or not at all: a finished draft is renamed into place.
-
-    A program that is killed in between leaves the old file, and a program that reads meanwhile never sees half of one.
-    """
-    write_text(path, json.dumps(as_json(value), indent=1) + "\n")
-
-
-@hosts.on_first
-def write_text(path: Path, text: str) -> None:
-    """Writes a text file, whole or not at all, as `write_json` does."""
-    draft = path.with_suffix(f".{secrets.token_hex(4)}{_DRAFT}")
-    try:
-        with draft.open("w") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        draft.replace(path)
-    except OSError:
-        # A full disk: the draft is of no use, and takes the room that others need.
-        draft.unlink(missing_ok=True)
-        raise
-    _sync(path.parent)
-
-
-@hosts.on_first
-def append_line(path: Path, value: Any) -> None:
-    """Adds a value to a log of JSON lines. A process that is killed in between leaves part of a line."""
-    with path.open("a") as log:
-        log.write(json.dumps(as_json(value)) + "\n")
-
-
-@hosts.on_first
-def exists(path: Path) -> bool:
-    """Whether a file of a run is there."""
-    return path.exists()
-
-
-@hosts.on_first
-def read_json(path: Path) -> Any:
-    """Reads a JSON file of a run.
-
-    Raises:
-      ValueError: the file was emptied or damaged, or holds no object; names it.
-    """
-    try:
-        found = json.loads(path.read_text())
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: is damaged: {error}") from None
-    if not isinstance(found, dict):
-        raise ValueError(f"{path}: is damaged: got {type(found).__name__}, expected an object")
-    return found
-
-
-def _sync(item: Path) -> None:
-    """Puts a file, or the names in a folder, on the disk: a renamed file may have its old name after a power cut."""
-    handle = os.open(item, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
 
 
 @contextlib.contextmanager
@@ -216,7 +102,7 @@ def open_run(out: Path, config: Any) -> None:
         fcntl.flock(file, fcntl.LOCK_EX)
         if path.exists():
             _same(f"out: {out} holds a run of another config", read_json(path)["config"], wanted)
-        elif any(not item.name.endswith((_DRAFT, _LOCK)) for item in out.iterdir()):
+        elif any(not item.name.endswith((DRAFT, _LOCK)) for item in out.iterdir()):
             raise ValueError(
                 f"out: {out} is not empty and holds no config.json; expected a new folder or an earlier run's"
             )
@@ -233,7 +119,7 @@ def check_writable(out: Path) -> None:
     """
     try:
         out.mkdir(parents=True, exist_ok=True)
-        draft = out / f".{secrets.token_hex(4)}{_DRAFT}"
+        draft = out / f".{secrets.token_hex(4)}{DRAFT}"
         draft.write_bytes(bytes(1024))
         draft.unlink()
     except OSError as error:
@@ -260,8 +146,8 @@ def save(path: Path, state: Any, config: Any, notes: Any = None) -> None:
     with _checkpointer() as checkpointer:
         checkpointer.save(new.absolute(), _numbers(state))
     for item in (new, *new.rglob("*")):
-        _sync(item)
-    _sync(path)
+        sync(item)
+    sync(path)
     entry = {"config": as_json(config), "state": new.name, "sha256": _checksum(new), "versions": versions()}
     write_json(path / "config.json", entry if notes is None else entry | {"notes": notes})
     # Not all that begins like this is a checkpoint's: discovery keeps a `state.json`.

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Protocol
 
 from experiments.common import checkpoint, plots
-from experiments.common.checkpoint import read_json, write_json, write_text
+from experiments.common.files import read_json, write_json, write_text
 from experiments.discovery import gate
 from experiments.discovery.investigate import investigate
 from experiments.discovery.measured import read_logs

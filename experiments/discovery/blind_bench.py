@@ -15,7 +15,7 @@ import numpy as np
 from envs import models
 from envs.effects import LIBRARY
 from envs.logs import Controller, Log, write
-from experiments.common.checkpoint import write_json
+from experiments.common.files import write_json
 from experiments.discovery.benchmark import Benchmark
 from experiments.discovery.blind_cases import SIZE_BOUNDS, SIZES, Case
 from experiments.discovery.blind_drive import Truth

@@ -10,7 +10,7 @@ import numpy as np
 from envs import corrected
 from envs.logs import Log
 from experiments.common import checkpoint
-from experiments.common.checkpoint import read_json, write_json
+from experiments.common.files import read_json, write_json
 from experiments.discovery.measured import read_logs
 from experiments.discovery.question import Question, build_question
 from experiments.discovery.summary import details, free_runs, summarise

@@ -6,7 +6,7 @@ Files need no network protocol on the robot, and they remain as a record of what
 import time
 from pathlib import Path
 
-from experiments.common.checkpoint import write_json
+from experiments.common.files import write_json
 
 _LOOK_S = 1.0  # pause between two looks at the folder
 _QUIET_LOOKS = 3  # a log that has not changed for so many looks is complete

@@ -1,7 +1,7 @@
 """Typed records of what a round predicted, measured and learnt.
 
 The files of a run (`prediction.json`, `measured.json`, `tuning.json`, `summary.json`) hold these records as JSON;
-`experiments.common.checkpoint.as_json` and `from_json` convert. The decision whether a robot may walk uses nothing
+`experiments.common.files.as_json` and `from_json` convert. The decision whether a robot may walk uses nothing
 else.
 """
 

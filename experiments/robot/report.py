@@ -7,7 +7,7 @@ from rich.console import Console
 from rich.table import Table
 
 from experiments.common import plots, report
-from experiments.common.checkpoint import as_json
+from experiments.common.files import as_json
 from experiments.robot.fall_risk import surprise
 from experiments.robot.records import Round
 from experiments.robot.rounds import Terms

@@ -26,8 +26,8 @@ import jax.numpy as jnp
 
 from envs.targets import recorded
 from experiments.common import checkpoint, report
-from experiments.common.checkpoint import from_json, read_json, write_json
 from experiments.common.cli import console
+from experiments.common.files import from_json, read_json, write_json
 from experiments.robot import policy_files
 from experiments.robot.checks import check_meaning, check_runs
 from experiments.robot.exchange import request, wait

@@ -11,7 +11,7 @@ from typing import Annotated
 import tyro
 
 from envs import corrected
-from experiments.common import checkpoint
+from experiments.common import checkpoint, files
 from experiments.common.cli import console
 from experiments.common.config import Preset, named_values, preset
 from experiments.robot import policy_files, report
@@ -139,7 +139,7 @@ def play(transfer: Transfer, programs: Programs) -> list[Round]:
             report.write(page, history, transfer.terms, programs.learner.kind.name)
             report.show(console, history[-1])
             console.print(f"report in {page}")
-        checkpoint.write_json(transfer.out / "summary.json", {"rounds": history, "versions": checkpoint.versions()})
+        files.write_json(transfer.out / "summary.json", {"rounds": history, "versions": checkpoint.versions()})
     return history
 
 

@@ -15,9 +15,9 @@ import jax
 import jax.numpy as jnp
 from rich.progress import Progress
 
-from experiments.common import checkpoint, hosts
-from experiments.common.checkpoint import write_json
+from experiments.common import checkpoint, files, hosts
 from experiments.common.cli import bars, console
+from experiments.common.files import write_json
 from experiments.walking.learner import Learner, Policy
 from experiments.walking.robots import Kind
 from jaxtune import devices
@@ -71,7 +71,7 @@ def walk(
         "chunk": chunk,
         "preset": learner.preset,
     }
-    if kept and checkpoint.exists(kept / "config.json"):
+    if kept and files.exists(kept / "config.json"):
         policy, curve = checkpoint.load(kept, policy, identity), checkpoint.read_notes(kept)
         if len(curve) * chunk > updates + chunk - 1:
             raise ValueError(f"updates: got {updates}, but {kept} holds a training of {len(curve) * chunk}")
@@ -169,7 +169,7 @@ def starting_policy(name: str, learner: Learner, out: Path | None = None) -> Pol
         raise ValueError("policy: got 'scratch', expected a policy that exists, such as a folder of experiments.train")
     if name == "scratch":
         place = out / "policy"
-        if not checkpoint.exists(place / "config.json"):
+        if not files.exists(place / "config.json"):
             trained(jax.random.PRNGKey(0), learner, learner.preset.scratch_updates, place)
     ppo = checkpoint.load(place, fresh.learner, policy_config(learner))
     # Disk holds networks, optimiser and statistics alone. Robots are new, so they may have another model by now.

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from faults import Killed, killed_at
 
-from experiments.common import checkpoint
+from experiments.common import checkpoint, files
 from experiments.common.config import PRESETS
 from experiments.walking import policies
 from experiments.walking.learner import Learner
@@ -55,10 +55,10 @@ def test_a_state_of_other_shapes_is_refused(tmp_path):
 
 def test_json_is_the_old_or_the_new_one_whenever_it_is_killed(monkeypatch, tmp_path):
     path = tmp_path / "summary.json"
-    checkpoint.write_json(path, {"value": 1})
+    files.write_json(path, {"value": 1})
     moment, found = 2, []
-    while killed_at(monkeypatch, moment, lambda: checkpoint.write_json(path, {"value": 2})):
-        found.append(checkpoint.read_json(path)["value"])
+    while killed_at(monkeypatch, moment, lambda: files.write_json(path, {"value": 2})):
+        found.append(files.read_json(path)["value"])
         moment += 1
     # Killed before and after: the draft's fsync, the renaming, the folder's fsync.
     assert found == [1, 1, 1, 2, 2, 2]
@@ -66,23 +66,23 @@ def test_json_is_the_old_or_the_new_one_whenever_it_is_killed(monkeypatch, tmp_p
 
 def test_a_full_disk_leaves_the_old_file_and_no_draft(monkeypatch, tmp_path):
     path = tmp_path / "summary.json"
-    checkpoint.write_json(path, {"value": 1})
+    files.write_json(path, {"value": 1})
 
     def full(handle):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(OSError, match="No space left"):
-        checkpoint.write_json(path, {"value": 2})
-    assert checkpoint.read_json(path) == {"value": 1}
+        files.write_json(path, {"value": 2})
+    assert files.read_json(path) == {"value": 1}
     assert list(tmp_path.iterdir()) == [path]
 
 
 def test_a_flipped_bit_anywhere_in_a_checkpoint_is_noticed(tmp_path):
     checkpoint.save(tmp_path, state(1.0), CONFIG)
-    files = [path for path in (tmp_path / "state_1").rglob("*") if path.is_file() and path.stat().st_size]
-    assert len(files) > 3
-    for path in files:
+    saved = [path for path in (tmp_path / "state_1").rglob("*") if path.is_file() and path.stat().st_size]
+    assert len(saved) > 3
+    for path in saved:
         content = path.read_bytes()
         path.write_bytes(bytes([content[0] ^ 4]) + content[1:])
         with pytest.raises(ValueError, match="is damaged: its checksum"):

@@ -8,7 +8,7 @@ import pytest
 from faults import check_every_kill
 
 from experiments import discovery_bench, gpu_bench, robots_bench, sim2sim, sweep
-from experiments.common import checkpoint, compiler, plots
+from experiments.common import checkpoint, compiler, files, plots
 from experiments.common.config import PRESETS
 from experiments.discovery import benchmark, investigate
 from experiments.discovery.field.bench import FieldBench
@@ -98,7 +98,7 @@ def found(monkeypatch):
 
     def write_model(folder, spec, rig, model):
         folder.mkdir(parents=True, exist_ok=True)
-        checkpoint.write_json(folder / "effects.json", {"model": model})
+        files.write_json(folder / "effects.json", {"model": model})
 
     summary = {"verdict": "named", "effects": [{"name": "coulomb"}], "parameter_changes": []}
     monkeypatch.setattr(investigate, "read_logs", lambda *_: (None, None))
@@ -122,7 +122,7 @@ def test_a_case_that_counts_as_answered_has_all_its_files(found, monkeypatch, tm
     def in_order(path, value):
         if path.name == "summary.json":
             assert (path.parent / "details.json").exists() and (path.parent / "model" / "effects.json").exists()
-        checkpoint.write_json(path, value)
+        files.write_json(path, value)
 
     monkeypatch.setattr(investigate, "write_json", in_order)
     investigate.investigate([tmp_path], tmp_path / "answer")
@@ -132,7 +132,7 @@ def test_a_case_that_counts_as_answered_has_all_its_files(found, monkeypatch, tm
 def test_a_benchmark_of_discovery(found, monkeypatch, tmp_path):
     def write(self, case):
         self.truth_path(case).parent.mkdir(parents=True, exist_ok=True)
-        checkpoint.write_json(self.truth_path(case), {"effects": [], "number": case.number})
+        files.write_json(self.truth_path(case), {"effects": [], "number": case.number})
         return self.out / "logs" / benchmark.name_of(case)
 
     monkeypatch.setattr(FieldBench, "write", write)

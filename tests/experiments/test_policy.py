@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from experiments import train as train_command
-from experiments.common import checkpoint
+from experiments.common import checkpoint, files
 from experiments.common.config import PRESETS, WALK
 from experiments.walking.learner import Learner
 from experiments.walking.policies import policy_config, starting_policy, trained, walk
@@ -108,7 +108,7 @@ def test_a_training_overwrites_no_other_policy_and_no_other_run(tmp_path, monkey
     (tmp_path / "config.json").write_text("{}")
     with pytest.raises(ValueError, match=r"out: .* holds a run of another command, expected a new folder"):
         train_command.main(args)
-    checkpoint.write_json(tmp_path / "curve.json", {"args": args, "curve": []})
+    files.write_json(tmp_path / "curve.json", {"args": args, "curve": []})
     for field, other in (("seed", 1), ("robot", "go2"), ("updates", 7)):
         with pytest.raises(ValueError, match=f"{field}: got {other}, but .* holds a policy with"):
             train_command.main(dataclasses.replace(args, **{field: other}))
@@ -117,7 +117,7 @@ def test_a_training_overwrites_no_other_policy_and_no_other_run(tmp_path, monkey
         train_command.main(dataclasses.replace(args, hosts=2, host=1, coordinator="first:1"))
     # The same again, and one that was killed: between its two last lines, or earlier.
     for written in ({"args": args}, {"curve": []}):
-        checkpoint.write_json(tmp_path / "curve.json", written)
+        files.write_json(tmp_path / "curve.json", written)
         with pytest.raises(pytest.fail.Exception, match="it was begun"):
             train_command.main(args)
     (tmp_path / "training").mkdir()

@@ -19,7 +19,7 @@ from rich.console import Console
 from envs.diagnosis import Finding
 from experiments import robot_stub, sim2real, sim2real_bench, train
 from experiments.common import checkpoint, cli
-from experiments.common.checkpoint import as_json, from_json
+from experiments.common.files import as_json, from_json
 from experiments.robot import exchange, report, rounds, transfer
 from experiments.robot.fall_risk import fall_risk, surprise
 from experiments.robot.records import Prediction, Round

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from experiments import sim2sim, sweep
-from experiments.common import checkpoint, plots
+from experiments.common import checkpoint, files, plots
 from experiments.common.cli import bars
 from experiments.common.config import PRESETS
 from experiments.walking import comparison
@@ -167,5 +167,5 @@ def test_json_has_no_nan():
         value: float
         array: np.ndarray
 
-    written = checkpoint.as_json(Thing(float("nan"), np.array([1.0, np.inf])))
+    written = files.as_json(Thing(float("nan"), np.array([1.0, np.inf])))
     assert written == {"value": None, "array": [1.0, None]}

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import toys
 
-from experiments.common.checkpoint import as_json
+from experiments.common.files import as_json
 from jaxtune import selftest
 from jaxtune.gate import GateInfo
 from jaxtune.host import HostTuner

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from envs.logs import Controller, Log, Run, write
-from experiments.common.checkpoint import write_json
+from experiments.common.files import write_json
 from experiments.discovery.field import motions, readings, robots
 from experiments.discovery.field.cases import FieldCase
 from experiments.discovery.field.forms import Form
