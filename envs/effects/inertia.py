@@ -69,7 +69,7 @@ ROWS = (
     Effect(
         name="payload",
         parameters=(
-            Parameter(name="kg", scale="mass", bounds=(0.0, 4.0), prior=0.3),
+            Parameter(name="kg", scale="mass", bounds=(0.0, 6.0), prior=0.3),
             *(Parameter(name=f"{axis}_m", bounds=(-0.4, 0.4), prior=0.1) for axis in "xyz"),
             Parameter(name="gyration_m", bounds=(0.0, 0.4), prior=0.1),
         ),
