@@ -10,6 +10,7 @@ import pytest
 
 from envs import segments
 from envs.corrected import save
+from envs.diagnosis.structure import structure
 from envs.logs import Controller, Log, Run, splits, write
 from envs.models import suspended
 from envs.null_logs import Robot, as_recorded, play
@@ -83,7 +84,12 @@ def with_holes(lengths, holes, **facts):
 @pytest.mark.parametrize("missing, begins", [(5, [0, 605]), (10, [0]), (20, [0])])
 def test_a_run_is_cut_where_a_few_rows_are_missing(tmp_path, missing, begins):
     # 10 ms, and 22 and 42 ms, in which somebody should look at the recording.
-    log, _ = read_logs(folder(tmp_path, with_holes([1500] * 3, [[(600, missing)]] * 3)))
+    recorded = with_holes([1500] * 3, [[(600, missing)]] * 3)
+    # The doctor says which of them need no mending.
+    (finding,) = structure(recorded.runs[0])[0]
+    assert finding.kind == "missing rows"
+    assert ("discover cuts the run there" in finding.sentence) == (len(begins) > 1)
+    log, _ = read_logs(folder(tmp_path, recorded))
     mine = [run for run in log.runs if run.condition == "run_0"]
     np.testing.assert_allclose([run.time[0] for run in mine], 0.002 * np.array(begins))
     assert len({run.name for run in log.runs}) == len(log.runs) == 3 * len(begins)
