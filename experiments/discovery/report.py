@@ -67,7 +67,6 @@ def write(path: Path, log: Log, question: Question, result: Result, summary: dic
     brief = partial(brief_keys, question)
     if result.terms:
         pictures["terms"] = plots.accepted_terms(result.terms, [brief(term.hypothesis.key) for term in result.terms])
-    presented, effects = _presented(summary, question), question.rig.effects
     page = report.render(
         _TEMPLATE,
         robot=log.robot,
@@ -77,11 +76,9 @@ def write(path: Path, log: Log, question: Question, result: Result, summary: dic
         summary=summary,
         brief=brief,
         place=partial(place_in_words, question),
-        effects=presented,
+        effects=_presented(summary, question),
         notes=question.notes,
-        not_testable=[
-            (name, effects[name].excited_by if name in effects else "a free base") for name in summary["not_testable"]
-        ],
+        not_testable=[(name, _what_would_show(question, name)) for name in summary["not_testable"]],
         proof=result.proof,
         terms=result.terms,
         failed=partial(_failed, summary),
@@ -92,6 +89,14 @@ def write(path: Path, log: Log, question: Question, result: Result, summary: dic
         pictures={name: plots.embedded(figure) for name, figure in pictures.items()},
     )
     path.write_text(page)
+
+
+def _what_would_show(question: Question, name: str) -> str:
+    """What it takes to see an effect that the logs do not show."""
+    if name not in question.rig.effects:
+        return "a free base"
+    asked = any(hypothesis.name == name for hypothesis in question.problem.hypotheses)
+    return question.rig.effects[name].excited_by if asked else "a controller that is known"
 
 
 def show(console: Console, question: Question, summary: dict, free: dict) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from envs.effects import LIBRARY
 from envs.logs import Controller
 from experiments.discovery import next_experiment, report
 from experiments.discovery.blind_cases import ARM
@@ -150,6 +151,15 @@ def test_whole_runs_are_said_in_the_units_of_their_signal(tmp_path, asked, signa
     report.show(console, question, summary, free)
     for text in ((tmp_path / "page.html").read_text(), console.export_text()):
         assert f"whole runs, mean absolute error in {units}" in text
+
+
+def test_what_would_show_an_effect_is_said(asked):
+    _, question = asked
+    assert report._what_would_show(question, "drag") == LIBRARY["drag"].excited_by
+    assert report._what_would_show(question, "ground_friction") == "a free base"
+    fewer = [one for one in question.problem.hypotheses if one.name != "command_delay"]
+    question = replace(question, problem=replace(question.problem, hypotheses=fewer))
+    assert report._what_would_show(question, "command_delay") == "a controller that is known"
 
 
 @pytest.mark.parametrize("withdrawn", [False, True])
