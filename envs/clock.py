@@ -1,4 +1,4 @@
-"""What the time stamps of a log say of its controller's clock, and which of them only jitter."""
+"""What the time stamps of a log say of its controller's clock, which of them only jitter, and when rows were read."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from envs.logs import Run
+from envs.readings import noise_of, stale
 
 SAME_S = 2e-6
 """Times in s that differ by less are the same: time stamps are rounded, those of a wall clock to 0.2 us."""
@@ -14,6 +15,9 @@ _WHOLE = 0.01  # how far rows may be from a whole number of ticks, as a share
 _NEAR = 9  # rows
 _WINDOW = 51  # rows, over which jitter averages out
 _SMOOTHER = 0.7  # least fall of the roughness of some joint's positions, as a share of its mean square
+_AGREED = 0.25  # most that is left of the roughness of joints that had no say in when rows were read
+_NEAR_S, _ROUNDS, _PACE = 0.01, 8, 0.8  # half width of local fits; how often rows are moved, and how far each time
+_LATE, _APART = 0.5, 0.05  # typical error of a stamp, and least time between two rows, as shares of the usual one
 
 
 @dataclass(frozen=True)
@@ -67,7 +71,7 @@ def evened(runs: Sequence[Run]) -> tuple[Run, ...]:
     even = [line if _only_jitters(run.time, line) else run.time for run, line in zip(runs, even, strict=True)]
     moved = [(run, time) for run, time in zip(runs, even, strict=True) if time is not run.time]
     before, after = (
-        sum(len(time) * _roughness(time, run.signals["q"]) for run, time in stamps)
+        sum(len(time) * _roughness(time, run.signals["q"]).mean(axis=0) for run, time in stamps)
         for stamps in ([(run, run.time) for run, _ in moved], moved)
     )
     if not np.any(after < _SMOOTHER * before):
@@ -75,6 +79,58 @@ def evened(runs: Sequence[Run]) -> tuple[Run, ...]:
     return tuple(
         run if time is run.time else replace(run, time=time - time[0]) for run, time in zip(runs, even, strict=True)
     )
+
+
+def retimed(runs: Sequence[Run]) -> tuple[Run, ...]:
+    """Moves time stamps to when rows were read, where the joints agree on that.
+
+    A program that polls a robot stamps what may be a period old, and no line goes through such stamps. But all joints
+    of a row were read at once. If a joint at 3 rad/s is 0.6 mrad ahead of its own motion, another one at 1 rad/s is
+    0.2 mrad ahead: the row was read 0.2 ms after its stamp. Half of the joints say when, and the others tell whether
+    their positions are smoother then. Robots with one moving joint keep their stamps.
+    """
+    before, after, moved = 0.0, 0.0, []
+    for run in runs:
+        keep, sd = ~stale(run, "q").any(axis=1), noise_of(run, "q")
+        time, position = run.time[keep], run.signals["q"][keep]
+        speed = np.ptp(position, axis=0) / sd
+        order = np.argsort(-speed)
+        halves = [half for half in (order[::2], order[1::2]) if len(half)]
+        if len(time) < 3 * _NEAR or len(halves) < 2:
+            moved.append(run.time)
+            continue
+        for half, others in (halves, halves[::-1]):
+            here = (position[:, others] / sd[others]).astype(float)
+            before = before + np.median(_roughness(time, here), axis=0).sum()
+            after = after + np.median(_roughness(_read(time, position[:, half], sd[half]), here), axis=0).sum()
+        shift = np.interp(run.time, time, _read(time, position, sd) - time)
+        moved.append(_rising(run.time + shift))
+    if not after < _AGREED * before:
+        return tuple(runs)
+    return tuple(replace(run, time=time - time[0]) for run, time in zip(runs, moved, strict=True))
+
+
+def _read(time: np.ndarray, position: np.ndarray, sd: np.ndarray) -> np.ndarray:
+    """When rows [rows] were read, by how far positions [rows, joints] of a noise [joints] are off local cubics."""
+    period = float(np.median(np.diff(time)))
+    half = max(3, round(_NEAR_S / period))
+    near = np.clip(np.arange(len(time)), half, len(time) - 1 - half)[:, None] + np.arange(-half, half + 1)
+    width, at = half * period, time
+    for _ in range(_ROUNDS):
+        powers = ((at[near] - at[:, None]) / width)[..., None] ** np.arange(4)
+        across = powers.swapaxes(1, 2)
+        fit = np.linalg.solve(across @ powers + 1e-9 * np.eye(4), across @ position[near])
+        ahead, speed = (position - fit[:, 0]) / sd, fit[:, 1] / width / sd
+        # As likely as not a stamp is right, and where nothing moves nobody knows.
+        shift = (speed * ahead).sum(axis=1) / ((speed**2).sum(axis=1) + (_LATE * period) ** -2.0)
+        at = _rising(at + _PACE * shift)
+    return at
+
+
+def _rising(time: np.ndarray) -> np.ndarray:
+    """Times that rise: a row that would be read before the last one is just after it."""
+    least = _APART * float(np.median(np.diff(time))) * np.arange(len(time))
+    return np.maximum.accumulate(time - least) + least
 
 
 def _line(time: np.ndarray) -> tuple[np.ndarray, float]:
@@ -103,10 +159,14 @@ def _only_jitters(time: np.ndarray, even: np.ndarray) -> bool:
 
 
 def _roughness(time: np.ndarray, position: np.ndarray) -> np.ndarray:
-    """Mean squares of what polynomials of degree 5 through few rows leave of positions [rows, joints], [joints]."""
+    """Mean squares of what polynomials of degree 5 through few rows leave of positions [rows, joints].
+
+    Returns:
+      [groups of rows, joints].
+    """
     begin = np.arange(0, len(time) - _NEAR, _NEAR)
     near = begin[:, None] + np.arange(_NEAR)
     at = time[near] - time[near].mean(axis=1, keepdims=True)
     basis, _ = np.linalg.qr(np.stack([(at / np.ptp(at)) ** power for power in range(6)], axis=-1))
     values = position[near]
-    return ((values - basis @ (basis.swapaxes(-1, -2) @ values)) ** 2).mean(axis=(0, 1))
+    return ((values - basis @ (basis.swapaxes(-1, -2) @ values)) ** 2).mean(axis=1)

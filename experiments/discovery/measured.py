@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from envs import models, readings, segments
-from envs.clock import evened
+from envs.clock import evened, retimed
 from envs.diagnosis.structure import pieces
 from envs.held import held_joints, unread_joints
 from envs.logs import Log, Run, read_any, splits, with_halves_swapped
@@ -194,6 +194,19 @@ def drop_filtered(log: Log) -> tuple[Log, tuple[str, ...]]:
             notes.append(f"{said}, so one of them was filtered or read late, and dq is not used")
             log = _without(log, "dq")
     return replace(log, rate_hz=row_rate(log)), tuple(notes)
+
+
+def on_read_times(log: Log) -> tuple[Log, tuple[str, ...]]:
+    """The log with rows at the times at which all joints say that they were read (`retimed`), and a note if they moved.
+
+    It comes after the log doctor, which looks at stamps as they are.
+    """
+    runs = retimed(log.runs)
+    if all(run is before for run, before in zip(runs, log.runs, strict=True)):
+        return log, ()
+    off = np.concatenate([run.time - before.time for run, before in zip(runs, log.runs, strict=True)])
+    note = f"time stamps are off by {1e3 * off.std():.2g} ms (rms), as all joints agree: rows are where they were read"
+    return replace(log, runs=runs), (note,)
 
 
 def stale_notes(runs: Sequence[Run]) -> list[str]:

@@ -18,7 +18,13 @@ from envs.rig import Rig
 from envs.scales import measure_scales
 from experiments.discovery.cutting import BIN_S, cut_log, fitting_horizons, told_alike
 from experiments.discovery.hypotheses import forms, hypotheses, learned_torque, unknown_directions
-from experiments.discovery.measured import check_simulatable, drop_filtered, stale_notes, without_sealed
+from experiments.discovery.measured import (
+    check_simulatable,
+    drop_filtered,
+    on_read_times,
+    stale_notes,
+    without_sealed,
+)
 from jaxtune.discovery.problem import Problem
 
 
@@ -94,7 +100,8 @@ def build_question(
     """
     horizons = fitting_horizons(log, horizons)
     rate = check_simulatable(log, spec, horizons)
-    log, notes = drop_filtered(with_splits(log))
+    log, moved = on_read_times(with_splits(log))
+    log, notes = drop_filtered(log)
     log = replace(log, runs=readings.with_noise(log.runs, without_sealed(log).runs))
     ours = follower(without_sealed(log), spec)
     log = followed(log, ours)
@@ -128,7 +135,9 @@ def build_question(
         residual=learned_torque(rig.axes, LEARNED),
     )
     names = {split: tuple(run.name for run in runs) for split, runs in splits(log).items()}
-    return Question(problem, spec, rig, log, sensed, names, (*log.notes, *notes, *partly, *stale_notes(unsealed)))
+    return Question(
+        problem, spec, rig, log, sensed, names, (*log.notes, *moved, *notes, *partly, *stale_notes(unsealed))
+    )
 
 
 def _free_or_asked(rig: Rig, signals: Sequence[str], follows: bool, sensed: np.ndarray) -> dict[str, Any]:

@@ -563,6 +563,47 @@ def test_stamps_that_jitter_where_positions_do_not_are_put_on_a_line():
     assert clock.evened([short]) == (short,)
 
 
+def polled(motion):
+    """Rows of a robot that has a new state every ms: when each was asked for, and the time of the state that it has."""
+    rng = np.random.default_rng(4)
+    asked = np.cumsum(rng.uniform(0.0007, 0.0012, 3000))
+    read = np.floor(asked * 1000.0) / 1000.0
+    return run(asked, q=motion(read) + 3e-6 * rng.standard_normal((len(read), 2))), read
+
+
+def test_rows_are_where_all_joints_say_that_they_were_read():
+    motion = lambda time: np.stack([0.5 * np.sin(3.0 * time), 0.3 * np.cos(5.0 * time)], axis=1)  # noqa: E731
+    mine, read = polled(motion)
+    (found,) = clock.retimed([mine])
+    new = np.append(True, np.diff(read) > 0)
+    # From row to row; what wanders slowly does not show in positions.
+    off = lambda time: (np.diff(time[new]) - np.diff(read[new])).std()  # noqa: E731
+    assert off(found.time) < 0.1 * off(mine.time)
+    assert (found.time - read)[new].std() < 0.5 * (mine.time - read)[new].std()
+    assert (np.diff(found.time) > clock.SAME_S).all()
+    # Two runs, of which one rests, were stamped by the same program.
+    both = clock.retimed([mine, run(mine.time, q=np.zeros((len(read), 2)))])
+    np.testing.assert_array_equal(both[0].time, found.time)
+
+
+@pytest.mark.parametrize("case", ["stamped as read", "one profile", "one joint", "at rest", "short"])
+def test_stamps_that_joints_do_not_speak_against_are_kept(case):
+    noise = lambda time: 3e-6 * np.random.default_rng(5).standard_normal((len(time), 2))  # noqa: E731
+    time = polled(lambda time: np.zeros((len(time), 2)))[0].time
+    if case == "stamped as read":
+        q = np.stack([0.5 * np.sin(3.0 * time), 0.3 * np.cos(5.0 * time)], axis=1)
+    elif case == "one profile":
+        # Steps of speed that all joints do at once look like a clock that goes wrong, but only there.
+        q = np.abs((0.8 * time) % 2.0 - 1.0)[:, None] * [0.5, -0.3]
+    elif case == "one joint":
+        q = polled(lambda time: np.stack([0.5 * np.sin(3.0 * time), 0.0 * time], axis=1))[0].signals["q"]
+    else:
+        q = np.zeros((len(time), 2))
+    rows = slice(20 if case == "short" else None)
+    mine = run(time[rows], q=(q + noise(time))[rows])
+    assert clock.retimed([mine]) == (mine,)
+
+
 @pytest.mark.parametrize("mean", [2e-5, 2e-4])
 def test_rows_that_are_stamped_very_late_or_are_missing_miss_no_tick(mean):
     time = times(10.0)
