@@ -16,8 +16,10 @@ _NEAR = 9  # rows
 _WINDOW = 51  # rows, over which jitter averages out
 _SMOOTHER = 0.7  # least fall of the roughness of some joint's positions, as a share of its mean square
 _AGREED = 0.25  # most that is left of the roughness of joints that had no say in when rows were read
-_NEAR_S, _ROUNDS, _PACE = 0.01, 8, 0.8  # half width of local fits; how often rows are moved, and how far each time
-_LATE, _APART = 0.5, 0.05  # typical error of a stamp, and least time between two rows, as shares of the usual one
+_SLOW_S, _JUDGED = 0.004, 5000  # longest time between rows that are moved; how many of them decide
+_HALF_S, _ROUNDS, _PACE = 0.01, 8, 0.8  # half width of local cubics, how often rows are moved, and how far of the way
+_LATE, _APART = 0.5, 0.2  # a usual move, and the least time between two rows, as shares of the usual one
+_KINK = 16.0  # times the usual mean square that a cubic leaves
 
 
 @dataclass(frozen=True)
@@ -81,39 +83,76 @@ def evened(runs: Sequence[Run]) -> tuple[Run, ...]:
     )
 
 
-def retimed(runs: Sequence[Run]) -> tuple[Run, ...]:
+def retimed(runs: Sequence[Run], seen: Sequence[Run]) -> tuple[Run, ...]:
     """Moves time stamps to when rows were read, where the joints agree on that.
 
     A program that polls a robot stamps what may be a period old, and no line goes through such stamps. But all joints
     of a row were read at once. If a joint at 3 rad/s is 0.6 mrad ahead of its own motion, another one at 1 rad/s is
     0.2 mrad ahead: the row was read 0.2 ms after its stamp. Half of the joints say when, and the others tell whether
-    their positions are smoother then. Robots with one moving joint keep their stamps.
+    their positions are smoother then. Lateness that changes slowly does not show. In slow rows motion cannot be told
+    from it, so they stay.
+
+    Args:
+      runs: of one robot and one program.
+      seen: those that may decide; without sealed ones.
+
+    Returns:
+      The runs; those that were moved with the noise of what they read, which stamps had hidden.
     """
-    before, after, moved = 0.0, 0.0, []
-    for run in runs:
-        keep, sd = ~stale(run, "q").any(axis=1), noise_of(run, "q")
-        time, position = run.time[keep], run.signals["q"][keep]
-        speed = np.ptp(position, axis=0) / sd
-        order = np.argsort(-speed)
-        halves = [half for half in (order[::2], order[1::2]) if len(half)]
-        if len(time) < 3 * _NEAR or len(halves) < 2:
-            moved.append(run.time)
-            continue
-        for half, others in (halves, halves[::-1]):
-            here = (position[:, others] / sd[others]).astype(float)
-            before = before + np.median(_roughness(time, here), axis=0).sum()
-            after = after + np.median(_roughness(_read(time, position[:, half], sd[half]), here), axis=0).sum()
-        shift = np.interp(run.time, time, _read(time, position, sd) - time)
-        moved.append(_rising(run.time + shift))
+    before, after = np.sum([_judged(run) for run in seen], axis=0)
     if not after < _AGREED * before:
         return tuple(runs)
-    return tuple(replace(run, time=time - time[0]) for run, time in zip(runs, moved, strict=True))
+    return tuple(_moved(run) for run in runs)
+
+
+def _judged(run: Run) -> tuple[float, float]:
+    """Roughness of joints at the stamps, and where the other half of the joints says that rows were read."""
+    time, position, sd = (values[:_JUDGED] for values in _fresh(run))
+    order = np.argsort(-np.ptp(position, axis=0) / sd[0])
+    halves = [half for half in (order[::2], order[1::2]) if len(half)]
+    if not _tells(time) or len(halves) < 2:
+        return 0.0, 0.0
+    found = np.zeros(2)
+    for half, others in (halves, halves[::-1]):
+        read = _read(time, position[:, half], sd[0][half])
+        # Fast joints show most of it. What a joint at rest has is noise, and the same at both times.
+        found += [np.median(_roughness(at, position[:, others]), axis=0).sum() for at in (time, read)]
+    return float(found[0]), float(found[1])
+
+
+def _tells(time: np.ndarray) -> bool:
+    """Whether rows are many and fast enough to tell motion from lateness."""
+    return len(time) >= 3 * _NEAR and float(np.median(np.diff(time))) <= _SLOW_S
+
+
+def _moved(run: Run) -> Run:
+    time, position, sd = _fresh(run)
+    if not _tells(time):
+        return run
+    parts = np.array_split(np.arange(len(time)), max(1, round(len(time) / _JUDGED)))
+    read = np.concatenate([_read(time[rows], position[rows], sd[0]) for rows in parts])
+    at = _rising(run.time + np.interp(run.time, time, read - time))
+    known = dict(run.known)
+    for name in {"q", "dq"} & set(run.signals):
+        # What is left of nine rows by six terms is a third of their noise; the median of such is 0.79 of the mean.
+        sd = np.sqrt(3.0 / 0.79 * np.median(_roughness(at, run.signals[name]), axis=0))
+        said = run.fact(name, "noise_sd")
+        known[name] = {**run.known.get(name, {}), "noise_sd": np.where(np.isfinite(said), said, sd)}
+    return replace(run, time=at, known=known)
+
+
+def _fresh(run: Run) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Times [rows] and positions [rows, joints] of rows that no joint repeats, and the positions' noise [1, joints]."""
+    keep = ~stale(run, "q").any(axis=1)
+    return run.time[keep], run.signals["q"][keep], noise_of(run, "q")[None]
 
 
 def _read(time: np.ndarray, position: np.ndarray, sd: np.ndarray) -> np.ndarray:
     """When rows [rows] were read, by how far positions [rows, joints] of a noise [joints] are off local cubics."""
     period = float(np.median(np.diff(time)))
-    half = max(3, round(_NEAR_S / period))
+    half = max(3, round(_HALF_S / period))
+    if len(time) <= 2 * half:
+        return time
     near = np.clip(np.arange(len(time)), half, len(time) - 1 - half)[:, None] + np.arange(-half, half + 1)
     width, at = half * period, time
     for _ in range(_ROUNDS):
@@ -121,10 +160,12 @@ def _read(time: np.ndarray, position: np.ndarray, sd: np.ndarray) -> np.ndarray:
         across = powers.swapaxes(1, 2)
         fit = np.linalg.solve(across @ powers + 1e-9 * np.eye(4), across @ position[near])
         ahead, speed = (position - fit[:, 0]) / sd, fit[:, 1] / width / sd
-        # As likely as not a stamp is right, and where nothing moves nobody knows.
+        # Where nothing moves nobody knows. A state that is polled is no more than a period old.
         shift = (speed * ahead).sum(axis=1) / ((speed**2).sum(axis=1) + (_LATE * period) ** -2.0)
-        at = _rising(at + _PACE * shift)
-    return at
+        at = _rising(np.clip(at + _PACE * shift, time - period, time + period))
+    # About a kink of the motion no cubic fits, whenever rows were read.
+    left = (ahead**2).sum(axis=1)[near].mean(axis=1)
+    return _rising(np.where(left > _KINK * np.median(left), time, at))
 
 
 def _rising(time: np.ndarray) -> np.ndarray:

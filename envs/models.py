@@ -144,10 +144,10 @@ def write_inertia(body: mujoco.MjsBody, model: mujoco.MjModel | mjx.Model, numbe
     # Without this the compiler would compute mass and inertia from the geometries again.
     body.explicitinertial = True
     inertia = np.array(model.body_inertia[number], float)
-    # A disc has no less about its axis than about the two others together. Rounding would make it more, which the
+    # A disc has as much about its axis as about the two others together. Rounding would make it more, which the
     # compiler refuses.
-    largest = inertia.argmax()
-    inertia[largest] = min(inertia[largest], (1.0 - _ROUNDING) * (inertia.sum() - inertia[largest]))
+    low, middle, high = np.argsort(inertia)
+    inertia[low] = max(inertia[low], (1.0 + _ROUNDING) * inertia[high] - inertia[middle])
     body.mass, body.inertia = float(model.body_mass[number]), inertia
     body.ipos, body.iquat = (np.asarray(getattr(model, f"body_{field}")[number], float) for field in ("ipos", "iquat"))
     # The compiler refuses a body that has both forms of inertia, and prefers other forms of an orientation.

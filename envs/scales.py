@@ -15,7 +15,7 @@ from envs.rig import Rig
 from envs.segments import smoothed
 
 _PINION_M = 0.05
-_LOAD = 0.05  # of the robot's mass
+_LOAD = 0.05  # of the mass of all links
 _LEVER_M = 0.001  # a centre of mass on its joint's axis is not dragged
 _DRIVEN = 0.01  # least share of the torque that moves a joint's inertia; a passive joint gets none
 
@@ -30,7 +30,7 @@ def measure_scales(rig: Rig, runs: Sequence[Run]) -> dict[str, np.ndarray]:
         quadratic  torque / rms(dq)^2          Nm s^2/rad^2
         stiffness  torque / (0.02 angle)       Nm/rad
         inertia    diagonal of the joint-space inertia in the mean pose, kg m^2
-        mass       mass of the body, or a twentieth of the robot's where that is more: what a light wrist
+        mass       mass of the body, or a twentieth of all links' where that is more: what a light wrist
                    carries goes by what the arm can lift   kg
         drag       least of torque / (lever v) over the joints that move the body's centre of mass by 1 mm a
                    rad or more (else the joint next to it), with the rms v of the centre in the mean pose   N s/m

@@ -52,12 +52,12 @@ def structure(run: Run) -> tuple[list[Finding], Run]:
             f"usual, the first after row {gaps[0] + 1}"
         )
         found.append(Finding("short gaps", "t", (), float(len(gaps)), text))
-    cut = [piece.time[0] for piece in pieces(run)[1:]]
+    cut = _BRIEF_S + SAME_S if pieces(run)[0] is not run else 0.0
     for row in holes:
         moved = _moves_on(run, row)
         kind, what = ("missing rows", "rows are missing") if moved else ("clock jump", "the clock jumps")
         text = f"{what} after row {row + 1}: {steps[row]:.4g} s to the next row, where {period:.4g} s are usual"
-        text += "; discover cuts the run there" if run.time[row + 1] in cut else ""
+        text += "; discover cuts the run there" if steps[row] <= cut else ""
         found.append(Finding(kind, "t", (), float(steps[row]), text))
     return found, _longest(run, np.union1d(holes, np.flatnonzero(twice)))
 

@@ -197,15 +197,19 @@ def drop_filtered(log: Log) -> tuple[Log, tuple[str, ...]]:
 
 
 def on_read_times(log: Log) -> tuple[Log, tuple[str, ...]]:
-    """The log with rows at the times at which all joints say that they were read (`retimed`), and a note if they moved.
+    """The log with rows where all joints say that they were read (`retimed`), and a note if they moved.
 
-    It comes after the log doctor, which looks at stamps as they are.
+    It is for logs of unknown controllers: what was sent has the time of its stamp. And it comes after the log doctor,
+    which looks at stamps as they are.
     """
-    runs = retimed(log.runs)
+    if any(run.controller.kind != "unknown" for run in log.runs):
+        return log, ()
+    runs = retimed(log.runs, without_sealed(log).runs)
     if all(run is before for run, before in zip(runs, log.runs, strict=True)):
         return log, ()
-    off = np.concatenate([run.time - before.time for run, before in zip(runs, log.runs, strict=True)])
-    note = f"time stamps are off by {1e3 * off.std():.2g} ms (rms), as all joints agree: rows are where they were read"
+    moves = [run.time - before.time for run, before in zip(runs, log.runs, strict=True)]
+    off = 1e3 * np.concatenate([move - np.median(move) for move in moves]).std()
+    note = f"time stamps jitter by {off:.2g} ms (rms), as all joints agree: rows were moved to where they were read"
     return replace(log, runs=runs), (note,)
 
 
