@@ -79,7 +79,7 @@ def step(
     library = state.library or simulate_library(at, state.nominal, every, say)
     state = replace(state, library=library)
     # A form may be another one of an effect that is there.
-    forms = [form for form in problem.forms if all(are_distinct(form, other) for other in base.hypotheses)]
+    forms = _beside(problem.forms, base.hypotheses)
     if state.screened:
         again = _again(settings, at, base.fit, free, forms, library, state.price)
         found = screen(at, base.fit, again, price=state.price, pairs=0, say=say)
@@ -88,7 +88,11 @@ def step(
         groups, pairs = groups_of(free, forms), settings.firsts
         found = screen(at, base.fit, groups, price=state.price, fitted=fit, pairs=pairs, library=library, say=say)
     leads = shortlist(settings, found, state.price)
-    leads = leads[: settings.swaps] if swapping else leads + shaped(_unfree(problem, at), free, leads, settings.shaped)
+    leads = (
+        leads[: settings.swaps]
+        if swapping
+        else leads + shaped(_beside(_unfree(problem, at), base.hypotheses), free, leads, settings.shaped)
+    )
     if base.fit is state.nominal:
         leads = leads + stuck(state.null.fit, [h for h in free if problem.is_nominal(h)], leads)
     say(f"fit {len(leads)}")
@@ -175,6 +179,11 @@ def _unfree(problem: Problem, at: Floor) -> list[Hypothesis]:
     return [form for form in problem.forms if not taken_over(at.prior, form).any()]
 
 
+def _beside(forms: Sequence[Hypothesis], present: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """Lists the forms that may stand beside all that is present: a coordinate must not be in a model twice."""
+    return [form for form in forms if all(are_distinct(form, other) for other in present)]
+
+
 def shaped(forms: Sequence[Hypothesis], free: Sequence[Hypothesis], leads: Sequence[Lead], count: int) -> list[Lead]:
     """Adds to the first leads what they are without the form that the screen saw them in, each further form that they
     may have, and what such a form is without them.
@@ -194,8 +203,7 @@ def shaped(forms: Sequence[Hypothesis], free: Sequence[Hypothesis], leads: Seque
         effect, *others = lead.hypotheses
         if others and all(one.form for one in others):
             found.append(replace(lead, hypotheses=(effect,), point=lead.point[: len(effect.directions)]))
-        there = {one.key for one in others}
-        for form in (form for form in forms if form.shapes(effect) and form.key not in there):
+        for form in (form for form in _beside(forms, lead.hypotheses) if form.shapes(effect)):
             point = _start(form)
             found.append(Lead((*lead.hypotheses, form), np.concatenate([lead.point, point]), lead.start, lead.cost))
             alone = [h for h in free if h.key not in known and np.array_equal(h.directions, form.directions)]

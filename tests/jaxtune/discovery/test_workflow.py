@@ -431,6 +431,10 @@ def test_a_form_that_is_an_effect_of_its_own_is_fitted_alone_too():
     (plain,) = step.shaped([DIRECTION], (), [both], 1)
     assert [h.key for h in plain.hypotheses] == ["coulomb@slider"]
     assert plain.point == pytest.approx([0.8])
+    # No coordinate is in a model twice, by a form and by an effect that is there.
+    pair = step.Lead((coulomb, push), np.array([0.8, 0.3]), np.zeros(2), 10.0)
+    assert [lead.hypotheses[-1].key for lead in step.shaped([DIRECTION, WARPED], (), [pair], 1)] == [WARPED.key]
+    assert [form.key for form in step._beside([DIRECTION, WARPED], [push])] == [WARPED.key]
 
 
 def test_a_nominal_parameter_that_moved_is_no_form_of_an_effect():
