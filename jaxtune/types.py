@@ -219,6 +219,9 @@ class Form:
     """Empty for all parameters of that row."""
     screened: bool = False
     """True where the effect may show in this form alone: it is screened with the form's smallest size too."""
+    like: str = ""
+    """Row, of as many parameters, that a small effect in this form is taken for: where that one leads, this is fitted
+    too."""
 
 
 @dataclass(frozen=True, kw_only=True)

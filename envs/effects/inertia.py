@@ -78,7 +78,10 @@ ROWS = (
         sentence="An object is attached to the link, at its centre of mass or beside it.",
         excited_by="a motor-off swing, and postures of high gravity torque",
         # How far the object's centre is from the link's, and its radius of gyration.
-        forms=(Form("off_centre", "payload", ("x_m", "y_m", "z_m")), Form("bulky", "payload", ("gyration_m",))),
+        forms=(
+            Form("off_centre", "payload", ("x_m", "y_m", "z_m"), like="com_offset"),
+            Form("bulky", "payload", ("gyration_m",)),
+        ),
         **_INERTIA,
     ),
 )

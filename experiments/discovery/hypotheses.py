@@ -60,7 +60,8 @@ def forms(axes: Sequence[Axis], rows: Mapping[str, Effect], every: Sequence[Hypo
 
 
 def _as_form(shape: Hypothesis, effect: Hypothesis, form: Form) -> Hypothesis:
-    return replace(shape, name=effect.name, family=effect.family, form=form.name, screened=form.screened)
+    said = {"form": form.name, "screened": form.screened, "like": form.like}
+    return replace(shape, name=effect.name, family=effect.family, **said)
 
 
 _RIGHT = {"left": "right", "l": "r", "fl": "fr", "rl": "rr", "hl": "hr", "bl": "br"}

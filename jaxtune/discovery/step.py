@@ -209,6 +209,23 @@ def shaped(forms: Sequence[Hypothesis], free: Sequence[Hypothesis], leads: Seque
             alone = [h for h in free if h.key not in known and np.array_equal(h.directions, form.directions)]
             found += [Lead((h,), point, lead.start, lead.cost) for h in alone]
             known.update(h.key for h in alone)
+        if not others:
+            found += _taken_for(lead, forms, [h for h in free if h.key not in known])
+    return found
+
+
+def _taken_for(lead: Lead, forms: Sequence[Hypothesis], free: Sequence[Hypothesis]) -> list[Lead]:
+    """Lists what may pass for the one effect of a lead (`jaxtune.types.Form.like`), at the same places.
+
+    A load beside a link's centre looks like a shift of that centre, and a load at the centre like neither.
+    """
+    (effect,), found = lead.hypotheses, []
+    for form in (form for form in forms if (form.like, form.places) == (effect.name, effect.places)):
+        # In the direction of what it passes for, and of the size that is tried.
+        point = form.probes.max() * lead.point / max(np.abs(lead.point).max(), 1e-9)
+        for host in (h for h in free if form.shapes(h)):
+            size = host.probes[len(host.probes) // 2]
+            found.append(Lead((host, form), np.concatenate([size, point]), lead.start, lead.cost))
     return found
 
 

@@ -431,6 +431,12 @@ def test_a_form_that_is_an_effect_of_its_own_is_fitted_alone_too():
     (plain,) = step.shaped([DIRECTION], (), [both], 1)
     assert [h.key for h in plain.hypotheses] == ["coulomb@slider"]
     assert plain.point == pytest.approx([0.8])
+    # What may pass for another effect is fitted where that one leads, unless it leads itself.
+    passes = replace(DIRECTION, form="beside", like="damping")
+    found = step.shaped([passes], HYPOTHESES, [second], 1)
+    assert [[h.key for h in lead.hypotheses] for lead in found] == [["coulomb@slider", "coulomb(beside)@slider"]]
+    np.testing.assert_allclose(found[0].point[-1], passes.probes.max())
+    assert len(step.shaped([passes], HYPOTHESES, [second, first], 1)) == 0
     # No coordinate is in a model twice, by a form and by an effect that is there.
     pair = step.Lead((coulomb, push), np.array([0.8, 0.3]), np.zeros(2), 10.0)
     assert [lead.hypotheses[-1].key for lead in step.shaped([DIRECTION, WARPED], (), [pair], 1)] == [WARPED.key]
