@@ -107,14 +107,15 @@ def retimed(runs: Sequence[Run], seen: Sequence[Run]) -> tuple[Run, ...]:
 
 def _judged(run: Run) -> tuple[float, float]:
     """Roughness of joints at the stamps, and where the other half of the joints says that rows were read."""
-    time, position, sd = (values[:_JUDGED] for values in _fresh(run))
-    order = np.argsort(-np.ptp(position, axis=0) / sd[0])
+    time, position = (values[:_JUDGED] for values in _fresh(run))
+    sd = noise_of(run, "q")
+    order = np.argsort(-np.ptp(position, axis=0) / sd)
     halves = [half for half in (order[::2], order[1::2]) if len(half)]
     if not _tells(time) or len(halves) < 2:
         return 0.0, 0.0
     found = np.zeros(2)
     for half, others in (halves, halves[::-1]):
-        read = _read(time, position[:, half], sd[0][half])
+        read = _read(time, position[:, half], sd[half])
         # Fast joints show most of it. What a joint at rest has is noise, and the same at both times.
         found += [np.median(_roughness(at, position[:, others]), axis=0).sum() for at in (time, read)]
     return float(found[0]), float(found[1])
@@ -126,11 +127,11 @@ def _tells(time: np.ndarray) -> bool:
 
 
 def _moved(run: Run) -> Run:
-    time, position, sd = _fresh(run)
+    (time, position), noise = _fresh(run), noise_of(run, "q")
     if not _tells(time):
         return run
     parts = np.array_split(np.arange(len(time)), max(1, round(len(time) / _JUDGED)))
-    read = np.concatenate([_read(time[rows], position[rows], sd[0]) for rows in parts])
+    read = np.concatenate([_read(time[rows], position[rows], noise) for rows in parts])
     at = _rising(run.time + np.interp(run.time, time, read - time))
     known = dict(run.known)
     for name in {"q", "dq"} & set(run.signals):
@@ -141,10 +142,10 @@ def _moved(run: Run) -> Run:
     return replace(run, time=at, known=known)
 
 
-def _fresh(run: Run) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Times [rows] and positions [rows, joints] of rows that no joint repeats, and the positions' noise [1, joints]."""
+def _fresh(run: Run) -> tuple[np.ndarray, np.ndarray]:
+    """Times [rows] and positions [rows, joints] of rows that no joint repeats."""
     keep = ~stale(run, "q").any(axis=1)
-    return run.time[keep], run.signals["q"][keep], noise_of(run, "q")[None]
+    return run.time[keep], run.signals["q"][keep]
 
 
 def _read(time: np.ndarray, position: np.ndarray, sd: np.ndarray) -> np.ndarray:

@@ -17,15 +17,13 @@ from jaxtune.discovery.curves import Group, Library, groups_of, on_segments, sim
 from jaxtune.discovery.evaluate import usual
 from jaxtune.discovery.evidence import ablate, or_known
 from jaxtune.discovery.fit import Fit, begin, polish, refine, taken_over
+from jaxtune.discovery.leads import beside, shaped, shortlist, stuck
 from jaxtune.discovery.localise import localise
 from jaxtune.discovery.noise_floor import Floor, NoiseFloor, Say
 from jaxtune.discovery.problem import Hypothesis, Problem, are_distinct
 from jaxtune.discovery.result import Settings
-from jaxtune.discovery.screen import Lead, Screen, promising, screen, seen
+from jaxtune.discovery.screen import Lead, promising, screen, seen
 from jaxtune.discovery.state import State
-
-_MOST_PLACES = 3  # of one name among the leads that are fitted: they tell where; more would crowd out other names
-
 
 _REACH = 0.5  # share of the best fit's gain that another one needs for fresh slopes
 
@@ -79,7 +77,7 @@ def step(
     library = state.library or simulate_library(at, state.nominal, every, say)
     state = replace(state, library=library)
     # A form may be another one of an effect that is there.
-    forms = _beside(problem.forms, base.hypotheses)
+    forms = beside(problem.forms, base.hypotheses)
     if state.screened:
         again = _again(settings, at, base.fit, free, forms, library, state.price)
         found = screen(at, base.fit, again, price=state.price, pairs=0, say=say)
@@ -88,11 +86,10 @@ def step(
         groups, pairs = groups_of(free, forms), settings.firsts
         found = screen(at, base.fit, groups, price=state.price, fitted=fit, pairs=pairs, library=library, say=say)
     leads = shortlist(settings, found, state.price)
-    leads = (
-        leads[: settings.swaps]
-        if swapping
-        else leads + shaped(_beside(_unfree(problem, at), base.hypotheses), free, leads, settings.shaped)
-    )
+    if swapping:
+        leads = leads[: settings.swaps]
+    else:
+        leads += shaped(beside(_unfree(problem, at), base.hypotheses), free, leads, settings.shaped)
     if base.fit is state.nominal:
         leads = leads + stuck(state.null.fit, [h for h in free if problem.is_nominal(h)], leads)
     say(f"fit {len(leads)}")
@@ -156,108 +153,9 @@ def _again(
     return groups_of([*own, *more], forms)
 
 
-def shortlist(settings: Settings, found: Screen, price: float) -> list[Lead]:
-    """Takes the best leads and the best of each family, at most three places of one name, and the best pairs."""
-    chosen: list[Lead] = []
-    families, names = set(), {}
-    # A fit finds more than the screen does, but not many times as much.
-    for lead in (one for one in found.leads if found.cost - one.cost > settings.promising * price):
-        hypothesis = lead.hypotheses[0]
-        if names.get(hypothesis.name, 0) >= _MOST_PLACES:
-            continue
-        if len(chosen) < settings.shortlist or hypothesis.family not in families:
-            chosen.append(lead)
-            families.add(hypothesis.family)
-            names[hypothesis.name] = names.get(hypothesis.name, 0) + 1
-    least = found.leads[0].cost if found.leads else found.cost
-    pairs = [pair for pair in found.pairs if least - pair.cost > settings.promising * price]
-    return chosen + pairs[: settings.pairs]
-
-
 def _unfree(problem: Problem, at: Floor) -> list[Hypothesis]:
     """Lists the forms that are not free under every hypothesis."""
     return [form for form in problem.forms if not taken_over(at.prior, form).any()]
-
-
-def _beside(forms: Sequence[Hypothesis], present: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """Lists the forms that may stand beside all that is present: a coordinate must not be in a model twice."""
-    return [form for form in forms if all(are_distinct(form, other) for other in present)]
-
-
-def shaped(forms: Sequence[Hypothesis], free: Sequence[Hypothesis], leads: Sequence[Lead], count: int) -> list[Lead]:
-    """Adds to the first leads what they are without the form that the screen saw them in, each further form that they
-    may have, and what such a form is without them.
-
-    Else what another form of the right effect leaves would be explained by a second effect. And play with a spring
-    that turns out to have no play is a spring: a form that is an effect of its own is fitted alone too.
-
-    Args:
-      forms: of all effects.
-      free: effects that may join the model.
-      leads: best first.
-      count: leads of one effect that get their forms.
-    """
-    known = {lead.hypotheses[0].key for lead in leads if sum(not one.form for one in lead.hypotheses) == 1}
-    found = []
-    for lead in leads[:count]:
-        effect, *others = lead.hypotheses
-        if others and all(one.form for one in others):
-            found.append(replace(lead, hypotheses=(effect,), point=lead.point[: len(effect.directions)]))
-        for form in (form for form in _beside(forms, lead.hypotheses) if form.shapes(effect)):
-            point = _start(form)
-            found.append(Lead((*lead.hypotheses, form), np.concatenate([lead.point, point]), lead.start, lead.cost))
-            alone = [h for h in free if h.key not in known and np.array_equal(h.directions, form.directions)]
-            found += [Lead((h,), point, lead.start, lead.cost) for h in alone]
-            known.update(h.key for h in alone)
-        if not others:
-            found += _taken_for(lead, forms, [h for h in free if h.key not in known])
-    return found
-
-
-def _taken_for(lead: Lead, forms: Sequence[Hypothesis], free: Sequence[Hypothesis]) -> list[Lead]:
-    """Lists what may pass for the one effect of a lead (`jaxtune.types.Form.like`), at the same places.
-
-    A load beside a link's centre looks like a shift of that centre, and a load at the centre like neither.
-    """
-    (effect,), found = lead.hypotheses, []
-    for form in (form for form in forms if (form.like, form.places) == (effect.name, effect.places)):
-        # In the direction of what it passes for, and of the size that is tried.
-        point = form.probes.max() * lead.point / max(np.abs(lead.point).max(), 1e-9)
-        for host in (h for h in free if form.shapes(h)):
-            size = host.probes[len(host.probes) // 2]
-            found.append(Lead((host, form), np.concatenate([size, point]), lead.start, lead.cost))
-    return found
-
-
-def _start(form: Hypothesis) -> np.ndarray:
-    """The point at which the fit of a form begins, [parameters]."""
-    if np.count_nonzero((form.probes != 0).any(axis=0)) > 1:
-        # In no direction more than in another.
-        return form.probes.mean(axis=0)
-    # The least size may be too small to have a slope.
-    return form.probes[:2][-1]
-
-
-def stuck(null: Fit, hypotheses: Sequence[Hypothesis], leads: Sequence[Lead]) -> list[Lead]:
-    """Lists the nominal parameters that went as far as they may in the null, each as a lead that lets it go on.
-
-    The screen holds nominal parameters near their belief, from where it may not see that one of them alone is far off.
-
-    Args:
-      null: the model without effects.
-      hypotheses: about nominal parameters.
-      leads: those that are fitted anyway.
-    """
-    known = {lead.hypotheses[0].key for lead in leads if len(lead.hypotheses) == 1}
-    low, high = null.free.bounds.T
-    at_bound = (null.coordinates <= low) | (null.coordinates >= high)
-    found = []
-    for hypothesis in (one for one in hypotheses if len(one.places) == 1 and one.key not in known):
-        if at_bound[taken_over(null.free, hypothesis)].any():
-            (axis,) = np.flatnonzero(hypothesis.directions[0])
-            point = null.vector[axis] / hypothesis.directions[:, axis]
-            found.append(Lead((hypothesis,), point, null.coordinates, null.cost))
-    return found
 
 
 def fit_leads(

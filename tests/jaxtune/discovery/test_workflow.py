@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from slider import AXES, BOTH, DIRECTION, EACH, HYPOTHESES, LEARNED, ONE_SIZE, WARPED, WILD, problem
 
-from jaxtune.discovery import noise_floor, state, step, workflow
+from jaxtune.discovery import leads, noise_floor, state, step, workflow
 from jaxtune.discovery.candidate import Candidate
 from jaxtune.discovery.conclude import _rivals
 from jaxtune.discovery.evaluate import is_worse
@@ -401,21 +401,21 @@ def test_a_nominal_parameter_that_stops_at_its_bound_is_a_lead_of_its_own():
     _, begun = state.begin(asked, measured_floor(asked))
     nominal = [one for one in HYPOTHESES if asked.is_nominal(one)]
     assert {one.name for one in nominal} == {"mass", "damping"}
-    (lead,) = step.stuck(begun.null.fit, nominal, [])
+    (lead,) = leads.stuck(begun.null.fit, nominal, [])
     # Three deviations of a tenth, from where the null stopped: beside it a fit may go on.
     assert [one.name for one in lead.hypotheses] == ["mass"]
     np.testing.assert_allclose(lead.point, [0.3], rtol=1e-6)
     np.testing.assert_array_equal(lead.start, begun.null.fit.coordinates)
-    assert step.stuck(begun.null.fit, nominal, [lead]) == []
+    assert leads.stuck(begun.null.fit, nominal, [lead]) == []
     near = problem({"mass": 0.05})
-    assert step.stuck(state.begin(near, measured_floor(near))[1].null.fit, nominal, []) == []
+    assert leads.stuck(state.begin(near, measured_floor(near))[1].null.fit, nominal, []) == []
 
 
 def test_a_form_that_is_an_effect_of_its_own_is_fitted_alone_too():
     coulomb, push = HYPOTHESES[2:4]
-    first = step.Lead((coulomb,), np.array([0.8]), np.zeros(2), 10.0)
-    second = step.Lead((HYPOTHESES[1],), np.array([0.3]), np.zeros(2), 11.0)
-    found = step.shaped([DIRECTION, WARPED], HYPOTHESES, [first, second], 2)
+    first = Lead((coulomb,), np.array([0.8]), np.zeros(2), 10.0)
+    second = Lead((HYPOTHESES[1],), np.array([0.3]), np.zeros(2), 11.0)
+    found = leads.shaped([DIRECTION, WARPED], HYPOTHESES, [first, second], 2)
     assert [[h.key for h in lead.hypotheses] for lead in found] == [
         ["coulomb@slider", "coulomb(direction_dependent)@slider"],
         ["push@slider"],
@@ -423,24 +423,24 @@ def test_a_form_that_is_an_effect_of_its_own_is_fitted_alone_too():
     ]
     np.testing.assert_array_equal(found[1].point, DIRECTION.probes[1])
     # One that is fitted anyway needs no second start, and only the first leads get forms.
-    known = step.Lead((push,), np.array([0.3]), np.zeros(2), 12.0)
-    assert len(step.shaped([DIRECTION, WARPED], HYPOTHESES, [first, second, known], 1)) == 2
-    assert step.shaped([DIRECTION], HYPOTHESES, [second, first], 1) == []
+    known = Lead((push,), np.array([0.3]), np.zeros(2), 12.0)
+    assert len(leads.shaped([DIRECTION, WARPED], HYPOTHESES, [first, second, known], 1)) == 2
+    assert leads.shaped([DIRECTION], HYPOTHESES, [second, first], 1) == []
     # One that the screen saw in a form is fitted without it too.
-    both = step.Lead((coulomb, DIRECTION), np.array([0.8, 0.3]), np.zeros(2), 10.0)
-    (plain,) = step.shaped([DIRECTION], (), [both], 1)
+    both = Lead((coulomb, DIRECTION), np.array([0.8, 0.3]), np.zeros(2), 10.0)
+    (plain,) = leads.shaped([DIRECTION], (), [both], 1)
     assert [h.key for h in plain.hypotheses] == ["coulomb@slider"]
     assert plain.point == pytest.approx([0.8])
     # What may pass for another effect is fitted where that one leads, unless it leads itself.
     passes = replace(DIRECTION, form="beside", like="damping")
-    found = step.shaped([passes], HYPOTHESES, [second], 1)
+    found = leads.shaped([passes], HYPOTHESES, [second], 1)
     assert [[h.key for h in lead.hypotheses] for lead in found] == [["coulomb@slider", "coulomb(beside)@slider"]]
     np.testing.assert_allclose(found[0].point[-1], passes.probes.max())
-    assert len(step.shaped([passes], HYPOTHESES, [second, first], 1)) == 0
+    assert len(leads.shaped([passes], HYPOTHESES, [second, first], 1)) == 0
     # No coordinate is in a model twice, by a form and by an effect that is there.
-    pair = step.Lead((coulomb, push), np.array([0.8, 0.3]), np.zeros(2), 10.0)
-    assert [lead.hypotheses[-1].key for lead in step.shaped([DIRECTION, WARPED], (), [pair], 1)] == [WARPED.key]
-    assert [form.key for form in step._beside([DIRECTION, WARPED], [push])] == [WARPED.key]
+    pair = Lead((coulomb, push), np.array([0.8, 0.3]), np.zeros(2), 10.0)
+    assert [lead.hypotheses[-1].key for lead in leads.shaped([DIRECTION, WARPED], (), [pair], 1)] == [WARPED.key]
+    assert [form.key for form in leads.beside([DIRECTION, WARPED], [push])] == [WARPED.key]
 
 
 def test_a_nominal_parameter_that_moved_is_no_form_of_an_effect():
