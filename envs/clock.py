@@ -61,26 +61,34 @@ def clock_of(run: Run, dt: float) -> Clock:
     return Clock(run.time, rate_hz, SAME_S)
 
 
-def evened(runs: Sequence[Run]) -> tuple[Run, ...]:
+def evened(runs: Sequence[Run], seen: Sequence[Run]) -> tuple[Run, ...]:
     """Puts the time stamps of a log on lines where positions say that their jitter is of the stamps alone.
 
     A joint at 3 rad/s that was stamped 0.15 ms late seems to be off by 0.45 mrad. Positions are much smoother on a line
     then. Rows that were really read late are not, and keep their stamps, as do those of a clock that wanders slowly, of
     which smoothness says nothing. All runs are judged together, as one program recorded them, and those in which
     little moves say little.
+
+    Args:
+      runs: of one robot and one program.
+      seen: those that may decide; without sealed ones.
     """
-    even = [_line(run.time)[0] if len(run.time) >= 3 * _NEAR else run.time for run in runs]
-    even = [line if _only_jitters(run.time, line) else run.time for run, line in zip(runs, even, strict=True)]
-    moved = [(run, time) for run, time in zip(runs, even, strict=True) if time is not run.time]
-    before, after = (
-        sum(len(time) * _roughness(time, run.signals["q"]).mean(axis=0) for run, time in stamps)
-        for stamps in ([(run, run.time) for run, _ in moved], moved)
-    )
-    if not np.any(after < _SMOOTHER * before):
+    moved = [(run, even) for run in seen if (even := _evened(run)) is not run]
+    if not moved:
         return tuple(runs)
-    return tuple(
-        run if time is run.time else replace(run, time=time - time[0]) for run, time in zip(runs, even, strict=True)
+    before, after = (
+        sum(len(run.time) * _roughness(run.time, run.signals["q"]).mean(axis=0) for run in stamped)
+        for stamped in zip(*moved, strict=True)
     )
+    return tuple(map(_evened, runs)) if np.any(after < _SMOOTHER * before) else tuple(runs)
+
+
+def _evened(run: Run) -> Run:
+    """The run on a line, if its stamps are off it from row to row alone."""
+    if len(run.time) < 3 * _NEAR:
+        return run
+    even, _ = _line(run.time)
+    return replace(run, time=even - even[0]) if _only_jitters(run.time, even) else run
 
 
 def retimed(runs: Sequence[Run], seen: Sequence[Run]) -> tuple[Run, ...]:

@@ -41,7 +41,7 @@ def read_logs(
       ValueError: a log cannot be read, the logs are not of one robot, its base is free, or its model has flags that
         switch physics off.
     """
-    logs = [_on_lines(read_any(folder, robot)) for folder in folders]
+    logs = [read_any(folder, robot) for folder in folders]
     if not logs:
         raise ValueError("logs: got none, expected one or more")
     first = logs[0]
@@ -63,13 +63,13 @@ def read_logs(
     if len(logs) > 1:
         runs = tuple(_numbered(run, number) for number, log in enumerate(logs) for run in log.runs)
     notes += tuple(note for log in logs for note in log.notes)
-    log = _in_pieces(split_in_time(replace(first, runs=runs, notes=notes)))
-    return with_halves_swapped(log) if swap_halves else log, spec
+    log = split_in_time(replace(first, runs=runs, notes=notes))
+    return _in_pieces(_on_lines(with_halves_swapped(log) if swap_halves else log)), spec
 
 
 def _on_lines(log: Log) -> Log:
     """The log with time stamps that jitter put on lines (`evened`)."""
-    runs = evened(log.runs)
+    runs = evened(log.runs, without_sealed(log).runs)
     moved = sum(run is not before for run, before in zip(runs, log.runs, strict=True))
     if not moved:
         return log

@@ -552,15 +552,17 @@ def test_stamps_that_jitter_where_positions_do_not_are_put_on_a_line():
     noise = 1e-5 * np.random.default_rng(1).standard_normal((len(time), 2))
     stamps = late(time, 3e-4)
     moves, rests, short = (run(stamps, q=position(time) + noise), run(stamps, q=noise), run(time[:9], q=noise[:9]))
-    *even, same = clock.evened([moves, rests, short])
+    *even, same = clock.evened([moves, rests, short], [moves, rests, short])
     # The run at rest does not show it, but the same program stamped it.
     for one in even:
         np.testing.assert_allclose(np.diff(one.time), 0.005, rtol=1e-3)
     assert same is short
+    # Sealed runs do not decide.
+    assert clock.evened([moves, rests], [rests]) == (moves, rests)
     # Rows that were read when they say so, and stamps without jitter.
     for one in (run(stamps, q=position(stamps) + noise), run(time, q=position(time) + noise)):
-        assert clock.evened([one, rests]) == (one, rests)
-    assert clock.evened([short]) == (short,)
+        assert clock.evened([one, rests], [one, rests]) == (one, rests)
+    assert clock.evened([short], [short]) == (short,)
 
 
 def polled(motion, grid=True):
@@ -644,7 +646,7 @@ def test_a_clock_that_wanders_slowly_is_believed():
     wanders = time + 1e-3 * np.sin(time)
     stamps, noise = late(wanders, 2e-4), 1e-5 * np.random.default_rng(1).standard_normal((len(time), 2))
     mine = run(stamps, q=0.3 * np.sin(8.0 * wanders)[:, None] * [1.0, -1.0] + noise)
-    assert clock.evened([mine]) == (mine,)
+    assert clock.evened([mine], [mine]) == (mine,)
 
 
 def test_stamps_off_an_even_clock_are_believed():
