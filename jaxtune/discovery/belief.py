@@ -12,9 +12,9 @@ import numpy as np
 
 from jaxtune.discovery.candidate import Candidate, finite, key_of, squares, total_cost, units_of
 from jaxtune.discovery.noise_floor import Floor
-from jaxtune.discovery.problem import Hypothesis, Problem
+from jaxtune.discovery.problem import Problem
 from jaxtune.discovery.resample import times_drawn
-from jaxtune.discovery.result import Settings, Suspect
+from jaxtune.discovery.result import AcceptedTerm, Settings, Suspect
 
 
 def posterior(problem: Problem, at: Floor, candidates: Sequence[Candidate], price: float, seed: int = 0) -> np.ndarray:
@@ -74,38 +74,35 @@ def rivals(
     candidates: Sequence[Candidate],
     probabilities: np.ndarray,
     best: Candidate,
-    hypothesis: Hypothesis,
+    term: AcceptedTerm,
     settings: Settings,
 ) -> tuple[str, ...]:
     """Names the effects that may as well be there in the place of one of the best candidate's.
 
-    They stand in models that do without the effect's name and are believed, or explain nearly as much of what the null
-    leaves.
+    They stand in models that do without the effect's name and are believed, or explain most of what the effect does.
 
     Args:
       at: the floor at the main horizon.
       candidates: all models, the null among them.
       probabilities: [candidates] of `posterior`.
       best: the model that is reported.
-      hypothesis: one of its effects.
+      term: one of its effects.
       settings: shares from which on a name counts.
 
     Returns:
       Names, most likely first.
     """
-    others = {other.key for other in best.hypotheses if other is not hypothesis}
-    nothing = max(total_cost(at, one, 0.0) for one in candidates if not one.hypotheses)
+    others = {other.key for other in best.hypotheses if other is not term.hypothesis}
     # The others were fitted without forms.
     plain = next((one for one in candidates if one.key == key_of(best.effects)), best)
-    most = nothing - total_cost(at, plain, 0.0)
+    least = total_cost(at, plain, 0.0)
     found: dict[str, float] = {}
     for candidate, probability in zip(candidates, probabilities, strict=True):
-        if hypothesis.name in [h.name for h in candidate.effects] or len(candidate.effects) > len(best.effects):
+        if term.hypothesis.name in [h.name for h in candidate.effects] or len(candidate.effects) > len(best.effects):
             continue
-        explained = (nothing - total_cost(at, candidate, 0.0)) / max(most, 1e-9)
+        explained = 1.0 - (total_cost(at, candidate, 0.0) - least) / term.evidence.gain
         for other in candidate.effects:
-            kin = other.family == hypothesis.family and set(other.places) & set(hypothesis.places)
-            if other.key not in others and explained > (settings.akin if kin else settings.same):
+            if other.key not in others and explained > settings.same:
                 found[other.name] = max(found.get(other.name, 0.0), explained)
             elif other.key not in others and probability > settings.possible:
                 found[other.name] = max(found.get(other.name, 0.0), float(probability))

@@ -65,7 +65,7 @@ def conclude(settings: Settings, problem: Problem, floor: NoiseFloor, state: Sta
     terms = tuple(replace(term, clear=clear_places(best.fit, errors, term.hypothesis)) for term in terms)
     candidates, probabilities = _compared(problem, at, replace(state, best=best))
     terms = tuple(
-        replace(term, confusable_with=rivals(at, candidates, probabilities, best, term.hypothesis, settings))
+        replace(term, confusable_with=rivals(at, candidates, probabilities, best, term, settings))
         for term in with_refinements(terms, settings.own)
     )
     say("learned torque")

@@ -41,11 +41,9 @@ class Settings:
     """Gap in floor units that counts as none. No further effect is looked for once every signal is below it."""
     promising: float = 0.3
     """Share of the price of an effect that the screen must see in a hypothesis before it is fitted."""
-    same: float = 0.9
-    """Share of the best explanation from which on another name may as well be right, since effects have more functional
-    forms than the one in the library."""
-    akin: float = 0.6
-    """The same for a name of the same family at the same place, as a low-pass filter is beside a delay."""
+    same: float = 0.6
+    """Share of what an effect explains from which on another name in its place may as well be right, since effects have
+    more functional forms than the one in the library."""
     possible: float = 0.05
     """Probability from which on another name may as well be right."""
     inexact: float = 0.08
@@ -74,7 +72,7 @@ class AcceptedTerm:
     thresholds: Any
     """The `evidence.Thresholds` that it passed."""
     confusable_with: tuple[str, ...] = ()
-    """Names of other effects that these logs cannot distinguish from it, or that explain nearly as much."""
+    """Names of other effects that these logs cannot distinguish from it, or that explain most of what it does."""
     forms: tuple[Any, ...] = ()
     """Each a `problem.Hypothesis` about its form; none where its first form is as good."""
     clear: tuple[str, ...] | None = None

@@ -12,7 +12,7 @@ from jaxtune.discovery.candidate import Candidate
 from jaxtune.discovery.evidence import Evidence, Thresholds, _in_smallest, ablate, or_known, passes, weigh_evidence
 from jaxtune.discovery.fit import begin, polish, without
 from jaxtune.discovery.resample import correlation_length, times_drawn, units
-from jaxtune.discovery.result import Settings
+from jaxtune.discovery.result import AcceptedTerm, Settings
 
 GOOD = Evidence(
     gain=50.0, confirmed=20.0, floors=2.0, left=1.1, relief=0.0, interval=(0.1, 0.2), inside=True, horizons=3, size=1.0
@@ -103,8 +103,15 @@ def test_models_that_are_equal_are_believed_alike(stepped):
         "coulomb": pytest.approx(0.5),
         "twin": pytest.approx(0.5),
     }
-    names = rivals(at, candidates, probabilities, found.best, found.best.hypotheses[0], Settings())
-    assert names == ("twin",)
+    (effect,) = found.best.hypotheses
+    evidence, ablated = weigh_evidence(asked, floor, found.best, effect, {})
+    term = AcceptedTerm(effect, evidence, Thresholds(gain=found.price))
+    assert rivals(at, candidates, probabilities, found.best, term, Settings()) == ("twin",)
+    # What leaves as much as the model without the effect is none, unless the effect explains much more than that.
+    idle = replace(ablated, hypotheses=twin.hypotheses)
+    for gain, names in ((1.0, ()), (10.0, ("twin",))):
+        term = replace(term, evidence=replace(evidence, gain=gain * evidence.gain))
+        assert rivals(at, [found.best, idle], np.array([1.0, 0.0]), found.best, term, Settings()) == names
 
 
 def test_evidence_compares_with_the_model_without_the_effect(stepped):
