@@ -15,6 +15,7 @@ from envs.rig import Rig
 from envs.segments import smoothed
 
 _PINION_M = 0.05
+_WOUND = 0.02  # rad, by which a spring winds up under the rms torque
 _LOAD = 0.05  # of the mass of all links
 _LEVER_M = 0.001  # a centre of mass on its joint's axis is not dragged
 _DRIVEN = 0.01  # least share of the torque that moves a joint's inertia; a passive joint gets none
@@ -29,6 +30,7 @@ def measure_scales(rig: Rig, runs: Sequence[Run]) -> dict[str, np.ndarray]:
         damping    torque / rms(dq)            Nm s/rad
         quadratic  torque / rms(dq)^2          Nm s^2/rad^2
         stiffness  torque / (0.02 angle)       Nm/rad
+        hardening  1 / (0.02 angle)^2          1/rad^2
         inertia    diagonal of the joint-space inertia in the mean pose, kg m^2
         mass       mass of the body, or a twentieth of all links' where that is more: what a light wrist
                    carries goes by what the arm can lift   kg
@@ -65,13 +67,15 @@ def measure_scales(rig: Rig, runs: Sequence[Run]) -> dict[str, np.ndarray]:
     torque = np.where(_rms(torque) > _DRIVEN * moves, _rms(torque), moves)
     turns = np.array([rig.mj_model.joint(name).type[0] == mujoco.mjtJoint.mjJNT_HINGE for name in rig.joints])
     angle = np.where(turns, 1.0, _PINION_M)
+    wound = _WOUND * angle
     pace = _rms(speed)
     drag, fast = _drag(rig, mean_pose, torque, pace)
     return {
         "torque": torque,
         "damping": torque / pace,
         "quadratic": torque / pace**2,
-        "stiffness": torque / (0.02 * angle),  # of a spring that winds up by 20 mrad under the rms torque
+        "stiffness": torque / wound,
+        "hardening": 1.0 / wound**2,
         "inertia": inertia,
         "mass": np.maximum(mass, _LOAD * mass.sum()),
         "drag": drag,

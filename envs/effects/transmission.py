@@ -188,7 +188,7 @@ ROWS = (
         enters="transmission",
         parameters=(
             Parameter(name="nm_per_rad", form="reciprocal", scale="stiffness", bounds=(0.0, 20.0), prior=1.0),
-            Parameter(name="hardening_per_rad2", bounds=(0.0, 200.0), prior=30.0),
+            Parameter(name="hardening_per_rad2", scale="hardening", bounds=(0.0, 100.0), prior=1.0),
             Parameter(name="nm_s_per_rad", scale="damping", bounds=(0.0, 5.0), prior=0.3),
             _AT_MOTOR,
         ),

@@ -93,6 +93,7 @@ def test_a_slide_has_no_angles():
     found = measure_scales(rig, [run])
     np.testing.assert_allclose(found["angle"], [1.0, 0.05])
     np.testing.assert_allclose(found["stiffness"], found["torque"] / [0.02, 0.001], rtol=1e-6)
+    np.testing.assert_allclose(found["hardening"], [2.5e3, 1e6], rtol=1e-6)
     for name in ("deadband", "backlash", "encoder_bias"):
         angles = [axis for axis in rig.scaled(found).axes if (axis.effect, axis.parameter) == (name, "rad")]
         axes = {axis.place: axis.scale for axis in angles}
