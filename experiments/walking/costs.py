@@ -28,6 +28,7 @@ from experiments.walking.work import peaks, work
 from jaxtune import devices, dvm, readings, regression, spm, tuner
 from jaxtune import dist as dists
 from jaxtune.mjx import parameters
+from jaxtune.types import ParamDist
 
 _STEPS = 50  # in which the speed of MuJoCo C is measured
 _SETTLED = 5  # tunings after which memory should be flat
@@ -179,7 +180,7 @@ def estimates(sizes: Preset, policy: str, radius: float, seeds: Sequence[int]) -
 
     Returns:
       By method: mean and 0.9-quantile of |estimate - truth| in radii, over all robots, coordinates and seeds, and the
-      mean by coordinate; seconds to fit.
+      mean by coordinate; the mean error of the robot's mass, as a share of it; seconds to fit.
     """
     learner = Learner(sizes, BITENO.chosen("legs6"))
     machine, config = learner.tuner(), sizes.tuner
@@ -206,7 +207,7 @@ def estimates(sizes: Preset, policy: str, radius: float, seeds: Sequence[int]) -
         "regression": (regress, partial(regression.estimate, config.regression)),
     }
     collect = _compiled(lambda key: machine.collect(key, start, dist))
-    found = {name: ([], []) for name in methods}
+    found = {name: ([], [], []) for name in methods}
     for seed in seeds:
         key_collect, key_fit = jax.random.split(jax.random.PRNGKey(seed))
         data = collect(key_collect)
@@ -216,11 +217,14 @@ def estimates(sizes: Preset, policy: str, radius: float, seeds: Sequence[int]) -
             every = _compiled(
                 lambda model, sets, answer=answer: devices.in_chunks(answer, (sets,), readings.SETS, shared=(model,))
             )
-            errors, times = found[name]
-            errors.append(np.abs(np.asarray(every(model, data.held_out)) - truth))
+            errors, off, times = found[name]
+            answers = np.asarray(every(model, data.held_out))
+            errors.append(np.abs(answers - truth))
+            mass, true_mass = (_mass(learner, dist, values) for values in (answers, truth))
+            off.append(np.abs(mass / true_mass - 1.0))
             times.append(seconds)
     rows = {}
-    for name, (errors, times) in found.items():
+    for name, (errors, off, times) in found.items():
         errors = np.concatenate(errors)
         by_coordinate = dict(zip(dists.names(dist), errors.mean(axis=0).tolist(), strict=True))
         rows[name] = {
@@ -228,8 +232,21 @@ def estimates(sizes: Preset, policy: str, radius: float, seeds: Sequence[int]) -
             "error_90": np.quantile(errors, 0.9),
             "fit_s": min(times),
             **by_coordinate,
+            "mass": np.mean(off),
         }
     return rows
+
+
+def _mass(learner: Learner, dist: ParamDist, radii: np.ndarray) -> np.ndarray:
+    """Mass of BITeno [robots] in kg, of coordinates [robots, coords] in radii."""
+    model = learner.robot.mj_model
+    ratio = np.exp(np.asarray(dists.ravel(dist.centre)) + np.asarray(dists.ravel(dist.radius)) * radii)
+    added = [
+        model.body_mass[[model.body(link).id for link in entry.targets]].sum() * (ratio[:, number] - 1.0)
+        for number, entry in enumerate(learner.entries[name] for name in dists.names(dist))
+        if "body_mass" in entry.fields
+    ]
+    return model.body_mass.sum() + np.sum(added, axis=0)
 
 
 def memory(sizes: Preset, policy: str, tunings: int = 50) -> dict[str, dict]:
