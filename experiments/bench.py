@@ -269,6 +269,7 @@ def main(args: Args) -> None:
         compiler.set_up(compiler.for_simulation(), most=1)
     else:
         compiler.set_up(preset(args.preset).xla_flags)
+    checkpoint.check_writable(args.out)
     begin = time.monotonic()
     rows = MEASURES[args.what](args)
     table = Table(title=args.what)
@@ -278,7 +279,6 @@ def main(args: Args) -> None:
         table.add_row(name, *(np.array2string(np.asarray(value), precision=2) for value in row.values()))
     console.print(table)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
-    args.out.mkdir(parents=True, exist_ok=True)
     result = {
         "args": args,
         "rows": rows,

@@ -12,7 +12,7 @@ from rich.table import Table
 
 from envs.diagnosis import diagnose_log, shared_findings
 from envs.logs import read_any
-from experiments.common import files, plots
+from experiments.common import checkpoint, files, plots
 from experiments.common.cli import console, run
 
 
@@ -37,10 +37,10 @@ def main(args: Args) -> None:
     """
     log = read_any(args.log, args.robot)
     out = args.out or Path("runs/doctor") / args.log.resolve().name
+    checkpoint.check_writable(out)
     with console.status(f"looking for errors in {len(log.runs)} runs"):
         found = diagnose_log(log)
     said = shared_findings(found)
-    out.mkdir(parents=True, exist_ok=True)
     files.write_json(
         out / "doctor.json",
         {"log": args.log, "runs": {name: [asdict(one) for one in findings] for name, findings in found.items()}},

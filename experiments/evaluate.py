@@ -82,6 +82,7 @@ def main(args: Args) -> None:
     """
     compiler.set_up(preset(args.preset).xla_flags)
     params = check(args)
+    checkpoint.check_writable(args.out)
     sizes = preset(args.preset)
     # A learner needs a parameter; foot friction at its nominal value changes nothing.
     entries = BITENO.chosen(",".join(dict.fromkeys(("foot_friction", *params))))
@@ -104,7 +105,6 @@ def main(args: Args) -> None:
         rows[name] = quality(*record_walks(target, jax.random.fold_in(key, len(rows)), act, args.episodes, long))
 
     _print_table(args, rows)
-    args.out.mkdir(parents=True, exist_ok=True)
     by_command = [
         {"command": one, **quality(*jax.tree.map(lambda leaf, row=row: leaf[row : row + 1], grid))}
         for row, one in enumerate(GRID)

@@ -21,6 +21,7 @@ from experiments.discovery.target_runs import MOTIONS
 
 _MOST = {"seconds": 3600.0, "rate_hz": 1e5, "kp": 1e6, "torque_limit_nm": 1e5, "control_hz": 1e5}
 """Largest values of options: what a robot can be, and what fits into memory."""
+_MOST_ROWS = 2e7  # of all runs together: five hours at 1 kHz
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -153,6 +154,11 @@ def _check(args: Args) -> None:
         raise ValueError(f"seed: got {args.seed}, expected a number that is not negative")
     if args.runs < 4:
         raise ValueError(f"runs: got {args.runs}, expected 4 or more")
+    if args.runs * args.seconds * args.rate_hz > _MOST_ROWS:
+        raise ValueError(
+            f"runs, seconds, rate_hz: got {args.runs}, {args.seconds:g} and {args.rate_hz:g}, expected {_MOST_ROWS:g} "
+            "rows together at most"
+        )
     if args.motion not in MOTIONS:
         raise ValueError(f"motion: got '{args.motion}', expected one of {', '.join(MOTIONS)}")
     if args.out.exists() and any(args.out.iterdir()):

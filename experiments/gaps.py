@@ -80,6 +80,7 @@ def main(args: Args) -> None:
     compiler.set_up(preset(args.preset).xla_flags)
     if args.episodes < 1:
         raise ValueError(f"episodes: got {args.episodes}, expected 1 or more")
+    checkpoint.check_writable(args.out)
     sizes = preset(args.preset)
     entries = parameters.select(constants.ENTRIES, [name for names, _ in SWEEPS.values() for name in names])
     learner = Learner(sizes, entries)
@@ -107,7 +108,6 @@ def main(args: Args) -> None:
     for row in results:
         table.add_row(row["sweep"], f"{row['value']:g}", *(f"{row[name]:.2f}" for name in SHOWN))
     console.print(table)
-    args.out.mkdir(parents=True, exist_ok=True)
     files.write_json(args.out / "gaps.json", {"args": args, "rows": results, "versions": checkpoint.versions()})
     plots.gaps(args.out / "gaps.png", results, SHOWN, {"friction": friction, "mass": 1.0, "motor": 1.0})
 

@@ -77,7 +77,7 @@ def commands(sizes: str, out: Path) -> dict[str, list[str]]:
 
 
 def _speed(out: Path) -> dict[str, float]:
-    rows = read_json(out / "bench" / "speed.json")["rows"]
+    rows = read_json(out / "bench" / "speed.json", "rows")["rows"]
     return {name: row["steps_per_second"] for name, row in rows.items()}
 
 
@@ -87,7 +87,7 @@ def _fastest(rows: Mapping[str, float]) -> float:
 
 
 def _training(out: Path) -> dict[str, float]:
-    curve = read_json(out / "policy" / "curve.json")["curve"]
+    curve = read_json(out / "policy" / "curve.json", "curve")["curve"]
     last = curve[-1]
     each = np.diff([0.0, *(line["seconds"] for line in curve)])
     # All lines are of equal work. The first holds the compilation, as does the one after an interruption.
@@ -111,11 +111,11 @@ def _tunings(place: str) -> Callable[[Path], dict[str, float]]:
 RESULTS: dict[str, Callable[[Path], dict[str, Any]]] = {
     "speed": _speed,
     "policy": _training,
-    "walk": lambda out: read_json(out / "walk" / "evaluation.json")["rows"],
+    "walk": lambda out: read_json(out / "walk" / "evaluation.json", "rows")["rows"],
     "tunings": _tunings("tunings"),
     "tunings_cached": _tunings("tunings_cached"),
     "sweep": lambda out: {name: read_json(out / "sweep" / "summary.json")[name] for name in ("lanes", "seconds")},
-    "profile": lambda out: read_json(out / "bench" / "profile.json")["rows"],
+    "profile": lambda out: read_json(out / "bench" / "profile.json", "rows")["rows"],
 }
 """Reads what a part has found, by part."""
 

@@ -61,6 +61,7 @@ def main(args: Args) -> None:
     """
     sysid_parameters.package()
     _check(args)
+    checkpoint.check_writable(args.out.parent)
     log, spec = read_logs(args.logs, robot=args.robot)
     begin = time.perf_counter()
     bench = Bench(log, sysid_parameters.robot_of(spec, log))
@@ -72,7 +73,6 @@ def main(args: Args) -> None:
         same = [name for name in chosen if chosen[name]["fit"] == best.name()]
         chosen[measure] = {"as": same[0], "fit": best.name()} if same else _prove(args, bench, best)
     nominal = sysid_parameters.declare(bench.robot, "joints")
-    args.out.parent.mkdir(parents=True, exist_ok=True)
     report = {
         "logs": [path.name for path in args.logs],
         "settings": {name: value for name, value in asdict(args).items() if name not in ("logs", "out")},

@@ -8,6 +8,7 @@ A robot's computer needs NumPy and a copy of this file, which `python -m experim
 """
 
 import json
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -20,13 +21,17 @@ class Network:
       path: of the `.npz` that was exported.
 
     Raises:
-      ValueError: the file holds a number that is not finite.
+      ValueError: the file is damaged, or holds a number that is not finite.
     """
 
     def __init__(self, path: str | Path):
-        with open(path, "rb") as file, np.load(file, allow_pickle=False) as stored:
-            self.meta = json.loads(str(stored["meta"]))
-            arrays = {name: stored[name] for name in stored.files if name != "meta"}
+        try:
+            with open(path, "rb") as file, np.load(file, allow_pickle=False) as stored:
+                text = str(stored["meta"])
+                arrays = {name: stored[name] for name in stored.files if name != "meta"}
+        except (zipfile.BadZipFile, EOFError, KeyError) as error:
+            raise ValueError(f"{path}: is damaged: {error}") from error
+        self.meta = json.loads(text, parse_constant=_finite, parse_float=_finite)
         for name, values in arrays.items():
             if not np.isfinite(values).all():
                 raise ValueError(f"{path}: {name}: got a number that is not finite")
@@ -55,3 +60,11 @@ class Network:
                 f"action: got a number that is not finite, for observations of up to {np.abs(obs).max():g}"
             )
         return value
+
+
+def _finite(text: str) -> float:
+    """Reads a number of the file's description; a limit that is no number would limit nothing."""
+    number = float(text)
+    if not np.isfinite(number):
+        raise ValueError(f"meta: got {text}, expected a number that is finite")
+    return number

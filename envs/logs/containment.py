@@ -6,6 +6,7 @@ A link, an absolute path or one with `..` would have another file quoted in a me
 import re
 import zipfile
 from pathlib import Path
+from xml.etree import ElementTree
 
 import mujoco
 
@@ -60,7 +61,7 @@ def check_model(folder: Path, path: Path, what: str) -> None:
       ValueError: one of them leads out of the folder, or the model cannot be read.
     """
     check_inside(folder, path, what, _OR_NAMED)
-    _check_text(path, what)
+    _check_included(folder, path, what)
     try:
         needed = [Path(one) for one in mujoco.mju_getXMLDependencies(str(path))]
     except mujoco.FatalError as error:
@@ -73,6 +74,26 @@ def check_model(folder: Path, path: Path, what: str) -> None:
             for name in _URDF_FILE.findall(one.read_bytes()):
                 place = one.parent / name.decode(errors="replace").removeprefix("package://")
                 check_inside(folder, place, what, _OR_NAMED)
+
+
+def _check_included(folder: Path, model: Path, what: str) -> None:
+    """Checks a model and what it includes, before MuJoCo opens any of it: some files block whoever reads them."""
+    found, pending = set(), [model]
+    while pending:
+        path = pending.pop()
+        if not path.is_file():
+            raise ValueError(f"{what}: got {path}, expected a file")
+        found.add(path)
+        _check_text(path, what)
+        try:
+            root = ElementTree.fromstring(path.read_bytes())
+        except ElementTree.ParseError as error:
+            raise ValueError(f"{what}: {path}: {error}") from None
+        names = [one.get("file", "") for one in root.iter() if one.tag.rpartition("}")[2] == "include"]
+        # Beside the model, or beside the file that includes them.
+        for place in [base / name for name in names for base in (model.parent, path.parent)]:
+            check_inside(folder, place, what, _OR_NAMED)
+            pending += [place] if place.exists() and place not in found else []
 
 
 def _check_text(path: Path, what: str) -> None:

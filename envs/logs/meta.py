@@ -31,6 +31,7 @@ from envs.logs.format import (
 
 _ANGLE = {"rad": 1.0, "deg": np.pi / 180.0}  # factors to rad
 _FASTEST_HZ = 1e5  # of rows and controllers; what follows from a rate must fit into memory
+_STRONGEST = 1e7  # gains and torque limits: beyond what any robot has, in any unit
 _LARGEST = 1e300  # YAML's integers may be too large for a float
 _TORQUE = {"Nm": 1.0, "mNm": 1e-3}  # factors to Nm
 _META = {
@@ -212,7 +213,7 @@ class Meta:
         values = value if isinstance(value, list) else [value] * len(self.joints)
         if len(values) != len(self.joints):
             self._refuse(where, value, f"one number or {len(self.joints)}, one per joint")
-        return np.array([self._number(where, one, zero=name in ("kp", "kd")) for one in values])
+        return np.array([self._at_most(where, one, _STRONGEST, zero=name in ("kp", "kd")) for one in values])
 
     def _robot(self, folder: Path, name: str, robots: Mapping[str, Sequence[str]]) -> tuple[str, dict[str, bool]]:
         """Resolves a robot to its name or path, and the joints that may be logged, with whether each turns."""
@@ -279,11 +280,14 @@ class Meta:
             self._refuse(where, value, wanted)
         return float(value)
 
+    def _at_most(self, where: str, value: Any, most: float, *, zero: bool = False) -> float:
+        number = self._number(where, value, zero=zero)
+        if number > most:
+            self._refuse(where, value, f"at most {most:g}")
+        return number
+
     def _rate(self, where: str, value: Any) -> float:
-        rate = self._number(where, value)
-        if rate > _FASTEST_HZ:
-            self._refuse(where, value, f"at most {_FASTEST_HZ:g}")
-        return rate
+        return self._at_most(where, value, _FASTEST_HZ)
 
     def _one_of(self, where: str, value: Any, allowed) -> Any:
         if isinstance(value, bool) or not isinstance(value, str | int) or value not in allowed:

@@ -202,27 +202,32 @@ def _read_parquet(path: Path, used: Callable[[str], bool]) -> dict[str, np.ndarr
     try:
         # What a table holds stands in its footer; the pages of a column of equal values are tiny.
         held = pyarrow.parquet.read_metadata(path)
+        schema = held.schema.to_arrow_schema()
+        names, kinds = schema.names, dict(zip(schema.names, schema.types, strict=True))
         packed = sum(held.row_group(number).total_byte_size for number in range(held.num_row_groups))
         size = max(packed, held.num_rows * held.num_columns * _CELL_BYTES)
     except (pyarrow.ArrowException, OSError) as error:
         raise ValueError(f"{path}: {type(error).__name__}: {error}") from error
     check_size(path, size)
+    columns: dict[str, np.ndarray | None] = dict.fromkeys(kinds)
+    for name in names:
+        if not name or names.count(name) > 1:
+            raise ValueError(f"{path}, column '{name}': expected a name that is there once")
+    numbers = [name for name, kind in kinds.items() if any(is_a(kind) for is_a in _NUMBERS)]
+    for name in kinds.keys() - numbers:
+        if used(name):
+            raise ValueError(f"{path}, column '{name}': got {kinds[name]}, expected numbers")
     try:
-        table = pyarrow.parquet.read_table(path, partitioning=None, page_checksum_verification=True)
+        # Texts are left out: a dictionary of a single one may stand for gigabytes.
+        table = pyarrow.parquet.read_table(path, columns=numbers, partitioning=None, page_checksum_verification=True)
         table.validate(full=True)
     except (pyarrow.ArrowException, OSError) as error:
         raise ValueError(f"{path}: {type(error).__name__}: {error}") from error
-    columns = {}
     for name, values in zip(table.column_names, table.columns, strict=True):
-        if not name or name in columns:
-            raise ValueError(f"{path}, column '{name}': expected a name that is there once")
-        numbers = any(is_a(values.type) for is_a in _NUMBERS)
-        if used(name) and not numbers:
-            raise ValueError(f"{path}, column '{name}': got {values.type}, expected numbers")
         if used(name) and values.null_count:
             row = int(np.argmax(values.is_null().to_numpy()))
             raise ValueError(f"{path}, row {row + 1}, column '{name}': is empty, expected a number")
-        columns[name] = values.to_numpy().astype(float) if numbers and not values.null_count else None
+        columns[name] = None if values.null_count else values.to_numpy().astype(float)
     return columns
 
 

@@ -101,7 +101,7 @@ def open_run(out: Path, config: Any) -> None:
         # Of two runs that begin at once the second waits until the first has said what it is.
         fcntl.flock(file, fcntl.LOCK_EX)
         if path.exists():
-            _same(f"out: {out} holds a run of another config", read_json(path)["config"], wanted)
+            _same(f"out: {out} holds a run of another config", read_json(path, "config")["config"], wanted)
         elif any(not item.name.endswith((DRAFT, _LOCK)) for item in out.iterdir()):
             raise ValueError(
                 f"out: {out} is not empty and holds no config.json; expected a new folder or an earlier run's"
@@ -175,7 +175,7 @@ def load(path: Path, like: Any, config: Any) -> Any:
     stored = path / "config.json"
     if not stored.exists():
         raise ValueError(f"policy: {path} holds no config.json; expected a folder that experiments.train has written")
-    entry = read_json(stored)
+    entry = read_json(stored, "config")
     _same(f"policy: {path} was made with another config", entry["config"], as_json(config))
     # Checkpoints of the first version have neither the name of their state nor its checksum.
     place = path / entry.get("state", "state")
@@ -197,7 +197,7 @@ def load(path: Path, like: Any, config: Any) -> Any:
 
 def read_notes(path: Path) -> Any:
     """Returns the notes that a checkpoint was saved with."""
-    return read_json(path / "config.json")["notes"]
+    return read_json(path / "config.json", "notes")["notes"]
 
 
 def _checksum(folder: Path) -> str:

@@ -1,6 +1,7 @@
 """What every command shares: it reads arguments, prints, shows progress, and turns a user's error into one line."""
 
 import shlex
+import signal
 import sys
 import threading
 import time
@@ -41,6 +42,8 @@ def run(main: Callable[[Any], None], args_type: type) -> None:
       SystemExit: with code 2, where `main` raised a `ValueError` or an `OSError`, or the command line cannot be parsed;
         with code 130 after Ctrl-C.
     """
+    if signal.getsignal(signal.SIGINT) is signal.SIG_DFL:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     args = tyro.cli(args_type, description=args_type.__doc__)
     try:
         main(args)

@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import re
 from pathlib import Path
 
 import jax
@@ -20,8 +21,8 @@ def set_up(xla_flags: str, most: int = 8) -> None:
 
     - On a CPU every core of this process is a device, so that all cores share the work (`jaxtune.devices`). XLA has a
       single CPU device unless it is told otherwise.
-    - XLA gets more threads than a small machine has cores (environment variable `NPROC`, unless it is set): with one
-      thread a core, programs on two cores were seen to hang.
+    - XLA gets more threads than there are devices (environment variable `NPROC`, unless it is set): with one for each,
+      programs on two cores were seen to hang.
     - Programs are kept on disk, in the user's cache folder or where `JAX_COMPILATION_CACHE_DIR` says, so that a second
       run starts sooner.
 
@@ -33,7 +34,8 @@ def set_up(xla_flags: str, most: int = 8) -> None:
     if _DEVICES not in flags:
         flags = f"{flags} {_DEVICES}={min(cores(), most)}"
     os.environ["XLA_FLAGS"] = flags
-    os.environ.setdefault("NPROC", str(max(_LEAST_THREADS, cores())))
+    devices = re.search(rf"{_DEVICES}=(\d+)", flags)
+    os.environ.setdefault("NPROC", str(max(_LEAST_THREADS, cores(), 1 + int(devices[1]) if devices else 0)))
     chosen = os.environ.get("JAX_COMPILATION_CACHE_DIR")
     base = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
     kept = Path(chosen) if chosen else base / "jaxtune" / "xla"

@@ -103,11 +103,15 @@ def exists(path: Path) -> bool:
 
 
 @hosts.on_first
-def read_json(path: Path) -> Any:
-    """Reads a JSON file of a run.
+def read_json(path: Path, *needs: str) -> Any:
+    """Reads a JSON file of a run, an object.
+
+    Args:
+      path: of the file.
+      *needs: keys that it must have.
 
     Raises:
-      ValueError: the file was emptied or damaged, or holds no object; names it.
+      ValueError: the file was emptied or damaged, holds no object, or lacks a key; names it.
     """
     try:
         found = json.loads(path.read_text())
@@ -115,6 +119,9 @@ def read_json(path: Path) -> Any:
         raise ValueError(f"{path}: is damaged: {error}") from None
     if not isinstance(found, dict):
         raise ValueError(f"{path}: is damaged: got {type(found).__name__}, expected an object")
+    for name in needs:
+        if name not in found:
+            raise ValueError(f"{path}: is damaged: '{name}' is missing")
     return found
 
 

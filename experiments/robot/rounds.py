@@ -179,6 +179,7 @@ class Rounds:
         place = self._place(index)
         if not (place / "start" / "config.json").exists():
             state = make()
+            checkpoint.check_finite("policy", state.policy.learner)
             checkpoint.save(place / "learner", state.policy.learner, policy_config(self._learner))
             checkpoint.save(place / "start", state, {})
         # Read back even if it was just made, so that an interrupted run has the same state as one that never stopped.
@@ -242,6 +243,7 @@ class Rounds:
         repeating = state.replace(policy=state.policy.replace(asked=start.commands))
         tuned, info = self._tune(self._key(index, 1), repeating, start.trajectory)
         tuned = tuned.replace(policy=state.policy)
+        checkpoint.check_finite("distribution", tuned.dist)
         checkpoint.save(place / "tuned", tuned, {})
         moved = report.moved(self._learner.entries, state.dist, tuned.dist, info)
         tuning = Tuning(

@@ -156,8 +156,8 @@ def starting_policy(name: str, learner: Learner, out: Path | None = None) -> Pol
       The policy, on freshly reset training robots.
 
     Raises:
-      ValueError: the robot ships no policy, the folder holds none, or one of another config; names the field that
-        differs.
+      ValueError: the robot ships no policy, the folder holds none, or one that is not finite or of another config;
+        names the field that differs.
     """
     fresh = learner.init(jax.random.PRNGKey(0))
     place = Path(name)
@@ -172,5 +172,6 @@ def starting_policy(name: str, learner: Learner, out: Path | None = None) -> Pol
         if not files.exists(place / "config.json"):
             trained(jax.random.PRNGKey(0), learner, learner.preset.scratch_updates, place)
     ppo = checkpoint.load(place, fresh.learner, policy_config(learner))
+    checkpoint.check_finite(f"policy: {place}", ppo)
     # Disk holds networks, optimiser and statistics alone. Robots are new, so they may have another model by now.
     return fresh.replace(learner=ppo)

@@ -1,5 +1,8 @@
 """Where compiled programs are kept."""
 
+import os
+
+import pytest
 from jax._src import compilation_cache
 
 from experiments.common import compiler
@@ -25,3 +28,12 @@ def test_the_first_run_says_that_programs_are_compiled(tmp_path, monkeypatch, ca
     (kept / "one").touch()
     compiler.set_up("")
     assert not capsys.readouterr().out
+
+
+@pytest.mark.parametrize("devices", [1, 40])
+def test_there_are_more_threads_than_devices(tmp_path, monkeypatch, devices):
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path))
+    monkeypatch.setenv("XLA_FLAGS", f"--xla_force_host_platform_device_count={devices}")
+    monkeypatch.delenv("NPROC", raising=False)
+    compiler.set_up("")
+    assert int(os.environ["NPROC"]) == max(8, compiler.cores(), devices + 1)

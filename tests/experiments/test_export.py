@@ -68,6 +68,23 @@ def test_a_policy_that_is_not_finite_is_neither_exported_nor_played(walk, folder
         Network(tmp_path / "policy.npz")
 
 
+def test_a_player_whose_description_or_file_is_damaged_does_not_begin(folder, tmp_path):
+    path = tmp_path / "policy.npz"
+    with np.load(folder / "policy.npz", allow_pickle=False) as stored:
+        arrays = dict(stored)
+    meta = str(arrays["meta"])
+    scale = json.loads(meta)["action_scale"]
+    for number in ("NaN", "-Infinity", "1e999"):
+        changed = meta.replace(f'"action_scale": {scale}', f'"action_scale": {number}')
+        assert changed != meta
+        np.savez(path, **arrays | {"meta": changed})
+        with pytest.raises(ValueError, match=rf"meta: got {number}, expected a number that is finite"):
+            Network(path)
+    path.write_bytes((folder / "policy.npz").read_bytes()[:-100])
+    with pytest.raises(ValueError, match=r"policy.npz: is damaged"):
+        Network(path)
+
+
 @pytest.mark.filterwarnings("ignore:overflow:RuntimeWarning", "ignore:invalid:RuntimeWarning")
 def test_a_player_never_answers_what_is_not_finite(folder):
     network = Network(folder / "policy.npz")

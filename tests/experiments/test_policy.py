@@ -84,6 +84,14 @@ def test_policy_of_another_config_is_refused(learner, tmp_path):
         checkpoint.load(tmp_path, ppo, policy_config(other))
 
 
+def test_a_policy_that_is_not_finite_is_not_played(learner, tmp_path):
+    policy = learner.init(jax.random.PRNGKey(0)).learner
+    broken = jax.tree.map(lambda leaf: leaf.at[..., 0].set(jnp.nan) if leaf.ndim == 2 else leaf, policy)
+    checkpoint.save(tmp_path, broken, policy_config(learner))
+    with pytest.raises(ValueError, match=rf"policy: {tmp_path}: got a number that is not finite in "):
+        starting_policy(str(tmp_path), learner)
+
+
 def test_missing_policy_is_named(learner, tmp_path):
     with pytest.raises(ValueError, match=r"policy: .*no config\.json"):
         checkpoint.load(tmp_path, None, policy_config(learner))

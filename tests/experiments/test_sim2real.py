@@ -1,8 +1,10 @@
 """A robot that answers through logs: what it is asked for, what is refused, and a run that is stopped at any point."""
 
+import importlib
 import io
 import json
 import shutil
+import signal
 import sys
 import time
 from dataclasses import dataclass, replace
@@ -16,6 +18,7 @@ import pytest
 from processes import ROBOT
 from rich.console import Console
 
+import experiments
 from envs.diagnosis import Finding
 from experiments import robot_stub, sim2real, sim2real_bench, train
 from experiments.common import checkpoint, cli
@@ -462,6 +465,23 @@ def test_errors_of_the_system_and_ctrl_c_are_one_line(monkeypatch, capsys, error
     assert printed.startswith(line)
     assert printed.count("\n") == 1
     assert code == 2 or printed.endswith(" --seed 3\n")
+
+
+def test_ctrl_c_ends_a_command_without_a_word_while_it_is_imported(monkeypatch):
+    standard = signal.getsignal(signal.SIGINT)
+    monkeypatch.setattr(sys, "argv", ["-m", "--seed", "3"])
+    try:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        importlib.reload(experiments)
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_DFL
+        monkeypatch.setattr(sys, "argv", ["program"])
+        cli.run(lambda args: None, dataclass(type("Nothing", (), {"__doc__": "Does nothing."})))
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+        # Whoever imports the package in a program of their own keeps what they have.
+        importlib.reload(experiments)
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, standard)
 
 
 def test_progress_is_a_line_a_minute_where_there_is_no_terminal(monkeypatch):

@@ -1,6 +1,7 @@
 """Logs: what was written is read, in the model's units and axes; what is damaged is refused by file, row and column."""
 
 import dataclasses
+import os
 import zipfile
 
 import numpy as np
@@ -181,6 +182,20 @@ def test_files_that_a_logs_model_refers_to_are_in_the_logs_folder(tmp_path, refe
         logs.read(folder)
 
 
+def test_what_a_model_includes_is_checked_before_it_is_opened(tmp_path):
+    folder = put(tmp_path / "log", meta={"robot": "robot.xml"})
+    for pipe, refusal in ((tmp_path / "pipe", OUT), (folder / "pipe", "expected a file")):
+        os.mkfifo(pipe)  # whoever opens it waits for ever
+        (folder / "inner.xml").write_text(f'<mujoco><include file="{os.path.relpath(pipe, folder)}"/></mujoco>')
+        (folder / "robot.xml").write_text('<mujoco><include file="inner.xml"/></mujoco>')
+        with pytest.raises(ValueError, match=refusal):
+            logs.read(folder)
+    # Two that include each other.
+    (folder / "inner.xml").write_text('<mujoco><include file="robot.xml"/></mujoco>')
+    with pytest.raises(ValueError, match=r"robot.xml"):
+        logs.read(folder)
+
+
 @pytest.mark.parametrize(
     "model",
     [
@@ -273,6 +288,20 @@ def test_a_csv_counts_by_its_cells(tmp_path, monkeypatch):
         logs.read(folder)
 
 
+def test_texts_of_a_table_are_not_read(tmp_path, monkeypatch):
+    """A dictionary of one long text may stand for gigabytes."""
+    folder = put(tmp_path / "log", columns(), name="run_000.parquet")
+    path, read = folder / "run_000.parquet", pyarrow.parquet.read_table
+    texts = pyarrow.array(["long" * 1000] * ROWS).dictionary_encode()
+    pyarrow.parquet.write_table(read(path).append_column("note", texts), path)
+    seen = []
+    monkeypatch.setattr(
+        pyarrow.parquet, "read_table", lambda *args, **options: seen.append(read(*args, **options)) or seen[0]
+    )
+    assert len(logs.read(folder).runs[0].time) == ROWS
+    assert "note" not in seen[0].column_names
+
+
 def test_a_table_of_equal_values_counts_unpacked(tmp_path, monkeypatch):
     folder = put(tmp_path / "log")
     path = folder / "run_001.parquet"
@@ -362,6 +391,10 @@ def test_a_folder_in_use_is_not_written_to(tmp_path):
         ({"controller": {"type": ["pd"]}}, r"controller.type: got \['pd'\]"),
         ({"controller": {"type": "pd", "kp": 1, "rate_hz": 100}}, "controller.kd: is missing"),
         ({"controller": {"type": "pd", "kp": -1, "kd": 0, "rate_hz": 100}}, "controller.kp: got -1"),
+        (
+            {"controller": {"type": "pd", "kp": 1e290, "kd": 0, "rate_hz": 100}},
+            "kp: got 1e.290, expected at most 1e.07",
+        ),
         ({"controller": {"type": "pd", "kp": [1], "kd": 0, "rate_hz": 100}}, r"controller.kp: got \[1\], .* or 2"),
         ({"controller": {"type": "pd", "kp": 1, "kd": 0, "ki": 0, "rate_hz": 100}}, "controller.ki: .*kp"),
         ({"sign": {"left_hip": 2}}, "sign.left_hip: got 2, expected one of 1, -1"),
