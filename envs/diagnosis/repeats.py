@@ -14,12 +14,13 @@ import numpy as np
 
 from envs.diagnosis.finding import MEASURED
 from envs.logs import Run
-from envs.readings import quantum_of
+from envs.readings import noise_of, quantum_of
 
 _SUDDEN_S = 0.008  # in which no robot stops, and starts again as fast
 _NEAR = 25  # rows before and after a stay, from which noise is estimated
 _LEAST_QUANTA = 3.0  # of motion before and after a stay, for its speed to be known
 _MISSED_QUANTA = 1.75  # of motion that must have been seen during the stay
+_MISSED_SD = 4.5  # of noise, which may undo as much between two readings
 _CHANCE = 0.3  # stays that noise may bring about in a run, at most
 _FAR = (0.3, 5.0, 2e-3)  # of the joint's own range of motion, quanta, and rad or m
 _FAST_QUANTA = 2.0  # below which a speed may be of rounding alone
@@ -47,15 +48,21 @@ def repeated(run: Run) -> np.ndarray:
     if "dq" in run.signals:
         rounding = quanta[joints : 2 * joints]  # `MEASURED` begins with positions and velocities
         speeds = np.where((fast := np.abs(run.signals["dq"])) > _FAST_QUANTA * rounding, fast, 0.0)
+    # Noise of positions holds that of rounding.
+    sd = np.sqrt(np.maximum(noise_of(run, "q") ** 2 - quanta[:joints] ** 2 / 12.0, 0.0))
+    seen = _MISSED_QUANTA * quanta[:joints] + _MISSED_SD * sd
     for (first, last), beyond in zip(stays, noisy, strict=True):
         driven = (speeds[first] * (run.time[last] - run.time[first]) > far).any()
-        if not (beyond or driven or _passes(run, first, last, quanta[:joints])):
+        if not (beyond or driven or _passes(run, first, last, quanta[:joints], seen)):
             same[first:last] = False
     return same
 
 
-def _passes(run: Run, first: int, last: int, quanta: np.ndarray) -> bool:
-    """Whether a joint moves in the same direction up to a stay and from its end on, without slowing down for it."""
+def _passes(run: Run, first: int, last: int, quanta: np.ndarray, seen: np.ndarray) -> bool:
+    """Whether a joint moves in the same direction up to a stay and from its end on, without slowing down for it.
+
+    So it must have moved by more than `seen` [joints] in between, which neither rounding nor noise hides.
+    """
     position = run.signals["q"]
     width = max(1, round(_SUDDEN_S / float(np.median(np.diff(run.time)))))
     if first < 2 * width or last + 2 * width >= len(position):
@@ -65,9 +72,8 @@ def _passes(run: Run, first: int, last: int, quanta: np.ndarray) -> bool:
     # Of a constant deceleration to rest, the last piece is a third of the one before.
     sudden = (near * far > 0.6 * far**2) & (leaving * gone > 0.6 * gone**2) & (near * leaving > 0)
     pace = np.minimum(np.abs(near), np.abs(leaving))
-    # Rounding alone makes a slow joint stay.
     missed = pace * (last - first) / width
-    return bool((sudden & (pace > _LEAST_QUANTA * quanta) & (missed > _MISSED_QUANTA * quanta)).any())
+    return bool((sudden & (pace > _LEAST_QUANTA * quanta) & (missed > seen)).any())
 
 
 def _chance(values: np.ndarray, first: int, last: int, quanta: np.ndarray, parts: np.ndarray) -> float:
