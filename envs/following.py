@@ -16,7 +16,8 @@ from envs.models import suspended
 from envs.smoothing import smoothed
 from jaxtune.types import Effect
 
-_FOLLOW_RAD_S = 150.0  # it settles in some 20 ms, and is stable with steps of 1 ms
+_FASTEST_RAD_S, _SLOWEST_RAD_S = 150.0, 15.0  # the fastest settles in some 20 ms, and is stable with steps of 1 ms
+_SHAKEN = 0.05  # share of a joint's rms torque that noise of its position may ask for
 _POSES = 20
 
 OF_SENSORS = ("torque_scale", "constant_push")
