@@ -13,6 +13,7 @@ import numpy as np
 
 from envs.logs import Controller, Log, Run
 from envs.models import suspended
+from envs.readings import noise_of
 from envs.smoothing import smoothed
 from jaxtune.types import Effect
 
@@ -42,10 +43,12 @@ def follower(log: Log, spec: mujoco.MjSpec) -> Controller | None:
         torque = kp (target - q) - kd dq,   target = q_measured + kd / kp dq_measured + tau_measured / kp
 
     so while the model moves as measured, it asks for the measured torque. What else it needs shows in that, and in how
-    far the motion is off.
+    far the motion is off. It is as fast as noise allows, which makes it ask for torques too:
+
+        pace^2 inertia noise_sd <= 0.05 rms(tau)
 
     Args:
-      log: without sealed runs.
+      log: without sealed runs, with the noise of its signals (`readings.with_noise`).
       spec: the nominal model.
 
     Raises:
@@ -57,10 +60,12 @@ def follower(log: Log, spec: mujoco.MjSpec) -> Controller | None:
     if not all(unknown):
         name = log.runs[unknown.index(False)].name
         raise ValueError(f"{name}: controller.type: got a known one, expected 'unknown' as in others, or in none")
-    inertia = _least_inertia(log, spec)
+    inertia, noise = _least_inertia(log, spec), noise_of(log.runs[0], "q")
+    torque = np.sqrt((np.concatenate([run.signals["tau"] for run in log.runs]) ** 2).mean(axis=0))
+    pace = np.clip(np.sqrt(_SHAKEN * torque / (inertia * noise)), _SLOWEST_RAD_S, _FASTEST_RAD_S)
     gains = {
-        "kp": inertia * _FOLLOW_RAD_S**2,
-        "kd": 2.0 * inertia * _FOLLOW_RAD_S,
+        "kp": inertia * pace**2,
+        "kd": 2.0 * inertia * pace,
         "torque_limit_nm": np.full(len(inertia), np.inf),
     }
     return replace(log.runs[0].controller, gains=gains, between_rows="linear")
