@@ -12,7 +12,7 @@ from jaxtune.types import Effect, Parameter
 # inaccurate number is not taken for a missing effect. Gains are set, and better known than a mass; a damping gain less
 # so, since the velocity that it multiplies was filtered.
 _PRIOR_SHARE = 0.1
-_NOMINAL_RATIOS = {"link_mass": _PRIOR_SHARE, "gain_error": 0.035, "damping_gain": 0.05}
+_NOMINAL_RATIOS = {"link_mass": _PRIOR_SHARE, "link_inertia": _PRIOR_SHARE, "gain_error": 0.035, "damping_gain": 0.05}
 _NOMINAL_FIELDS = {"armature": "dof_armature", "viscous": "dof_damping", "coulomb": "dof_frictionloss"}
 _MOST_TAKEN = 0.9  # of a field of the model: armature and damping must stay positive
 

@@ -90,10 +90,10 @@ def _drawn(spec: mujoco.MjSpec, joints: Sequence[str], rng: np.random.Generator)
     # The controller's torque is applied to the joints directly, so the model's own actuators are switched off.
     model.opt.iterations, model.opt.ls_iterations = 100, 50
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION
-    # A heavier link of the same shape: its inertia grows in proportion.
+    # A heavier link of the same shape has an inertia that grows in proportion, but its shape is not known better.
     masses = _factors(rng, model.nbody)
     model.body_mass[:] *= masses
-    model.body_inertia[:] *= masses[:, None]
+    model.body_inertia[:] *= (masses * _factors(rng, model.nbody))[:, None]
     for name in ("dof_armature", "dof_damping", "dof_frictionloss"):
         getattr(model, name)[:] *= _factors(rng, model.nv)
     mujoco.mj_setConst(model, mujoco.MjData(model))

@@ -1,8 +1,8 @@
 """What every log leaves uncertain beside the model's own parameters; these rows are fitted, and never named as missing.
 
-A controller's damping gain is rarely known to a percent, few logs say how their targets went on between two rows, and a
-torque that was computed from a motor's current is as good as its constant. Discovery fits these under every hypothesis,
-or it would call them a delay, a friction or a weak motor.
+A controller's damping gain is rarely known to a percent, and the inertia of a link no better than its mass. Few logs
+say how their targets went on between two rows, and a torque that was computed from a motor's current is as good as its
+constant. Discovery fits these under every hypothesis, or it would call them a delay, friction, a load or a weak motor.
 """
 
 import jax.numpy as jnp
@@ -38,6 +38,16 @@ ROWS = (
         act=_damping_gain,
         sentence="The controller's damping gain is not the one that was set.",
         excited_by="chirps at two controller gains",
+    ),
+    Effect(
+        name="link_inertia",
+        family="inertia",
+        on="body",
+        enters="model",
+        parameters=(Parameter(name="ratio", form="ratio", bounds=(-1.0, 1.0), prior=0.1, fields=("body_inertia",)),),
+        sizes=(0.05,),
+        sentence="The link's mass is spread farther from its centre, or nearer to it, than the model says.",
+        excited_by="fast motion of the link about its centre",
     ),
     Effect(
         name="target_between_rows",
