@@ -88,6 +88,19 @@ def test_between_the_ticks_of_a_slow_controller_joints_move_in_curves(spec):
         np.testing.assert_allclose(read[name][rows].T, exact, atol=0.01 * span)
 
 
+def test_null_robots_differ_in_mass_and_in_inertia(spec):
+    nominal = spec.copy().compile()
+    drawn = [Robot.drawn(spec, ARM_JOINTS, np.random.default_rng(seed)).model for seed in range(200)]
+    mass, inertia = (
+        np.log([getattr(model, name)[1:].reshape(nominal.nbody - 1, -1)[:, 0] for model in drawn])
+        - np.log(getattr(nominal, name)[1:].reshape(nominal.nbody - 1, -1)[:, 0])
+        for name in ("body_mass", "body_inertia")
+    )
+    # A tenth each, cut at two deviations, and a heavier link has more inertia.
+    np.testing.assert_allclose([mass.std(), (inertia - mass).std()], 0.096, atol=0.012)
+    assert abs(np.corrcoef((inertia - mass).ravel(), mass.ravel())[0, 1]) < 0.15
+
+
 def test_unknown_targets_between_rows_are_drawn_for_every_null_log(spec):
     known = {"q": {"noise_sd": np.zeros(2)}}
     found = {}

@@ -501,6 +501,7 @@ def test_the_imu_reads_gravity_as_it_is_mounted(arm):
 FIELDS = (*reference.FIELDS[:9], "body_inertia")
 INERTIAL = {
     "link_mass": {"upper": {"ratio": 0.8}, "lower": {"ratio": 1.3}},
+    "link_inertia": {"upper": {"ratio": 1.2}, "lower": {"ratio": 0.7}},
     "com_offset": {"upper": {"x_m": 0.01, "y_m": -0.02, "z_m": 0.03}, "lower": {"x_m": -0.02, "z_m": 0.05}},
     # At the end of an oblique arm, so that the principal axes turn.
     "payload": {"upper": {"kg": 0.3}, "lower": {"kg": 0.1, "x_m": 0.08, "y_m": -0.05, "z_m": 0.1, "gyration_m": 0.02}},
@@ -541,8 +542,8 @@ def change(spec, nominal, effect, place, values):
         body.explicitinertial = True
         body.mass, body.ipos, body.iquat = float(compiled.mass[0]), compiled.ipos, compiled.iquat
         body.inertia = compiled.inertia
-    if effect == "link_mass":
-        body.mass *= values["ratio"]
+    if effect in ("link_mass", "link_inertia"):
+        body.mass *= values["ratio"] if effect == "link_mass" else 1.0
         body.inertia = body.inertia * values["ratio"]
     elif effect == "payload":
         # About the link's frame: mass, first and second moment of both.
@@ -619,6 +620,7 @@ def test_nominal_parameters_are_those_that_the_model_has(pendulum):
         ("damping_gain", "hinge"): 0.05,
         ("armature", "hinge"): 0.00019,
         ("link_mass", "arm"): 0.1,
+        ("link_inertia", "arm"): 0.1,
     }
     got = prior_sd(pendulum)
     assert got.keys() == expected.keys()
@@ -632,7 +634,8 @@ def test_prior_standard_deviations_are_in_coordinates(arm):
     np.testing.assert_allclose(got["armature", "shoulder"], 0.001 / 0.11, rtol=1e-6)
     np.testing.assert_allclose(got["armature", "elbow"], 0.001 / 0.03, rtol=1e-6)
     np.testing.assert_allclose(got["viscous", "elbow"], 0.005 / 0.3, rtol=1e-6)
-    assert {effect for effect, _ in got} == {"armature", "viscous", "link_mass", "gain_error", "damping_gain"}
+    inertial = {"armature", "link_mass", "link_inertia"}
+    assert {effect for effect, _ in got} == {"viscous", "gain_error", "damping_gain"} | inertial
     assert {place for _, place in got} == {"shoulder", "elbow", "upper", "lower"}
 
 
