@@ -22,7 +22,7 @@ from rich.table import Table
 
 from experiments.common import checkpoint, compiler, files, plots
 from experiments.common.cli import bars, console, count, run
-from experiments.common.config import preset
+from experiments.common.config import preset, tell_limits
 from experiments.common.rates import interval
 from experiments.walking import memory
 from experiments.walking.cases import check_positive
@@ -302,6 +302,7 @@ def main(args: Args) -> None:
     """Runs the self-test, prints tables, and writes `selftest.json` and a plot."""
     compiler.set_up(preset(args.preset).xla_flags)
     robot, entries, others, numbers = check(args)
+    tell_limits(preset(args.preset))
     identity = {name: value for name, value in vars(args).items() if name != "out"}
     # A policy that is trained first is kept in the folder, and is another one for other sizes.
     checkpoint.open_run(args.out, identity | {"sizes": preset(args.preset)})

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from experiments.common import compiler
 from experiments.common.cli import run
-from experiments.common.config import preset
+from experiments.common.config import preset, tell_limits
 from experiments.robot.transfer import Transfer, compile_programs, play
 
 
@@ -25,6 +25,7 @@ def main(args: Args) -> None:
       ValueError: an option is wrong, too many falls are expected, or the robot's log is missing or unusable.
     """
     compiler.set_up(preset(args.preset).xla_flags)
+    tell_limits(preset(args.preset))
     play(args, compile_programs(args))
 
 

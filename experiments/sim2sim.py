@@ -19,7 +19,7 @@ from rich.progress import Progress, TaskID
 from envs.targets.protocol import Target
 from experiments.common import checkpoint, compiler, files, hosts, plots, report
 from experiments.common.cli import bars, console, run
-from experiments.common.config import Preset, named_values, preset
+from experiments.common.config import Preset, named_values, preset, tell_limits
 from experiments.common.files import as_json, read_json, write_json, write_text
 from experiments.walking import comparison, memory
 from experiments.walking.cases import Case, check_positive, check_seeds, checked_case, errors
@@ -226,6 +226,7 @@ def main(args: Args) -> None:
     hidden = parameters.select(robot.entries, [name for name in case.hidden if name not in entries])
     learner = Learner(sizes, entries, hidden, kind=robot, states=args.states)
     memory.check(learner)
+    tell_limits(sizes)
     checkpoint.open_run(args.out, identity)
     target = robot.engines[case.target](learner.robot, case.true_params(entries, args.start))
     runner = Runner(args, learner, target, starting_policy(args.policy, learner, args.out), knobs)

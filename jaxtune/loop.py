@@ -18,12 +18,11 @@ from jaxtune.gate import GateInfo, no_gate_log
 from jaxtune.pooling import Past
 from jaxtune.readings import Collected
 from jaxtune.replay import Replay
-from jaxtune.settings import Knobs, TunerConfig
+from jaxtune.settings import UNEXPLAINED, Knobs, TunerConfig
 from jaxtune.types import ParamDist, Trajectory, Verdict
 from jaxtune.update import UpdateInfo, no_update
 
 _CHANGED = 0.9  # of a radius: what is narrowed less than that, or moved by less than the rest, is as it was
-_UNEXPLAINED = 0.01  # largest p-value; a conformal one needs 99 simulated sets to be so small
 
 
 @chex.dataclass(frozen=True)
@@ -148,7 +147,7 @@ def refine(config: TunerConfig, carry: dict, moved: ParamDist, update: UpdateInf
     # Tested once a tuning, so that its rate of false alarms is that of one test: at filled bounds by the gate, and from
     # states, where they are measured, by `sharpen`.
     first = (carry["left"] == config.refinements) & ~dists.at_bounds(tested) & carry["sharpened"]
-    unexplained = first & (update.p_misfit <= _UNEXPLAINED)
+    unexplained = first & (update.p_misfit <= UNEXPLAINED)
     radius, unit = dists.ravel(dist.radius), dists.ravel(tested.radius)
     changed = (dists.ravel(moved.radius) < _CHANGED * radius) | (jnp.abs(update.step) > 1.0 - _CHANGED)
     contradicts = _contradicts(update)
@@ -235,7 +234,7 @@ def sharpen(
         "update": update,
         "sharpened": jnp.asarray(True),
     }
-    return optax.tree.where(found.p_value <= _UNEXPLAINED, _given_up(read), read)
+    return optax.tree.where(found.p_value <= UNEXPLAINED, _given_up(read), read)
 
 
 def known_after(carry: dict) -> Past:
@@ -274,7 +273,7 @@ def _verdict(config: TunerConfig, gate: GateInfo, dist: ParamDist, calls: jax.Ar
             ~jnp.asarray(gate.comparable),
             ~(jnp.isfinite(gate.novelty) & jnp.isfinite(gate.threshold)),
             gate.novelty <= gate.threshold,
-            full & (gate.p_value <= _UNEXPLAINED),
+            full & (gate.p_value <= UNEXPLAINED),
             full | (calls >= config.max_widenings),
         ],
         [

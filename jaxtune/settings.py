@@ -11,6 +11,9 @@ from jaxtune.regression import RegressionConfig
 from jaxtune.replay import ReplayConfig
 from jaxtune.spm import SPMConfig
 
+UNEXPLAINED = 0.01
+"""Largest p-value of a set that is `unexplained`."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class TunerConfig:
@@ -58,6 +61,11 @@ class TunerConfig:
             raise ValueError(f"coverage: got {self.coverage}, expected a number between 0 and 1")
         if not self.min_radius > 0:
             raise ValueError(f"min_radius: got {self.min_radius}, expected a positive number")
+
+    @property
+    def may_be_unexplained(self) -> bool:
+        """Whether a conformal p-value can be so small: that needs 99 simulated sets."""
+        return self.held_out_sets + 1 >= 1.0 / UNEXPLAINED
 
     @property
     def longest_window(self) -> int:

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from envs.biteno import TaskConfig
+from experiments.common.cli import console
 from jaxtune.dvm import DVMConfig
 from jaxtune.mjx import Entry
 from jaxtune.ppo import PPOConfig
@@ -143,6 +144,14 @@ _GPU = Preset(
 
 PRESETS = {"smoke": _SMOKE, "cpu": Preset(), "gpu": _GPU}
 """Presets by the name that `--preset` takes; the defaults of `Preset` are those of `cpu`."""
+
+
+def tell_limits(sizes: Preset) -> None:
+    """Prints what runs of a size cannot find."""
+    sets = sizes.tuner.held_out_sets
+    if not sizes.tuner.may_be_unexplained:
+        text = f"note: {sets} simulated sets are too few to call a robot unexplained; that takes 99"
+        console.print(text, highlight=False, soft_wrap=True)
 
 
 def preset(name: str) -> Preset:

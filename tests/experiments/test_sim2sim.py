@@ -10,7 +10,7 @@ import pytest
 from experiments import sim2sim, sweep
 from experiments.common import checkpoint, files, plots
 from experiments.common.cli import bars
-from experiments.common.config import PRESETS
+from experiments.common.config import PRESETS, tell_limits
 from experiments.walking import comparison
 from experiments.walking.cases import CASES, errors
 from experiments.walking.robots import BITENO
@@ -169,3 +169,10 @@ def test_json_has_no_nan():
 
     written = files.as_json(Thing(float("nan"), np.array([1.0, np.inf])))
     assert written == {"value": None, "array": [1.0, None]}
+
+
+def test_a_size_that_cannot_call_a_robot_unexplained_says_so(capsys):
+    tell_limits(PRESETS["cpu"])
+    assert not capsys.readouterr().out
+    tell_limits(PRESETS["smoke"])
+    assert "note: 19 simulated sets are too few to call a robot unexplained; that takes 99" in capsys.readouterr().out
