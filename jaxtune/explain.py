@@ -51,6 +51,24 @@ def weak(info) -> np.ndarray:
     return np.sqrt(found, where=found >= 0, out=np.zeros_like(found)) > _WEAK
 
 
+def intervals(info) -> np.ndarray:
+    """Computes half widths of the intervals around the new centre, where they hold.
+
+    Held-out sets calibrate them, which say nothing of values beyond the distribution that they were drawn from.
+
+    Args:
+      info: of one tuning.
+
+    Returns:
+      [coords] in coordinates, in the order of `dist.names`; nan where the interval reaches past the distribution, or
+      where the update gives none.
+    """
+    step, interval = (np.asarray(value) for value in (info.update.step, info.update.interval))
+    low, high = map(np.asarray, dists.normalised_box(info.dist))
+    inside = (step - interval >= low) & (step + interval <= high)
+    return np.where(inside, np.asarray(dists.ravel(info.dist.radius)) * interval, np.nan)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Combination:
     """A weighted sum of coordinates that is known better than each of them."""
@@ -153,7 +171,7 @@ def explain(info) -> str:
         elif not np.isnan(replay):
             lines.append(f"  measured states give no better estimate (their fit: p {replay:.2f})")
         moved = dists.move(info.dist, info.update.step).centre
-        interval = np.asarray(dists.ravel(info.dist.radius) * info.update.interval)
+        interval = intervals(info)
         vague = weak(info)
         for column, name in enumerate(dists.names(info.dist)):
             line = f"  {name}: {float(info.dist.centre[name]):.3f}"

@@ -3,12 +3,11 @@
 from collections.abc import Mapping
 from pathlib import Path
 
-import jax.numpy as jnp
 import jinja2
 import numpy as np
 
 from jaxtune import dist as dists
-from jaxtune.explain import combinations, weak
+from jaxtune.explain import combinations, intervals, weak
 from jaxtune.mjx import Entry, parameters
 from jaxtune.tuner import Info
 from jaxtune.types import ParamDist, Verdict
@@ -85,14 +84,9 @@ def moved(entries: Mapping[str, Entry], before: ParamDist, after: ParamDist, inf
 
     Returns:
       `before`, `after`, and the ends `low` and `high` of the interval, by parameter. The ends are nan if no set was
-      accepted. They are also nan if the interval reaches past the simulated range, because the held-out sets that
-      calibrate it say nothing about values outside.
+      accepted, or where the interval does not hold (`jaxtune.explain.intervals`).
     """
-    update = info.update
-    low, high = dists.normalised_box(info.dist)
-    inside = (update.step - update.interval >= low) & (update.step + update.interval <= high)
-    half = dists.ravel(info.dist.radius) * jnp.where(inside, update.interval, jnp.nan)
-    half = dists.unravel(dists.names(after), half)
+    half = dists.unravel(dists.names(after), intervals(info))
     ends = {
         "before": before.centre,
         "after": after.centre,

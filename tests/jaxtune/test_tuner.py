@@ -645,6 +645,9 @@ def test_an_accepted_set_is_explained_with_what_moved(play):
     assert "novelty 0.500, threshold 1.000" in text
     # Half a radius of 0.2, give or take an eighth of it.
     assert "mass: 0.000 -> 0.100 +- 0.025" in text
+    # Held-out sets say nothing of values beyond the distribution.
+    past = info.replace(update=info.update.replace(interval=jnp.full_like(info.update.interval, 0.6)))
+    assert "+-" not in tuners.explain(past).split("mass: ")[1].split("\n")[0]
     assert state.dist.centre["mass"] == pytest.approx(0.1)
 
 
