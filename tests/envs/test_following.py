@@ -132,6 +132,20 @@ def test_sealed_runs_have_no_say_in_the_gains(spec):
     np.testing.assert_array_equal(ours.gains["kp"], other.gains["kp"])
 
 
+def test_noise_of_positions_asks_for_little_torque(spec):
+    log = recorded()
+    (run,) = log.runs
+    rms = np.sqrt((run.signals["tau"] ** 2).mean(axis=0))
+    known = lambda sd: replace(log, runs=(replace(run, known={"q": {"noise_sd": np.full(2, sd)}}),))  # noqa: E731
+    fine, coarse, coarsest = (follower(known(sd), spec).gains for sd in (1e-6, 1e-3, 1.0))
+    assert (coarse["kp"] < 0.5 * fine["kp"]).all()
+    np.testing.assert_allclose(1e-3 * coarse["kp"], 0.05 * rms, rtol=1e-6)
+    # As fast as its steps allow, or as slow as makes sense; critically damped in any case.
+    np.testing.assert_allclose(fine["kp"] / coarsest["kp"], (150.0 / 15.0) ** 2, rtol=1e-6)
+    for gains in (fine, coarse):
+        np.testing.assert_allclose(coarsest["kd"] ** 2 / coarsest["kp"], gains["kd"] ** 2 / gains["kp"], rtol=1e-6)
+
+
 def test_a_known_controller_stays_and_a_mixture_is_refused(spec):
     log = recorded(names=("run_000", "run_001"))
     gains = {name: np.ones(2) for name in ("kp", "kd", "torque_limit_nm")}
