@@ -9,15 +9,18 @@ import numpy as np
 from jaxtune.discovery.belief import believed, families, posterior, rivals
 from jaxtune.discovery.candidate import Candidate, cost, key_of, measures, squares, total_cost, units_of
 from jaxtune.discovery.evaluate import is_worse, position_gap, rms
-from jaxtune.discovery.evidence import Thresholds, passes, weigh_evidence
+from jaxtune.discovery.evidence import Thresholds, ablate, passes, weigh_evidence
 from jaxtune.discovery.fit import Fit, begin, polish, refine
+from jaxtune.discovery.leads import beside, may_pass, taken_for
 from jaxtune.discovery.naming import at_fewest_places, clear_places, moved_forms, renamed, with_refinements
 from jaxtune.discovery.noise_floor import Floor, NoiseFloor, Say
 from jaxtune.discovery.problem import Hypothesis, Problem
 from jaxtune.discovery.resample import standard_errors
 from jaxtune.discovery.result import AcceptedTerm, DroppedTerm, Settings, Suspect
+from jaxtune.discovery.screen import Lead
 from jaxtune.discovery.shares import energy, explained, explained_shares, open_gaps, speak
 from jaxtune.discovery.state import State
+from jaxtune.discovery.step import fit_leads
 
 _SUSPECTS = 8
 _BELIEVED = 0.01  # probability from which on effects are worth an experiment
@@ -60,6 +63,9 @@ def conclude(settings: Settings, problem: Problem, floor: NoiseFloor, state: Sta
     say("evidence")
     state = _where_it_shows(problem, at, _with_one_name(problem, at, state))
     best, terms, ablated, dropped = _proved(settings, problem, floor, state)
+    state = _with_what_passes(settings, problem, at, replace(state, best=best))
+    if state.best is not best:
+        best, terms, ablated, dropped = _proved(settings, problem, floor, state)
     unit = units_of(problem, at, squares(at, best))[: len(problem.data["train"][at.horizon].run)]
     errors = standard_errors(best.fit, unit)
     terms = tuple(replace(term, clear=clear_places(best.fit, errors, term.hypothesis)) for term in terms)
@@ -151,6 +157,25 @@ def _where_it_shows(problem: Problem, at: Floor, state: State) -> State:
     if all(len(effect.places) == 1 for effect in state.best.effects):
         return state
     return replace(state, best=at_fewest_places(state.best, *_compared(problem, at, state)))
+
+
+def _with_what_passes(settings: Settings, problem: Problem, at: Floor, state: State) -> State:
+    """Adds models in which something else is in the place of an effect of the best one that may pass for it.
+
+    The search may have come to that model by taking effects away, and never have looked there.
+    """
+    known, found = {one.key for one in state.candidates}, []
+    for effect in (one for one in state.best.effects if any(may_pass(form, one) for form in problem.forms)):
+        base = ablate(at, state.best, effect)
+        (fit,) = polish([base.fit], at.residuals["train"], 0)
+        point = state.best.fit.coordinates[state.best.fit.along(effect)]
+        lead = Lead((effect,), point, fit.coordinates, fit.cost)
+        free = beside(problem.hypotheses, base.hypotheses)
+        leads = taken_for(lead, beside(problem.forms, base.hypotheses), free)
+        leads = [one for one in leads if key_of((*base.hypotheses, *one.hypotheses)) not in known]
+        found += fit_leads(settings, at, fit, base.hypotheses, leads, state.price)
+    cheapest = min((state.best, *found), key=lambda one: total_cost(at, one, state.price))
+    return replace(state.with_candidates(found), best=cheapest)
 
 
 def _compared(problem: Problem, at: Floor, state: State) -> tuple[list[Candidate], np.ndarray]:

@@ -62,17 +62,27 @@ def shaped(forms: Sequence[Hypothesis], free: Sequence[Hypothesis], leads: Seque
             found += [Lead((h,), point, lead.start, lead.cost) for h in alone]
             known.update(h.key for h in alone)
         if not others:
-            found += _taken_for(lead, forms, [h for h in free if h.key not in known])
+            found += taken_for(lead, forms, [h for h in free if h.key not in known])
     return found
 
 
-def _taken_for(lead: Lead, forms: Sequence[Hypothesis], free: Sequence[Hypothesis]) -> list[Lead]:
+def may_pass(form: Hypothesis, effect: Hypothesis) -> bool:
+    """Says whether an effect in this form may pass for another effect."""
+    return (form.like, form.places) == (effect.name, effect.places)
+
+
+def taken_for(lead: Lead, forms: Sequence[Hypothesis], free: Sequence[Hypothesis]) -> list[Lead]:
     """Lists what may pass for the one effect of a lead (`jaxtune.types.Form.like`), at the same places.
 
     A load beside a link's centre looks like a shift of that centre, and a load at the centre like neither.
+
+    Args:
+      lead: with one effect.
+      forms: of all effects.
+      free: effects that may join the model.
     """
     (effect,), found = lead.hypotheses, []
-    for form in (form for form in forms if (form.like, form.places) == (effect.name, effect.places)):
+    for form in (form for form in forms if may_pass(form, effect)):
         # In the direction of what it passes for, and of the size that is tried.
         point = form.probes.max() * lead.point / max(np.abs(lead.point).max(), 1e-9)
         for host in (h for h in free if form.shapes(h)):
