@@ -10,7 +10,7 @@ from slider import AXES, BOTH, DIRECTION, EACH, HYPOTHESES, LEARNED, ONE_SIZE, W
 
 from jaxtune.discovery import leads, noise_floor, state, step, workflow
 from jaxtune.discovery.candidate import Candidate
-from jaxtune.discovery.conclude import _rivals
+from jaxtune.discovery.conclude import _rivals, _with_what_passes
 from jaxtune.discovery.evaluate import is_worse
 from jaxtune.discovery.evidence import Evidence
 from jaxtune.discovery.fit import begin
@@ -441,6 +441,24 @@ def test_a_form_that_is_an_effect_of_its_own_is_fitted_alone_too():
     pair = Lead((coulomb, push), np.array([0.8, 0.3]), np.zeros(2), 10.0)
     assert [lead.hypotheses[-1].key for lead in leads.shaped([DIRECTION, WARPED], (), [pair], 1)] == [WARPED.key]
     assert [form.key for form in leads.beside([DIRECTION, WARPED], [push])] == [WARPED.key]
+
+
+def test_what_may_pass_for_a_named_effect_is_fitted_in_its_place():
+    mass, damping = HYPOTHESES[:2]
+    passes = replace(DIRECTION, form="beside", like="damping")
+    asked = problem({"coulomb": 0.8, "push": 0.4}, forms=(passes,))
+    floor, begun = state.begin(asked, measured_floor(asked))
+    at, null = floor[asked.main_horizon], begun.null.fit
+    # Somehow the search has ended with another effect, and never looked at this one.
+    lead = Lead((damping,), np.array([0.5]), null.coordinates, null.cost)
+    (wrong,) = step.fit_leads(Settings(), at, null, (), [lead], 0.0)
+    found = _with_what_passes(Settings(), asked, at, replace(begun, best=wrong))
+    assert found.best.key == "coulomb(beside)@slider + coulomb@slider"
+    assert {one.key for one in found.candidates} >= {found.best.key}
+    # What may pass for nothing is left as it is.
+    (other,) = step.fit_leads(Settings(), at, null, (), [replace(lead, hypotheses=(mass,))], 0.0)
+    ended = replace(begun, best=other)
+    assert _with_what_passes(Settings(), asked, at, ended).best is other
 
 
 def test_a_nominal_parameter_that_moved_is_no_form_of_an_effect():
