@@ -5,9 +5,11 @@ several hosts the first one writes and reads them all (`experiments.common.hosts
 """
 
 import contextlib
+import errno
 import fcntl
 import hashlib
 import importlib.metadata
+import os
 import platform
 import re
 import secrets
@@ -27,6 +29,7 @@ from experiments.common.files import DRAFT, as_json, read_json, sync, write_json
 
 _PACKAGES = ("jaxtune", "jax", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "orbax-checkpoint", "numpy")
 
+_ROOM = 1.5  # of a state's size, which a disk must have left
 _LOCK = ".lock"  # suffix of a file whose lock says that a process works on a piece
 
 
@@ -142,9 +145,12 @@ def save(path: Path, state: Any, config: Any, notes: Any = None) -> None:
     """
     path.mkdir(parents=True, exist_ok=True)
     numbers = [int(old.name.rpartition("_")[2]) for old in path.glob("state_*") if old.name[6:].isdecimal()]
-    new = path / f"state_{max(numbers, default=0) + 1}"
+    new, arrays = path / f"state_{max(numbers, default=0) + 1}", _numbers(state)
+    # Orbax prints a hundred lines where the disk is full.
+    if shutil.disk_usage(path).free < _ROOM * sum(leaf.nbytes for leaf in jax.tree.leaves(arrays)):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(new))
     with _checkpointer() as checkpointer:
-        checkpointer.save(new.absolute(), _numbers(state))
+        checkpointer.save(new.absolute(), arrays)
     for item in (new, *new.rglob("*")):
         sync(item)
     sync(path)

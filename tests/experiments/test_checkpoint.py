@@ -9,6 +9,7 @@ import sys
 import threading
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -76,6 +77,17 @@ def test_a_full_disk_leaves_the_old_file_and_no_draft(monkeypatch, tmp_path):
         files.write_json(path, {"value": 2})
     assert files.read_json(path) == {"value": 1}
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_state_that_does_not_fit_on_the_disk_is_not_begun(monkeypatch, tmp_path):
+    checkpoint.save(tmp_path, state(1.0), CONFIG)
+    before = sorted(path.name for path in tmp_path.iterdir())
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=30))
+    with pytest.raises(OSError, match=r"No space left on device: .*state_2") as refused:
+        checkpoint.save(tmp_path, state(2.0), CONFIG)
+    assert refused.value.errno == errno.ENOSPC
+    assert sorted(path.name for path in tmp_path.iterdir()) == before
+    assert (checkpoint.load(tmp_path, state(0.0), CONFIG)["kernel"] == 1.0).all()
 
 
 def test_a_flipped_bit_anywhere_in_a_checkpoint_is_noticed(tmp_path):
