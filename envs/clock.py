@@ -72,6 +72,9 @@ def evened(runs: Sequence[Run], seen: Sequence[Run]) -> tuple[Run, ...]:
     Args:
       runs: of one robot and one program.
       seen: those that may decide; without sealed ones.
+
+    Returns:
+      The runs, on lines or as they are.
     """
     moved = [(run, even) for run in seen if (even := _evened(run)) is not run]
     if not moved:

@@ -43,9 +43,10 @@ def follower(log: Log, spec: mujoco.MjSpec) -> Controller | None:
         torque = kp (target - q) - kd dq,   target = q_measured + kd / kp dq_measured + tau_measured / kp
 
     so while the model moves as measured, it asks for the measured torque. What else it needs shows in that, and in how
-    far the motion is off. It is as fast as noise allows, which makes it ask for torques too:
+    far the motion is off. It is as fast as noise allows, which makes it ask for torques too. With the standard
+    deviations that white noise of the sensors leaves in smoothed positions and velocities, but no slower than 15 rad/s,
 
-        pace^2 inertia noise_sd <= 0.05 rms(tau)
+        inertia (pace^2 sd(q) + 2 pace sd(dq)) <= 0.05 rms(tau)
 
     Args:
       log: without sealed runs, with the noise of its signals (`readings.with_noise`).
@@ -60,9 +61,10 @@ def follower(log: Log, spec: mujoco.MjSpec) -> Controller | None:
     if not all(unknown):
         name = log.runs[unknown.index(False)].name
         raise ValueError(f"{name}: controller.type: got a known one, expected 'unknown' as in others, or in none")
-    inertia, noise = _least_inertia(log, spec), noise_of(log.runs[0], "q")
+    inertia, (far, fast) = _least_inertia(log, spec), _noise_left(log.runs[0])
     torque = np.sqrt((np.concatenate([run.signals["tau"] for run in log.runs]) ** 2).mean(axis=0))
-    pace = np.clip(np.sqrt(_SHAKEN * torque / (inertia * noise)), _SLOWEST_RAD_S, _FASTEST_RAD_S)
+    pace = (np.sqrt(fast**2 + far * _SHAKEN * torque / inertia) - fast) / far
+    pace = np.clip(pace, _SLOWEST_RAD_S, _FASTEST_RAD_S)
     gains = {
         "kp": inertia * pace**2,
         "kd": 2.0 * inertia * pace,
@@ -89,6 +91,13 @@ def _followed(run: Run, controller: Controller) -> Run:
     torque = smoothed(replace(run, signals={"q": run.signals["tau"]}, known={"q": run.known.get("tau", {})}))[:, 0]
     target = states[:, 0] + (gains["kd"] * states[:, 1] + torque) / gains["kp"]
     return replace(run, controller=controller, signals={**run.signals, "target": target})
+
+
+def _noise_left(run: Run) -> np.ndarray:
+    """Standard deviations that smoothing leaves of noise, of positions and velocities, [2, joints]."""
+    rng, signals = np.random.default_rng(0), {name: run.signals[name] for name in ("q", "dq") if name in run.signals}
+    noise = {name: noise_of(run, name) * rng.standard_normal(values.shape) for name, values in signals.items()}
+    return smoothed(replace(run, signals=noise)).std(axis=0)
 
 
 def _least_inertia(log: Log, spec: mujoco.MjSpec) -> np.ndarray:

@@ -5,7 +5,7 @@ effects one always improves the fit a little, because it imitates differences th
 its integrator, the moment at which a controller reads the joint. A null log therefore has such differences too:
 
 - MuJoCo C simulates the nominal model with half the step, another integrator and a controller whose ticks jitter;
-- its masses, armatures, dampings and frictions are drawn from the prior, its controller's gains
+- its masses, inertias, armatures, dampings and frictions are drawn from the prior, its controller's gains
   are those of the log;
 - if it is unknown whether targets are held between rows, or move on in straight lines, one of them is drawn;
 - the readings get the noise, the rounding, the times and the repetitions that are found in the measured log, column by

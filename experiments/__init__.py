@@ -10,9 +10,9 @@ import io
 import signal
 import sys
 
-# The imports below take seconds, in which Ctrl-C would print a long traceback or be swallowed by JAX. It ends a command
-# (`python -m`) at once instead, until `experiments.common.cli.run` can say how to go on.
-if sys.argv[:1] == ["-m"] and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+# The imports of a command take seconds, in which Ctrl-C would print a long traceback or be swallowed by JAX. It ends
+# the command at once instead, until `experiments.common.cli.run` can say how to go on.
+if f"-m {__name__}." in " ".join(sys.orig_argv) and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 # MJX prints two lines about an optional engine (warp) on its first import; they would head every command's output.

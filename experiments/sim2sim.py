@@ -226,7 +226,8 @@ def main(args: Args) -> None:
     hidden = parameters.select(robot.entries, [name for name in case.hidden if name not in entries])
     learner = Learner(sizes, entries, hidden, kind=robot, states=args.states)
     memory.check(learner)
-    tell_limits(sizes)
+    if "ours" in args.methods:
+        tell_limits(sizes)
     checkpoint.open_run(args.out, identity)
     target = robot.engines[case.target](learner.robot, case.true_params(entries, args.start))
     runner = Runner(args, learner, target, starting_policy(args.policy, learner, args.out), knobs)

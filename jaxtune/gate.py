@@ -27,7 +27,7 @@ from jaxtune.settings import Knobs, TunerConfig
 from jaxtune.types import Trajectory
 
 _SAME = 1e-6  # of an observation's size and usual spread: it does not change
-_ROUNDED = 1e-3  # of a number of sets
+_ROUNDED = 2e-4  # of one, by which a level near one may be off in single precision
 
 
 @chex.dataclass(frozen=True)
@@ -106,8 +106,8 @@ def calibrated_gate(
     every = jnp.where(fixed, cover, jnp.nanmax(jnp.stack([*found.values()]), axis=0))
     calibration, value = every[:-1], jnp.where(sane[-1], every[-1], jnp.nan)
     lived = jnp.append(_lives(collected.held_out, config), _lives(measured, config))
-    usable, needed = valid.any(axis=-1) & (fixed | lived), knobs.level / (1.0 - knobs.level)
-    enough = fixed | (usable[:-1].sum() >= jnp.ceil(needed - _ROUNDED))
+    usable = valid.any(axis=-1) & (fixed | lived)
+    enough = fixed | ((usable[:-1].sum() + 1) * (1.0 - knobs.level) >= 1.0 - _ROUNDED)
     return GateInfo(
         novelty=value,
         threshold=jnp.where(fixed, knobs.threshold, conformal.quantile(calibration, knobs.level)),

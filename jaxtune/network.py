@@ -9,9 +9,14 @@ A robot's computer needs NumPy and a copy of this file, which `python -m experim
 
 import json
 import zipfile
+import zlib
 from pathlib import Path
 
 import numpy as np
+
+_DIGITS = 18
+# What readers of archives and of JSON raise. LookupError: something is not there.
+_DAMAGED = (zipfile.BadZipFile, zlib.error, EOFError, OSError, LookupError, TypeError, ValueError, NotImplementedError)
 
 
 class Network:
@@ -29,12 +34,15 @@ class Network:
             with open(path, "rb") as file, np.load(file, allow_pickle=False) as stored:
                 text = str(stored["meta"])
                 arrays = {name: stored[name] for name in stored.files if name != "meta"}
-        except (zipfile.BadZipFile, EOFError, KeyError) as error:
+            self.meta = json.loads(text, parse_constant=_finite, parse_float=_finite, parse_int=_whole)
+            used = {"mean", "std"} | {f"{kind}_{i}" for i in range(self.meta["layers"]) for kind in ("kernel", "bias")}
+            wrong = [name for name in sorted(used) if not np.isfinite(arrays[name]).all()]
+        except FileNotFoundError:
+            raise
+        except _DAMAGED as error:
             raise ValueError(f"{path}: is damaged: {error}") from error
-        self.meta = json.loads(text, parse_constant=_finite, parse_float=_finite)
-        for name, values in arrays.items():
-            if not np.isfinite(values).all():
-                raise ValueError(f"{path}: {name}: got a number that is not finite")
+        if wrong:
+            raise ValueError(f"{path}: {wrong[0]}: got a number that is not finite")
         self._mean, self._std = arrays["mean"], arrays["std"]
         self._layers = [(arrays[f"kernel_{i}"], arrays[f"bias_{i}"]) for i in range(self.meta["layers"])]
 
@@ -60,6 +68,13 @@ class Network:
                 f"action: got a number that is not finite, for observations of up to {np.abs(obs).max():g}"
             )
         return value
+
+
+def _whole(text: str) -> int:
+    """Reads a whole number, of which NumPy can make one of its own."""
+    if len(text) > _DIGITS:
+        raise ValueError(f"meta: got {len(text)} digits, expected {_DIGITS} at most")
+    return int(text)
 
 
 def _finite(text: str) -> float:

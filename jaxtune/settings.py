@@ -13,6 +13,8 @@ from jaxtune.spm import SPMConfig
 
 UNEXPLAINED = 0.01
 """Largest p-value of a set that is `unexplained`."""
+SETS_TO_EXPLAIN = round(1 / UNEXPLAINED) - 1
+"""Simulated sets of which a conformal p-value can be as small as that."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,8 +66,8 @@ class TunerConfig:
 
     @property
     def may_be_unexplained(self) -> bool:
-        """Whether a conformal p-value can be so small: that needs 99 simulated sets."""
-        return self.held_out_sets + 1 >= 1.0 / UNEXPLAINED
+        """Whether the verdict `unexplained` can be reached with so many held-out sets."""
+        return self.held_out_sets >= SETS_TO_EXPLAIN
 
     @property
     def longest_window(self) -> int:

@@ -20,7 +20,7 @@ _SUDDEN_S = 0.008  # in which no robot stops, and starts again as fast
 _NEAR = 25  # rows before and after a stay, from which noise is estimated
 _LEAST_QUANTA = 3.0  # of motion before and after a stay, for its speed to be known
 _MISSED_QUANTA = 1.75  # of motion that must have been seen during the stay
-_MISSED_SD = 4.5  # of noise, which may undo as much between two readings
+_MISSED_SD, _FINE = 4.5, 0.25  # of noise, which may undo as much between two readings; a fine quantum, as its share
 _CHANCE = 0.3  # stays that noise may bring about in a run, at most
 _FAR = (0.3, 5.0, 2e-3)  # of the joint's own range of motion, quanta, and rad or m
 _FAST_QUANTA = 2.0  # below which a speed may be of rounding alone
@@ -48,9 +48,10 @@ def repeated(run: Run) -> np.ndarray:
     if "dq" in run.signals:
         rounding = quanta[joints : 2 * joints]  # `MEASURED` begins with positions and velocities
         speeds = np.where((fast := np.abs(run.signals["dq"])) > _FAST_QUANTA * rounding, fast, 0.0)
-    # Noise of positions holds that of rounding.
+    # Noise of positions holds that of rounding. Where that is much finer, no two readings are equal by chance.
     sd = np.sqrt(np.maximum(noise_of(run, "q") ** 2 - quanta[:joints] ** 2 / 12.0, 0.0))
-    seen = _MISSED_QUANTA * quanta[:joints] + _MISSED_SD * sd
+    hidden = np.where(quanta[:joints] > _FINE * sd, _MISSED_SD * sd, 0.0)
+    seen = _MISSED_QUANTA * quanta[:joints] + hidden
     for (first, last), beyond in zip(stays, noisy, strict=True):
         driven = (speeds[first] * (run.time[last] - run.time[first]) > far).any()
         if not (beyond or driven or _passes(run, first, last, quanta[:joints], seen)):

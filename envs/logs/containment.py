@@ -3,6 +3,7 @@
 A link, an absolute path or one with `..` would have another file quoted in a message, or used as the robot's model.
 """
 
+import os
 import re
 import zipfile
 from pathlib import Path
@@ -16,6 +17,7 @@ _OR_NAMED = ", or a model that is named on the command line (--robot)"
 # What readers of XML and file systems understand differently: MuJoCo takes a backslash for a slash, and reads what
 # others take for a definition.
 _AMBIGUOUS = re.compile(rb"\\|<!(?!--|\[CDATA\[)")
+_COMMENT = re.compile(rb"<!--.*?-->", re.DOTALL)
 _URDF_FILE = re.compile(rb"""filename\s*=\s*["']([^"']*)["']""")  # MuJoCo does not list those
 
 
@@ -61,6 +63,10 @@ def check_model(folder: Path, path: Path, what: str) -> None:
       ValueError: one of them leads out of the folder, or the model cannot be read.
     """
     check_inside(folder, path, what, _OR_NAMED)
+    for item in folder.rglob("*"):
+        # Whoever opens a pipe waits for ever.
+        if item.exists() and not (item.is_file() or item.is_dir()):
+            raise ValueError(f"{what}: got {item}, expected files and folders alone beside a model")
     _check_included(folder, path, what)
     try:
         needed = [Path(one) for one in mujoco.mju_getXMLDependencies(str(path))]
@@ -77,23 +83,30 @@ def check_model(folder: Path, path: Path, what: str) -> None:
 
 
 def _check_included(folder: Path, model: Path, what: str) -> None:
-    """Checks a model and what it includes, before MuJoCo opens any of it: some files block whoever reads them."""
+    """Checks a model and what it includes or attaches, before MuJoCo opens any of it."""
     found, pending = set(), [model]
     while pending:
         path = pending.pop()
-        if not path.is_file():
-            raise ValueError(f"{what}: got {path}, expected a file")
-        found.add(path)
+        found.add(path.resolve())
         _check_text(path, what)
-        try:
-            root = ElementTree.fromstring(path.read_bytes())
-        except ElementTree.ParseError as error:
-            raise ValueError(f"{what}: {path}: {error}") from None
-        names = [one.get("file", "") for one in root.iter() if one.tag.rpartition("}")[2] == "include"]
         # Beside the model, or beside the file that includes them.
-        for place in [base / name for name in names for base in (model.parent, path.parent)]:
+        for place in [base / name for name in _included(path, what) for base in (model.parent, path.parent)]:
             check_inside(folder, place, what, _OR_NAMED)
-            pending += [place] if place.exists() and place not in found else []
+            pending += [place] if os.path.isfile(place) and place.resolve() not in found else []
+
+
+def _included(path: Path, what: str) -> list[str]:
+    """Names of the XML files that one refers to: MuJoCo opens them to look for others."""
+    text = path.read_bytes()
+    # MuJoCo takes comments that XML does not, such as rows of hyphens.
+    plain = _COMMENT.sub(b"", text)
+    if any(b"include" in comment for comment in _COMMENT.findall(text)):
+        plain = text
+    try:
+        root = ElementTree.fromstring(plain)
+    except (ElementTree.ParseError, LookupError, ValueError) as error:
+        raise ValueError(f"{what}: {path}: {error}") from None
+    return [one.get("file", "") for one in root.iter() if one.tag.rpartition("}")[2] in ("include", "model")]
 
 
 def _check_text(path: Path, what: str) -> None:

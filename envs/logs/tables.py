@@ -218,8 +218,13 @@ def _read_parquet(path: Path, used: Callable[[str], bool]) -> dict[str, np.ndarr
         if used(name):
             raise ValueError(f"{path}, column '{name}': got {kinds[name]}, expected numbers")
     try:
-        # Texts are left out: a dictionary of a single one may stand for gigabytes.
-        table = pyarrow.parquet.read_table(path, columns=numbers, partitioning=None, page_checksum_verification=True)
+        # Texts are left out: a dictionary of a single one may stand for gigabytes. So may rows that the footer hides.
+        file, batches = pyarrow.parquet.ParquetFile(path, page_checksum_verification=True), []
+        for batch in file.iter_batches(columns=numbers):
+            batches.append(batch)
+            if sum(one.num_rows for one in batches) > held.num_rows:
+                raise ValueError(f"{path}: got more rows than its footer says, {held.num_rows}")
+        table = pyarrow.Table.from_batches(batches, pyarrow.schema([schema.field(name) for name in numbers]))
         table.validate(full=True)
     except (pyarrow.ArrowException, OSError) as error:
         raise ValueError(f"{path}: {type(error).__name__}: {error}") from error

@@ -44,9 +44,8 @@ def run(main: Callable[[Any], None], args_type: type) -> None:
     """
     if signal.getsignal(signal.SIGINT) is signal.SIG_DFL:
         signal.signal(signal.SIGINT, signal.default_int_handler)
-    args = tyro.cli(args_type, description=args_type.__doc__)
     try:
-        main(args)
+        main(tyro.cli(args_type, description=args_type.__doc__))
     except ValueError as error:
         _refuse(str(error), error)
     except OSError as error:

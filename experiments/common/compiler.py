@@ -34,8 +34,8 @@ def set_up(xla_flags: str, most: int = 8) -> None:
     if _DEVICES not in flags:
         flags = f"{flags} {_DEVICES}={min(cores(), most)}"
     os.environ["XLA_FLAGS"] = flags
-    devices = re.search(rf"{_DEVICES}=(\d+)", flags)
-    os.environ.setdefault("NPROC", str(max(_LEAST_THREADS, cores(), 1 + int(devices[1]) if devices else 0)))
+    devices = [int(number) for number in re.findall(rf"{_DEVICES}=(\d+)", flags)]
+    os.environ.setdefault("NPROC", str(max(_LEAST_THREADS, cores(), *(1 + number for number in devices))))
     chosen = os.environ.get("JAX_COMPILATION_CACHE_DIR")
     base = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
     kept = Path(chosen) if chosen else base / "jaxtune" / "xla"

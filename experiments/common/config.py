@@ -14,6 +14,7 @@ from experiments.common.cli import console
 from jaxtune.dvm import DVMConfig
 from jaxtune.mjx import Entry
 from jaxtune.ppo import PPOConfig
+from jaxtune.settings import SETS_TO_EXPLAIN
 from jaxtune.spm import SPMConfig
 from jaxtune.tuner import TunerConfig
 
@@ -150,7 +151,7 @@ def tell_limits(sizes: Preset) -> None:
     """Prints what runs of a size cannot find."""
     sets = sizes.tuner.held_out_sets
     if not sizes.tuner.may_be_unexplained:
-        text = f"note: {sets} simulated sets are too few to call a robot unexplained; that takes 99"
+        text = f"note: {sets} simulated sets are too few to call a robot unexplained; that takes {SETS_TO_EXPLAIN}"
         console.print(text, highlight=False, soft_wrap=True)
 
 

@@ -14,7 +14,7 @@ from envs import models, readings, segments
 from envs.clock import evened, retimed
 from envs.diagnosis.structure import pieces
 from envs.held import held_joints, unread_joints
-from envs.logs import Log, Run, read_any, splits, with_halves_swapped
+from envs.logs import Log, Run, read_any, splits, with_halves_swapped, with_splits
 from experiments.discovery.cutting import row_rate, split_in_time
 
 _LEAST_STALE = 0.02  # share of readings
@@ -63,18 +63,30 @@ def read_logs(
     if len(logs) > 1:
         runs = tuple(_numbered(run, number) for number, log in enumerate(logs) for run in log.runs)
     notes += tuple(note for log in logs for note in log.notes)
-    log = split_in_time(replace(first, runs=runs, notes=notes))
-    return _in_pieces(_on_lines(with_halves_swapped(log) if swap_halves else log)), spec
+    # Splits go by what motors do, so they are settled before stamps move.
+    log = with_splits(split_in_time(replace(first, runs=runs, notes=notes)))
+    log = with_halves_swapped(log) if swap_halves else log
+    parts = len(log.runs) // len(runs)
+    return _in_pieces(_on_lines(log, [parts * len(one.runs) for one in logs])), spec
 
 
-def _on_lines(log: Log) -> Log:
-    """The log with time stamps that jitter put on lines (`evened`)."""
-    runs = evened(log.runs, without_sealed(log).runs)
+def _on_lines(log: Log, sizes: Sequence[int]) -> Log:
+    """The log with time stamps that jitter put on lines (`evened`), each folder judged by its own runs.
+
+    Args:
+      log: with splits.
+      sizes: numbers of its runs by folder, in their order.
+    """
+    runs = []
+    for size in sizes:
+        mine = log.runs[len(runs) : len(runs) + size]
+        runs += evened(mine, [run for run in mine if run.split != "sealed"])
+
     moved = sum(run is not before for run, before in zip(runs, log.runs, strict=True))
     if not moved:
         return log
     note = f"time stamps of {moved} runs jitter and were put on a line: positions are smoother there"
-    return replace(log, runs=runs, notes=(*log.notes, note))
+    return replace(log, runs=tuple(runs), notes=(*log.notes, note))
 
 
 def _in_pieces(log: Log) -> Log:

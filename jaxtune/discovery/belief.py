@@ -93,14 +93,18 @@ def rivals(
       Names, most likely first.
     """
     others = {other.key for other in best.hypotheses if other is not term.hypothesis}
+    least = total_cost(at, best, 0.0)
+    # A model without the effect may break a segment; the null does not.
+    null = max(total_cost(at, one, 0.0) for one in candidates if not one.hypotheses)
+    nothing = min(least + term.evidence.gain, null)
     # The others were fitted without forms.
-    plain = next((one for one in candidates if one.key == key_of(best.effects)), best)
-    least = total_cost(at, plain, 0.0)
+    plain = [total_cost(at, one, 0.0) for one in candidates if one.key == key_of(best.effects)]
+    least = plain[0] if plain and plain[0] < nothing else least
     found: dict[str, float] = {}
     for candidate, probability in zip(candidates, probabilities, strict=True):
         if term.hypothesis.name in [h.name for h in candidate.effects] or len(candidate.effects) > len(best.effects):
             continue
-        explained = 1.0 - (total_cost(at, candidate, 0.0) - least) / term.evidence.gain
+        explained = (nothing - total_cost(at, candidate, 0.0)) / max(nothing - least, 1e-9)
         for other in candidate.effects:
             if other.key not in others and explained > settings.same:
                 found[other.name] = max(found.get(other.name, 0.0), explained)

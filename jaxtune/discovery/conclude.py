@@ -11,7 +11,7 @@ from jaxtune.discovery.candidate import Candidate, cost, key_of, measures, squar
 from jaxtune.discovery.evaluate import is_worse, position_gap, rms
 from jaxtune.discovery.evidence import Thresholds, ablate, passes, weigh_evidence
 from jaxtune.discovery.fit import Fit, begin, polish, refine
-from jaxtune.discovery.leads import beside, may_pass, taken_for
+from jaxtune.discovery.leads import beside, taken_for
 from jaxtune.discovery.naming import at_fewest_places, clear_places, moved_forms, renamed, with_refinements
 from jaxtune.discovery.noise_floor import Floor, NoiseFloor, Say
 from jaxtune.discovery.problem import Hypothesis, Problem
@@ -65,7 +65,8 @@ def conclude(settings: Settings, problem: Problem, floor: NoiseFloor, state: Sta
     best, terms, ablated, dropped = _proved(settings, problem, floor, state)
     state = _with_what_passes(settings, problem, at, replace(state, best=best))
     if state.best is not best:
-        best, terms, ablated, dropped = _proved(settings, problem, floor, state)
+        best, terms, ablated, later = _proved(settings, problem, floor, state)
+        dropped += later
     unit = units_of(problem, at, squares(at, best))[: len(problem.data["train"][at.horizon].run)]
     errors = standard_errors(best.fit, unit)
     terms = tuple(replace(term, clear=clear_places(best.fit, errors, term.hypothesis)) for term in terms)
@@ -165,15 +166,18 @@ def _with_what_passes(settings: Settings, problem: Problem, at: Floor, state: St
     The search may have come to that model by taking effects away, and never have looked there.
     """
     known, found = {one.key for one in state.candidates}, []
-    for effect in (one for one in state.best.effects if any(may_pass(form, one) for form in problem.forms)):
-        base = ablate(at, state.best, effect)
-        (fit,) = polish([base.fit], at.residuals["train"], 0)
+    for effect in state.best.effects:
+        mine = {one.key for one in (effect, *state.best.forms_of(effect))}
+        others = [one for one in state.best.hypotheses if one.key not in mine]
         point = state.best.fit.coordinates[state.best.fit.along(effect)]
-        lead = Lead((effect,), point, fit.coordinates, fit.cost)
-        free = beside(problem.hypotheses, base.hypotheses)
-        leads = taken_for(lead, beside(problem.forms, base.hypotheses), free)
-        leads = [one for one in leads if key_of((*base.hypotheses, *one.hypotheses)) not in known]
-        found += fit_leads(settings, at, fit, base.hypotheses, leads, state.price)
+        lead = Lead((effect,), point, state.null.fit.coordinates, state.null.fit.cost)
+        leads = taken_for(lead, beside(problem.forms, others), beside(problem.hypotheses, others))
+        leads = [one for one in leads if key_of((*others, *one.hypotheses)) not in known]
+        if leads:
+            base = ablate(at, state.best, effect)
+            (fit,) = polish([base.fit], at.residuals["train"], 0)
+            leads = [replace(one, start=fit.coordinates) for one in leads]
+            found += fit_leads(settings, at, fit, base.hypotheses, leads, state.price)
     cheapest = min((state.best, *found), key=lambda one: total_cost(at, one, state.price))
     return replace(state.with_candidates(found), best=cheapest)
 

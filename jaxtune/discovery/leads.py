@@ -66,11 +66,6 @@ def shaped(forms: Sequence[Hypothesis], free: Sequence[Hypothesis], leads: Seque
     return found
 
 
-def may_pass(form: Hypothesis, effect: Hypothesis) -> bool:
-    """Says whether an effect in this form may pass for another effect."""
-    return (form.like, form.places) == (effect.name, effect.places)
-
-
 def taken_for(lead: Lead, forms: Sequence[Hypothesis], free: Sequence[Hypothesis]) -> list[Lead]:
     """Lists what may pass for the one effect of a lead (`jaxtune.types.Form.like`), at the same places.
 
@@ -82,7 +77,7 @@ def taken_for(lead: Lead, forms: Sequence[Hypothesis], free: Sequence[Hypothesis
       free: effects that may join the model.
     """
     (effect,), found = lead.hypotheses, []
-    for form in (form for form in forms if may_pass(form, effect)):
+    for form in (form for form in forms if (form.like, form.places) == (effect.name, effect.places)):
         # In the direction of what it passes for, and of the size that is tried.
         point = form.probes.max() * lead.point / max(np.abs(lead.point).max(), 1e-9)
         for host in (h for h in free if form.shapes(h)):

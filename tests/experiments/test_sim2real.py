@@ -469,7 +469,7 @@ def test_errors_of_the_system_and_ctrl_c_are_one_line(monkeypatch, capsys, error
 
 def test_ctrl_c_ends_a_command_without_a_word_while_it_is_imported(monkeypatch):
     standard = signal.getsignal(signal.SIGINT)
-    monkeypatch.setattr(sys, "argv", ["-m", "--seed", "3"])
+    monkeypatch.setattr(sys, "orig_argv", ["python", "-W", "ignore", "-m", "experiments.train", "--seed", "3"])
     try:
         signal.signal(signal.SIGINT, signal.default_int_handler)
         importlib.reload(experiments)
@@ -478,6 +478,7 @@ def test_ctrl_c_ends_a_command_without_a_word_while_it_is_imported(monkeypatch):
         cli.run(lambda args: None, dataclass(type("Nothing", (), {"__doc__": "Does nothing."})))
         assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
         # Whoever imports the package in a program of their own keeps what they have.
+        monkeypatch.setattr(sys, "orig_argv", ["python", "-m", "theirs"])
         importlib.reload(experiments)
         assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     finally:

@@ -15,6 +15,7 @@ from jaxtune.mjx import parameters
 
 WRONG = {
     "link_mass": {"upper": {"ratio": 1.2}},
+    "link_inertia": {"lower": {"ratio": 0.8}},
     "com_offset": {"lower": {"x_m": 0.02, "y_m": -0.01}},
     "payload": {"lower": {"kg": 0.2, "x_m": 0.03, "z_m": -0.05}},
     "armature": {"elbow": {"kg_m2": 0.013}},
@@ -30,7 +31,7 @@ WRONG = {
     "drag": {"lower": {"n_s_per_m": 1.5}},
     "imu_tilt": {"robot": {"pitch_rad": 0.02}},
 }
-IN_THE_MODEL = {"link_mass", "com_offset", "payload", "armature", "viscous", "coulomb"}
+IN_THE_MODEL = {"link_mass", "link_inertia", "com_offset", "payload", "armature", "viscous", "coulomb"}
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -3,6 +3,7 @@
 import dataclasses
 import os
 import zipfile
+from types import SimpleNamespace
 
 import numpy as np
 import pyarrow
@@ -182,17 +183,45 @@ def test_files_that_a_logs_model_refers_to_are_in_the_logs_folder(tmp_path, refe
         logs.read(folder)
 
 
-def test_what_a_model_includes_is_checked_before_it_is_opened(tmp_path):
+@pytest.mark.parametrize(
+    "reference",
+    [
+        '<include file="{pipe}"/>',
+        '<asset><model name="it" file="{pipe}"/></asset>',
+        '<asset><mesh file="{pipe}"/></asset>',
+    ],
+    ids=["include", "model", "mesh"],
+)
+def test_what_would_block_whoever_reads_it_is_not_opened(tmp_path, reference):
     folder = put(tmp_path / "log", meta={"robot": "robot.xml"})
-    for pipe, refusal in ((tmp_path / "pipe", OUT), (folder / "pipe", "expected a file")):
-        os.mkfifo(pipe)  # whoever opens it waits for ever
-        (folder / "inner.xml").write_text(f'<mujoco><include file="{os.path.relpath(pipe, folder)}"/></mujoco>')
-        (folder / "robot.xml").write_text('<mujoco><include file="inner.xml"/></mujoco>')
+    for pipe, refusal in ((tmp_path / "pipe.obj", OUT), (folder / "pipe.obj", "expected files and folders alone")):
+        os.mkfifo(pipe)
+        used = reference.format(pipe=os.path.relpath(pipe, folder))
+        (folder / "inner.xml").write_text(f"<mujoco>{used if 'include' in used else ''}</mujoco>")
+        (folder / "robot.xml").write_text(
+            f'<mujoco><include file="inner.xml"/>{"" if "include" in used else used}</mujoco>'
+        )
         with pytest.raises(ValueError, match=refusal):
             logs.read(folder)
-    # Two that include each other.
-    (folder / "inner.xml").write_text('<mujoco><include file="robot.xml"/></mujoco>')
+
+
+def test_models_that_include_each_other_are_read_once(tmp_path):
+    folder = put(tmp_path / "log", meta={"robot": "robot.xml"})
+    for link in ("d", "e"):
+        (folder / link).symlink_to(folder)
+    (folder / "robot.xml").write_text('<mujoco><include file="d/robot.xml"/><include file="e/robot.xml"/></mujoco>')
     with pytest.raises(ValueError, match=r"robot.xml"):
+        logs.read(folder)
+
+
+def test_comments_that_mujoco_takes_are_taken(tmp_path):
+    arm = """<mujoco><!-- ---- arm ---- --><worldbody><body><joint name="left_hip"/><geom size=".1"/>
+      <body><joint name="left_knee"/><geom size=".1"/></body></body></worldbody></mujoco>"""
+    folder = put(tmp_path / "log", meta={"robot": "robot.xml"})
+    (folder / "robot.xml").write_text(arm)
+    assert logs.read(folder).robot == str(folder / "robot.xml")
+    (folder / "robot.xml").write_text(arm.replace("arm", '<include file="x.xml"/>'))
+    with pytest.raises(ValueError, match=r"robot.xml: not well-formed"):
         logs.read(folder)
 
 
@@ -291,15 +320,30 @@ def test_a_csv_counts_by_its_cells(tmp_path, monkeypatch):
 def test_texts_of_a_table_are_not_read(tmp_path, monkeypatch):
     """A dictionary of one long text may stand for gigabytes."""
     folder = put(tmp_path / "log", columns(), name="run_000.parquet")
-    path, read = folder / "run_000.parquet", pyarrow.parquet.read_table
-    texts = pyarrow.array(["long" * 1000] * ROWS).dictionary_encode()
-    pyarrow.parquet.write_table(read(path).append_column("note", texts), path)
-    seen = []
-    monkeypatch.setattr(
-        pyarrow.parquet, "read_table", lambda *args, **options: seen.append(read(*args, **options)) or seen[0]
-    )
+    path, reader = folder / "run_000.parquet", pyarrow.parquet.ParquetFile
+    texts, seen = pyarrow.array(["long" * 1000] * ROWS).dictionary_encode(), []
+    pyarrow.parquet.write_table(pyarrow.parquet.read_table(path).append_column("note", texts), path)
+
+    class Spy(reader):
+        def iter_batches(self, **options):
+            seen.extend(super().iter_batches(**options))
+            return seen
+
+    monkeypatch.setattr(pyarrow.parquet, "ParquetFile", Spy)
     assert len(logs.read(folder).runs[0].time) == ROWS
-    assert "note" not in seen[0].column_names
+    assert "note" not in seen[0].schema.names
+    # And no more rows than the footer says.
+    footer = pyarrow.parquet.read_metadata(path)
+    few = SimpleNamespace(
+        schema=footer.schema,
+        num_rows=ROWS - 1,
+        num_columns=footer.num_columns,
+        row_group=footer.row_group,
+        num_row_groups=1,
+    )
+    monkeypatch.setattr(pyarrow.parquet, "read_metadata", lambda path: few)
+    with pytest.raises(ValueError, match=r"run_000.parquet: got more rows than its footer says, 4"):
+        logs.read(folder)
 
 
 def test_a_table_of_equal_values_counts_unpacked(tmp_path, monkeypatch):

@@ -8,7 +8,7 @@ from slider import HYPOTHESES, problem
 
 from jaxtune.discovery import noise_floor, state, step
 from jaxtune.discovery.belief import believed, posterior, rivals
-from jaxtune.discovery.candidate import Candidate
+from jaxtune.discovery.candidate import Candidate, total_cost
 from jaxtune.discovery.evidence import Evidence, Thresholds, _in_smallest, ablate, or_known, passes, weigh_evidence
 from jaxtune.discovery.fit import begin, polish, without
 from jaxtune.discovery.resample import correlation_length, times_drawn, units
@@ -105,13 +105,19 @@ def test_models_that_are_equal_are_believed_alike(stepped):
     }
     (effect,) = found.best.hypotheses
     evidence, ablated = weigh_evidence(asked, floor, found.best, effect, {})
-    term = AcceptedTerm(effect, evidence, Thresholds(gain=found.price))
+    term, sure = AcceptedTerm(effect, evidence, Thresholds(gain=found.price)), np.array([1.0, 0.0, 0.0])
     assert rivals(at, candidates, probabilities, found.best, term, Settings()) == ("twin",)
-    # What leaves as much as the model without the effect is none, unless the effect explains much more than that.
+    # What leaves as much as the model without the effect is none, also where a form explains most of the gain.
     idle = replace(ablated, hypotheses=twin.hypotheses)
-    for gain, names in ((1.0, ()), (10.0, ("twin",))):
-        term = replace(term, evidence=replace(evidence, gain=gain * evidence.gain))
-        assert rivals(at, [found.best, idle], np.array([1.0, 0.0]), found.best, term, Settings()) == names
+    assert rivals(at, [found.best, idle, found.null], sure, found.best, term, Settings()) == ()
+    form = replace(HYPOTHESES[3], name=effect.name, form="more")
+    shaped = replace(found.best, hypotheses=(effect, form))
+    plain = off(at, found.best, 0, size=3.0)
+    assert total_cost(at, plain, 0.0) > total_cost(at, shaped, 0.0) + 0.3 * evidence.gain
+    assert rivals(at, [shaped, plain, idle, found.null], np.append(sure, 0.0), shaped, term, Settings()) == ()
+    # Without the effect a segment may break.
+    broken = replace(term, evidence=replace(evidence, gain=np.inf))
+    assert rivals(at, [found.best, idle, found.null], sure, found.best, broken, Settings()) == ()
 
 
 def test_evidence_compares_with_the_model_without_the_effect(stepped):

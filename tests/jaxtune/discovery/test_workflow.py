@@ -454,7 +454,6 @@ def test_what_may_pass_for_a_named_effect_is_fitted_in_its_place():
     (wrong,) = step.fit_leads(Settings(), at, null, (), [lead], 0.0)
     found = _with_what_passes(Settings(), asked, at, replace(begun, best=wrong))
     assert found.best.key == "coulomb(beside)@slider + coulomb@slider"
-    assert {one.key for one in found.candidates} >= {found.best.key}
     # What may pass for nothing is left as it is.
     (other,) = step.fit_leads(Settings(), at, null, (), [replace(lead, hypotheses=(mass,))], 0.0)
     ended = replace(begun, best=other)
