@@ -83,6 +83,7 @@ def conclude(settings: Settings, problem: Problem, floor: NoiseFloor, state: Sta
         bool(terms) and share >= settings.share and whole >= settings.least
     )
     changed = _at_bounds(problem, best.fit, state.price) if explains else {}
+    explains = explains and (len(changed) < settings.strained or usual[1].max() < settings.much)
     verdict = _verdict(problem, terms, changed) if explains else "unnamed"
     terms = tuple(
         replace(term, forms=(*term.forms, *moved_forms(problem, best.fit, errors, term.hypothesis))) for term in terms

@@ -37,6 +37,11 @@ class Settings:
     less the verdict is `unnamed`."""
     least: float = 0.3
     """The same share of the whole gap above the floor: a learned torque cannot explain everything either."""
+    strained: int = 2
+    """Nominal parameters at the end of their belief from which on a model that leaves `much` explains nothing: they
+    imitate what the library lacks."""
+    much: float = 5.0
+    """Gap in floor units that is much."""
     at_floor: float = 1.5
     """Gap in floor units that counts as none. No further effect is looked for once every signal is below it."""
     promising: float = 0.3

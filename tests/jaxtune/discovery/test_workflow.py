@@ -267,6 +267,9 @@ def test_a_nominal_parameter_that_stops_at_its_bound_is_a_finding():
     result = workflow.discover(asked)
     assert result.verdict == "parameter_change"
     assert result.changed == {AXES.index("damping"): pytest.approx(3.0)}
+    # Where much is left, as many at their bounds as may not be imitate something else.
+    for strained, much, verdict in ((1, 0.0, "unnamed"), (2, 0.0, "parameter_change"), (1, 9.0, "parameter_change")):
+        assert workflow.discover(asked, Settings(strained=strained, much=much)).verdict == verdict
 
 
 def test_without_a_name_the_user_gets_the_best_of_all_models_on_validation_runs():
