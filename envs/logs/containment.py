@@ -100,7 +100,8 @@ def _included(path: Path, what: str) -> list[str]:
     text = path.read_bytes()
     # MuJoCo takes comments that XML does not, such as rows of hyphens.
     plain = _COMMENT.sub(b"", text)
-    if any(b"include" in comment for comment in _COMMENT.findall(text)):
+    if any(b"include" in comment or b"<model" in comment for comment in _COMMENT.findall(text)):
+        # What is cut out may have been no comment to MuJoCo.
         plain = text
     try:
         root = ElementTree.fromstring(plain)
