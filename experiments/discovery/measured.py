@@ -81,7 +81,6 @@ def _on_lines(log: Log, sizes: Sequence[int]) -> Log:
     for size in sizes:
         mine = log.runs[len(runs) : len(runs) + size]
         runs += evened(mine, [run for run in mine if run.split != "sealed"])
-
     moved = sum(run is not before for run, before in zip(runs, log.runs, strict=True))
     if not moved:
         return log
