@@ -50,6 +50,14 @@ def pytest_configure(config):
     os.environ.setdefault("NPROC", "8")
 
 
+# Files that take longest. A process that begins with one of them at the end is waited for.
+_LONGEST = ("test_tuner", "test_kills", "test_sim2real", "test_selftest", "test_devices", "test_rig")
+
+
+def pytest_collection_modifyitems(items):
+    items.sort(key=lambda item: item.path.stem not in _LONGEST)
+
+
 def pytest_unconfigure(config):
     shutil.rmtree(config.stash.get(_KEPT, ""), ignore_errors=True)
 
