@@ -207,32 +207,30 @@ def estimates(sizes: Preset, policy: str, radius: float, seeds: Sequence[int]) -
         "regression": (regress, partial(regression.estimate, config.regression)),
     }
     collect = _compiled(lambda key: machine.collect(key, start, dist))
-    found = {name: ([], [], []) for name in methods}
+    found, truths = {name: ([], []) for name in methods}, []
     for seed in seeds:
         key_collect, key_fit = jax.random.split(jax.random.PRNGKey(seed))
         data = collect(key_collect)
-        truth = np.asarray(dists.normalise(dist, data.held_out_coords))
+        truths.append(np.asarray(dists.normalise(dist, data.held_out_coords)))
         for name, (train, answer) in methods.items():
             model, seconds = _timed(train, (key_fit, data))
             every = _compiled(
                 lambda model, sets, answer=answer: devices.in_chunks(answer, (sets,), readings.SETS, shared=(model,))
             )
-            errors, off, times = found[name]
-            answers = np.asarray(every(model, data.held_out))
-            errors.append(np.abs(answers - truth))
-            mass, true_mass = (_mass(learner, dist, values) for values in (answers, truth))
-            off.append(np.abs(mass / true_mass - 1.0))
+            answers, times = found[name]
+            answers.append(np.asarray(every(model, data.held_out)))
             times.append(seconds)
-    rows = {}
-    for name, (errors, off, times) in found.items():
-        errors = np.concatenate(errors)
-        by_coordinate = dict(zip(dists.names(dist), errors.mean(axis=0).tolist(), strict=True))
+    truth, rows = np.concatenate(truths), {}
+    mass = _mass(learner, dist, truth)
+    for name, (answers, times) in found.items():
+        answers = np.concatenate(answers)
+        errors = np.abs(answers - truth)
         rows[name] = {
             "error": errors.mean(),
             "error_90": np.quantile(errors, 0.9),
             "fit_s": min(times),
-            **by_coordinate,
-            "mass": np.mean(off),
+            **dict(zip(dists.names(dist), errors.mean(axis=0).tolist(), strict=True)),
+            "mass": np.abs(_mass(learner, dist, answers) / mass - 1.0).mean(),
         }
     return rows
 

@@ -9,6 +9,7 @@ import pytest
 
 from envs import models
 from envs.diagnosis import Finding, diagnose, shared_findings
+from envs.diagnosis.repeats import repeated
 from envs.logs import Controller
 from envs.models import suspended
 from experiments.discovery.blind_cases import ARM
@@ -414,6 +415,22 @@ def test_stamps_in_milliseconds_are_no_clock_jumps():
     assert {1.0, 2.0} == set(np.unique(np.round(1e3 * np.diff(time))))
     kinds = {one.kind for one in diagnose(replace(run, time=time), JOINTS, MODEL)}
     assert not kinds & {"clock jump", "missing rows", "short gaps"}
+
+
+@pytest.mark.parametrize(("quantum", "twice"), [(8e-4, False), (1e-6, True)])
+def test_noise_in_coarse_steps_repeats_no_rows(quantum, twice):
+    # Two coarse steps a row, and noise of 0.6 of one: now and then a row is the one before.
+    rng, time = np.random.default_rng(2), 0.005 * np.arange(4000)
+    q = (0.3 * time + 5e-4 * rng.standard_normal(len(time)))[:, None]
+    q = quantum * np.round(q / quantum)
+    written = slice(1000, 3000, 50)
+    if twice:
+        q[1001:3001:50] = q[written]
+    run = replace(undamaged(0), time=time, signals={"q": q, "target": q}, known={})
+    assert (np.diff(q, axis=0) == 0).sum() >= 40
+    found = repeated(run)
+    # Finer than noise, equal readings are no chance.
+    assert found[written].mean() > 0.5 if twice else not found.any()
 
 
 def test_rounded_speeds_of_a_robot_at_rest_repeat_no_rows():
