@@ -11,7 +11,7 @@ from jaxtune.discovery.candidate import Candidate, cost, key_of, measures, squar
 from jaxtune.discovery.evaluate import is_worse, position_gap, rms
 from jaxtune.discovery.evidence import Thresholds, ablate, passes, weigh_evidence
 from jaxtune.discovery.fit import Fit, begin, polish, refine
-from jaxtune.discovery.leads import beside, taken_for
+from jaxtune.discovery.leads import beside, fit_leads, taken_for
 from jaxtune.discovery.naming import at_fewest_places, clear_places, moved_forms, renamed, with_refinements
 from jaxtune.discovery.noise_floor import Floor, NoiseFloor, Say
 from jaxtune.discovery.problem import Hypothesis, Problem
@@ -20,7 +20,6 @@ from jaxtune.discovery.result import AcceptedTerm, DroppedTerm, Settings, Suspec
 from jaxtune.discovery.screen import Lead
 from jaxtune.discovery.shares import energy, explained, explained_shares, open_gaps, speak
 from jaxtune.discovery.state import State
-from jaxtune.discovery.step import fit_leads
 
 _SUSPECTS = 8
 _BELIEVED = 0.01  # probability from which on effects are worth an experiment

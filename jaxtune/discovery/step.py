@@ -10,22 +10,18 @@ one effect may hide another. Where nothing joins the best model any more, each o
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
-
-from jaxtune.discovery.candidate import Candidate, key_of, of_further_sizes, total_cost
-from jaxtune.discovery.curves import Group, Library, groups_of, on_segments, simulate_library, spread_segments
+from jaxtune.discovery.candidate import Candidate, key_of, total_cost
+from jaxtune.discovery.curves import Group, Library, groups_of, simulate_library
 from jaxtune.discovery.evaluate import usual
 from jaxtune.discovery.evidence import ablate, or_known
-from jaxtune.discovery.fit import Fit, begin, polish, refine, taken_over
-from jaxtune.discovery.leads import beside, shaped, shortlist, stuck
+from jaxtune.discovery.fit import Fit, polish, taken_over
+from jaxtune.discovery.leads import beside, fit_leads, shaped, shortlist, stuck
 from jaxtune.discovery.localise import localise
 from jaxtune.discovery.noise_floor import Floor, NoiseFloor, Say
 from jaxtune.discovery.problem import Hypothesis, Problem, are_distinct
 from jaxtune.discovery.result import Settings
-from jaxtune.discovery.screen import Lead, promising, screen, seen
+from jaxtune.discovery.screen import promising, screen, seen
 from jaxtune.discovery.state import State
-
-_REACH = 0.5  # share of the best fit's gain that another one needs for fresh slopes
 
 
 @dataclass(frozen=True)
@@ -156,78 +152,3 @@ def _again(
 def _unfree(problem: Problem, at: Floor) -> list[Hypothesis]:
     """Lists the forms that are not free under every hypothesis."""
     return [form for form in problem.forms if not taken_over(at.prior, form).any()]
-
-
-def fit_leads(
-    settings: Settings, at: Floor, base: Fit, present: Sequence[Hypothesis], leads: Sequence[Lead], price: float
-) -> list[Candidate]:
-    """Fits leads beside a model: all of them on the screened segments, the best on the whole of `train`.
-
-    Args:
-      settings: rounds, and how many are finalists.
-      at: the floor at the main horizon.
-      base: the model without them.
-      present: the effects that the model has.
-      leads: what joins it.
-      price: of an effect.
-
-    Returns:
-      Models that could be simulated, on `train` and `select`; of the finalists with fresh slopes.
-    """
-    if not leads:
-        return []
-    chosen = spread_segments(at, base)
-    some, evaluate = on_segments(at, base, chosen), at.on_some(chosen)
-    groups, points, starts = zip(*((lead.hypotheses, lead.point, lead.start) for lead in leads), strict=True)
-    fits = refine(begin(some, groups, points, starts, evaluate), evaluate, settings.rounds)
-    order = [index for index in np.argsort([fit.cost for fit in fits]) if np.isfinite(fits[index].cost)]
-    if not order:
-        return []
-    whole = _on_all(at, [fits[index] for index in order])
-    costs = [fit.cost + of_further_sizes(groups[order[index]], price) for index, fit in whole]
-    cheapest = np.argsort(costs, kind="stable")
-    whole, costs = [whole[index] for index in cheapest], [costs[index] for index in cheapest]
-    every = [fit for _, fit in whole]
-    chosen = _finalists(settings, base.cost, [groups[order[index]] for index, _ in whole], costs)
-    # A further round costs little beside the slopes.
-    for number, fit in zip(
-        chosen, polish([every[n] for n in chosen], at.residuals["train"], 3 * settings.rounds), strict=True
-    ):
-        every[number] = fit
-    select = at.residuals["select"](np.stack([fit.vector for fit in every]))
-    return [
-        Candidate((*present, *groups[order[index]]), fit, residual)
-        for (index, _), fit, residual in zip(whole, every, select, strict=True)
-    ]
-
-
-def _finalists(
-    settings: Settings, before: float, groups: Sequence[Sequence[Hypothesis]], costs: Sequence[float]
-) -> list[int]:
-    """Picks the fits that get fresh slopes, of those that gain enough: the best single effects and half as many pairs.
-
-    Pairs have a list of their own, since a pair costs less than its better half for want of rounds alone.
-
-    Args:
-      settings: how many.
-      before: cost without any of them.
-      groups: what each fit adds, in the order of their costs.
-      costs: of the fits, rising.
-
-    Returns:
-      Indices of the fits.
-    """
-    near = [index for index, cost in enumerate(costs) if before - cost >= _REACH * (before - costs[0])]
-    effects = [sum(not hypothesis.form for hypothesis in groups[index]) for index in near]
-    single = [index for index, count in zip(near, effects, strict=True) if count < 2][: settings.finalists]
-    pairs = [index for index, count in zip(near, effects, strict=True) if count >= 2][: settings.finalists // 2]
-    return [*single, *pairs]
-
-
-def _on_all(at: Floor, fits: Sequence[Fit]) -> list[tuple[int, Fit]]:
-    """The same models with their residuals on the whole of `train`, and without slopes; numbered."""
-    found = at.residuals["train"](np.stack([fit.vector for fit in fits]))
-    return [
-        (index, replace(fit, residual=residual, jacobian=np.zeros((len(residual), len(fit.coordinates)))))
-        for index, (fit, residual) in enumerate(zip(fits, found, strict=True))
-    ]

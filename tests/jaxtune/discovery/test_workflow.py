@@ -351,7 +351,7 @@ def test_an_effect_gives_way_to_another_that_stands_in_its_place_better():
     first, _ = step.step(Settings(), asked, floor, begun)
     at, wrong = floor[asked.main_horizon], (HYPOTHESES[2], HYPOTHESES[4])
     lead = Lead(wrong, np.array([0.8, 0.1]), begun.nominal.coordinates, 0.0)
-    (bad,) = step.fit_leads(Settings(), at, begun.nominal, (), [lead], 10.0)
+    (bad,) = leads.fit_leads(Settings(), at, begun.nominal, (), [lead], 10.0)
     alone = [one for one in first.candidates if len(one.hypotheses) < 2]
     stuck = replace(first, best=bad, candidates=(*alone, bad), tried=("null", bad.key))
     found, info = step.step(Settings(), asked, floor, stuck)
@@ -454,11 +454,11 @@ def test_what_may_pass_for_a_named_effect_is_fitted_in_its_place():
     at, null = floor[asked.main_horizon], begun.null.fit
     # Somehow the search has ended with another effect, and never looked at this one.
     lead = Lead((damping,), np.array([0.5]), null.coordinates, null.cost)
-    (wrong,) = step.fit_leads(Settings(), at, null, (), [lead], 0.0)
+    (wrong,) = leads.fit_leads(Settings(), at, null, (), [lead], 0.0)
     found = _with_what_passes(Settings(), asked, at, replace(begun, best=wrong))
     assert found.best.key == "coulomb(beside)@slider + coulomb@slider"
     # What may pass for nothing is left as it is.
-    (other,) = step.fit_leads(Settings(), at, null, (), [replace(lead, hypotheses=(mass,))], 0.0)
+    (other,) = leads.fit_leads(Settings(), at, null, (), [replace(lead, hypotheses=(mass,))], 0.0)
     ended = replace(begun, best=other)
     assert _with_what_passes(Settings(), asked, at, ended).best is other
 
