@@ -347,6 +347,7 @@ class Rig:
             name: getattr(segment, name)
             for name in ("target", "between", "feed", "stiffness", "damping", "limit", "emf", "sample")
         }
+        drive["emf"], _ = self.chain.stage("back_emf", values, segment.emf, None, {})
         past = jax.tree.map(lambda x: x[:before], drive)
         future = jax.tree.map(lambda x: x[before:], drive)
         # The readings as they would have been without this hypothesis' sensor errors.

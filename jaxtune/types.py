@@ -252,6 +252,7 @@ class Effect:
         "command",
         "error",
         "speed",
+        "back_emf",
         "torque",
         "transmission",
         "encoder",

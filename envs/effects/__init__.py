@@ -10,6 +10,7 @@ of their rows:
     target -command-> -error-> controller -torque-> motor -transmission-> joint -sensor-> readings
                                           friction, bristle, wrench --^
 
+    motor's constants -back_emf-> its braking
     motor ahead of its joint -encoder-> what sensors see of that
     motor -torque_reading-> recorded torque
 

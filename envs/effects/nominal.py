@@ -1,8 +1,9 @@
 """What every log leaves uncertain beside the model's own parameters; these rows are fitted, and never named as missing.
 
-A controller's damping gain is rarely known to a percent, and the inertia of a link no better than its mass. Few logs
-say how their targets went on between two rows, and a torque that was computed from a motor's current is as good as its
-constant. Discovery fits these under every hypothesis, or it would call them a delay, friction, a load or a weak motor.
+A controller's damping gain is rarely known to a percent, the constants of a servo's motor are those of a data sheet,
+and the inertia of a link is known no better than its mass. Few logs say how their targets went on between two rows, and
+a torque that was computed from a motor's current is as good as its constant. Discovery fits these under every
+hypothesis, or it would call them a delay, friction, a load or a weak motor.
 """
 
 import jax.numpy as jnp
@@ -14,6 +15,13 @@ def _damping_gain(values, speed, now, memory):
     """speed' = ratio speed, as the controller damps it; `values` hold the logarithm of the ratio."""
     del now
     return speed * jnp.exp(values["ratio"]), memory
+
+
+def _back_emf(values, braking, now, memory):
+    """braking' = ratio braking, the damping by a motor's back electromotive force; `values` hold the logarithm of the
+    ratio."""
+    del now
+    return braking * jnp.exp(values["ratio"]), memory
 
 
 def _target_between_rows(values, target, now, memory):
@@ -38,6 +46,17 @@ ROWS = (
         act=_damping_gain,
         sentence="The controller's damping gain is not the one that was set.",
         excited_by="chirps at two controller gains",
+    ),
+    Effect(
+        name="back_emf",
+        family="actuator",
+        on="joint",
+        enters="back_emf",
+        parameters=(Parameter(name="ratio", form="ratio", bounds=(-1.0, 1.0), prior=0.1),),
+        sizes=(0.05,),
+        act=_back_emf,
+        sentence="The motor's back electromotive force brakes more, or less, than its constants say.",
+        excited_by="a swing with the motor's terminals closed",
     ),
     Effect(
         name="link_inertia",

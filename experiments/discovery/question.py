@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 
 from envs import readings, segments
+from envs.axes import SERVO_RATIOS
 from envs.effects import LEARNED, LIBRARY
 from envs.following import OF_SENSORS, followed, follower, tells
 from envs.logs import Log, Run, splits, with_splits
@@ -103,7 +104,7 @@ def build_question(
     log, moved = on_read_times(with_splits(log))
     log, notes = drop_filtered(log)
     log = replace(log, runs=readings.with_noise(log.runs, without_sealed(log).runs))
-    ours = follower(without_sealed(log), spec)
+    controller, ours = log.runs[0].controller.kind, follower(without_sealed(log), spec)
     log = followed(log, ours)
     unsealed = without_sealed(log).runs
     plain = plain or Rig(spec, log.joints, rate)
@@ -122,7 +123,7 @@ def build_question(
         system=plain.system,
         values=rig.inner,
         axes=len(rig.axes),
-        **_free_or_asked(rig, signals, follows, sensed),
+        **_free_or_asked(rig, signals, controller, sensed),
         trees=rig.trees,
         axis_trees=np.array([_one_tree(rig.trees[list(axis.joints)]) for axis in rig.axes]),
         data=measured,
@@ -140,8 +141,9 @@ def build_question(
     )
 
 
-def _free_or_asked(rig: Rig, signals: Sequence[str], follows: bool, sensed: np.ndarray) -> dict[str, Any]:
+def _free_or_asked(rig: Rig, signals: Sequence[str], controller: str, sensed: np.ndarray) -> dict[str, Any]:
     """What is free under every hypothesis, and what the hypotheses and their forms are: fields of the problem."""
+    follows, constants = controller == "unknown", SERVO_RATIOS if controller == "servo" else {}
     told = {name: row for name, row in rig.effects.items() if not follows or tells(row)}
     every = hypotheses(rig.axes, rig.places, {name: row for name, row in told.items() if name in LIBRARY})
     unknowns, bounds = unknown_directions(rig.axes, rig.control_hz, signals, follows)
@@ -150,7 +152,7 @@ def _free_or_asked(rig: Rig, signals: Sequence[str], follows: bool, sensed: np.n
         "hypotheses": every,
         # An error of a torque sensor is free, and no form of friction.
         "forms": tuple(form for form in shapes if not (form.directions[:, sensed] != 0).any()),
-        "prior": np.array([axis.prior_sd if axis.effect in told else 0.0 for axis in rig.axes]),
+        "prior": np.array([constants.get(a.effect, a.prior_sd) if a.effect in told else 0.0 for a in rig.axes]),
         "unknowns": unknowns,
         "unknown_bounds": bounds,
     }

@@ -140,6 +140,13 @@ def test_a_wrong_gain_is_one_of_the_position_alone(arm, plain):
     agrees(read, rigs.in_mujoco(arm.rig, plain, stiffer))
 
 
+def test_a_motor_may_brake_more_than_its_constants_say(arm, plain):
+    drive = {"kp": 12.0, "kd": 0.0, "limit": 3.0}
+    segment = rigs.segment(arm.rig, START, steps_of(START), emf=[0.2, 0.1], **drive)
+    braked = rigs.segment(arm.rig, START, steps_of(START), emf=[0.3, 0.1], **drive)
+    agrees(arm.play(segment, back_emf={"shoulder": {"ratio": 1.5}}), rigs.in_mujoco(arm.rig, plain, braked))
+
+
 def test_a_robot_read_late_starts_where_it_is_and_not_where_it_was_read(arm, plain):
     # Reads 10 ms old: having come with 2 and -1 rad/s, it is 0.02 and -0.01 rad further than what is read.
     speed = np.array([2.0, -1.0])

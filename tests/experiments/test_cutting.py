@@ -236,6 +236,22 @@ def test_a_servos_supply_is_a_column_or_a_number(played, spec):
     np.testing.assert_allclose(problem.data["train"][problem.main_horizon].inputs.limit, 8.0, rtol=1e-6)
 
 
+def test_the_constants_of_a_servos_motor_are_free(played, spec):
+    servo = Controller(kind="servo", rate_hz=500.0, gains=SERVO | {"volts": np.array([8.0, 8.0])})
+    free = {}
+    for controller in (played.runs[0].controller, servo):
+        log = split_in_time(replace(played, runs=(replace(played.runs[0], controller=controller),)))
+        question = build_question(log, spec, null_logs=0)
+        prior = zip(question.rig.axes, question.problem.prior, strict=True)
+        free[controller.kind] = {axis.effect: sd for axis, sd in prior if sd > 0 and axis.place == "elbow"}
+    # A servo damps with its motor alone.
+    assert free["pd"].keys() - free["servo"].keys() == {"damping_gain"}
+    assert {name: free["servo"][name] for name in free["servo"].keys() - free["pd"].keys()} == {
+        "torque_scale": 0.07,
+        "back_emf": 0.1,
+    }
+
+
 def test_joints_that_nobody_reads_are_named_with_what_to_do(played, spec):
     log = split_in_time(replace(played, joints=("shoulder",)))
     with pytest.raises(ValueError, match=r"joints: got a log without elbow, .* take their <joint> out of the MJCF"):
