@@ -134,7 +134,8 @@ def other_cases(robot: Kind, tuned: Mapping[str, Entry], options: Sequence[str])
 def _different(entry: Entry) -> float:
     low, high = entry.bounds
     if entry.log:
-        return max(_OTHER, low)
+        # A multiplier that may only grow has to.
+        return max(_OTHER, low) if low < 1.0 else min(1.0 / _OTHER, high)
     return _OTHER * (high if abs(high) >= abs(low) else low)
 
 
@@ -158,6 +159,7 @@ def check(args: Args) -> tuple[Kind, dict[str, Entry], dict[str, dict[str, float
     for number in numbers:
         check_positive(episodes=number)
     tuner.knobs(level=args.level)
+    sizes.tuner.check_level(args.level)
     return robot, entries, other_cases(robot, entries, args.others), numbers
 
 
@@ -270,7 +272,7 @@ def show(reports: Mapping[int, SelfTest]) -> None:
         console.print(table)
         console.print(f"all true values in their intervals: {_rate(report.covered)}", markup=False)
         for name, sets in report.unusable.items():
-            console.print(f"{name}: {sets} sets are too short or not finite, and are not counted", markup=False)
+            console.print(f"{name}: {sets} sets are not comparable or not finite, and are not counted", markup=False)
         for place, text in selftest.whole_tunings(report).items():
             console.print(f"{place}: {text}", markup=False)
     for line in lacking(reports):

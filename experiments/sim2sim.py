@@ -113,6 +113,8 @@ def check(args: Args) -> tuple[Preset, Kind, dict[str, Entry], Case, tuner.Knobs
     knobs = tuner.knobs(
         step_size=args.step_size, widen_factor=args.widen_factor, level=args.level, threshold=args.threshold
     )
+    if args.threshold is None:
+        sizes.tuner.check_level(args.level)
     return sizes, robot, entries, case, knobs
 
 

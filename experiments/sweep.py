@@ -91,7 +91,7 @@ def check(args: Args) -> tuple[Preset, Kind, dict[str, Entry], Case]:
     Raises:
       ValueError: names the field, the value and what is allowed.
     """
-    sizes, robot = preset(args.preset), kind(args.robot)
+    sizes, robot = preset(args.preset).for_sweep(), kind(args.robot)
     entries = robot.chosen(args.parameters)
     truth = named_values("truth", args.truth, entries)
     case = checked_case(args.case, args.start, entries, engines=robot.engines, truth=truth)
@@ -99,6 +99,7 @@ def check(args: Args) -> tuple[Preset, Kind, dict[str, Entry], Case]:
     for step_size, widen_factor, radius, level in combinations:
         check_positive(radius=radius)
         tuner.knobs(step_size=step_size, widen_factor=widen_factor, level=level)
+        sizes.tuner.check_level(level)
     check_seeds(args.seeds)
     if case.target != "mjx":
         raise ValueError(f"case: got '{args.case}', expected friction or mass: a sweep needs a target in mjx")
@@ -108,7 +109,7 @@ def check(args: Args) -> tuple[Preset, Kind, dict[str, Entry], Case]:
         raise ValueError(f"step_sizes: got {len(args.step_sizes)}, expected one: the posterior update has no step size")
     if args.lanes is not None and args.lanes < 1:
         raise ValueError(f"lanes: got {args.lanes}, expected 1 or more")
-    return sizes.for_sweep(), robot, entries, case
+    return sizes, robot, entries, case
 
 
 def lanes(args: Args) -> np.ndarray:

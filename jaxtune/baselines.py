@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 
+from jaxtune import windows
 from jaxtune.gate import GateInfo, no_gate_log
 from jaxtune.readings import Collected
 from jaxtune.settings import Knobs, TunerConfig
@@ -25,10 +26,10 @@ from jaxtune.update import no_update, vote_update
 def open_gate(
     key: jax.Array, config: TunerConfig, collected: Collected, measured: Trajectory, knobs: Knobs
 ) -> GateInfo:
-    """Accepts every measured set that holds at least one living step, without comparing it with anything.
+    """Accepts every measured set that holds living steps, all of them finite, without comparing it with anything.
 
     It takes the place of `gate.calibrated_gate` in the ungated baseline. Its `GateInfo` has novelty 0 at threshold 0,
-    or novelty nan for an empty set, which the tuner reports as `not_finite`. No verification model is trained.
+    or novelty nan for any other set, which the tuner reports as `not_finite`. No verification model is trained.
 
     Args:
       key: not used.
@@ -37,8 +38,9 @@ def open_gate(
       measured: the measured set, [set_episodes, time].
       knobs: not used.
     """
-    # A set without a step must not move the centre; a novelty of nan ends the tuning as `not_finite`.
-    usable = jnp.where(measured.alive.any(), 0.0, jnp.nan)
+    # Such a set must not move the centre; a novelty of nan ends the tuning as `not_finite`.
+    finite = jnp.isfinite(windows.steps(measured)).all(axis=-1) | ~measured.alive
+    usable = jnp.where(measured.alive.any() & finite.all(), 0.0, jnp.nan)
     return GateInfo(novelty=usable, threshold=jnp.zeros(()))
 
 

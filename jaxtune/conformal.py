@@ -6,6 +6,13 @@ import jax.numpy as jnp
 ROUNDING = 1e-5
 """Less than the distance of two p-values of as many sets as anybody simulates."""
 
+IDENTIFIABLE = 0.9
+"""Largest error of a coordinate that counts as identified, as a share of the error that ignores the data. It is below 1
+because both are of a few dozen sets, and differ by chance."""
+
+EACH = 0.1
+"""Share of all misses that the box which a reading narrows to may have: what it excludes is excluded for good."""
+
 
 def p_value(scores: jax.Array) -> jax.Array:
     """The conformal p-value of the last score among all [sets + 1]; nan where it is. Other nan are left out."""
@@ -27,6 +34,7 @@ def quantile(values: jax.Array, level: jax.Array | float) -> jax.Array:
     another kind than the one more.
     """
     count = (~jnp.isnan(values)).sum(axis=0)
-    rank = jnp.ceil((count + 1) * level).astype(int) - 1
+    # A product that is a whole number must not cost a rank by its rounding.
+    rank = jnp.ceil((count + 1) * (level - ROUNDING)).astype(int) - 1
     place = jnp.maximum(jnp.minimum(rank, count - 1), 0)
     return jnp.take_along_axis(jnp.sort(values, axis=0), place[None], axis=0)[0]

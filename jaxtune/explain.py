@@ -21,8 +21,9 @@ ADVICE = {
     "effect with jaxtune.discovery. Do not trust the parameters.",
     Verdict.RADIUS_EXHAUSTED: "Check the bounds and the measured episodes. If both are right, a parameter is missing.",
     Verdict.NOT_FINITE: "Look for numbers that are not finite, and for simulated observations that never change.",
-    Verdict.NOT_COMPARABLE: "Measure episodes in which the robot moves, that differ from each other and last for a "
-    "window at least. Simulated ones must last as long; a level of 0.95 needs 19 held-out sets that do.",
+    Verdict.NOT_COMPARABLE: "Measure episodes in which the robot moves so that parameters show, that differ from each "
+    "other and last for a window at least. Simulated ones must last as long, in enough held-out sets for the level: "
+    "0.95 needs 19, and 0.99 needs 99.",
 }
 """What to do next."""
 
@@ -54,19 +55,22 @@ def weak(info) -> np.ndarray:
 def intervals(info) -> np.ndarray:
     """Computes half widths of the intervals around the new centre, where they hold.
 
-    Held-out sets calibrate them, which say nothing of values beyond the distribution that they were drawn from.
+    Held-out sets calibrate them, which say nothing of values beyond the distribution that they were drawn from. Of a
+    coordinate that is not identifiable, nothing was learnt.
 
     Args:
       info: of one tuning.
 
     Returns:
-      [coords] in coordinates, in the order of `dist.names`; nan where the interval reaches past the distribution, or
-      where the update gives none.
+      [coords] in coordinates, in the order of `dist.names`; nan where the interval reaches past the distribution, the
+      coordinate is not identifiable, or the update gives none.
     """
     step, interval = (np.asarray(value) for value in (info.update.step, info.update.interval))
     low, high = map(np.asarray, dists.normalised_box(info.dist))
     inside = (step - interval >= low) & (step + interval <= high)
-    return np.where(inside, np.asarray(dists.ravel(info.dist.radius)) * interval, np.nan)
+    return np.where(
+        inside & np.asarray(info.update.identifiable), np.asarray(dists.ravel(info.dist.radius)) * interval, np.nan
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -31,7 +31,7 @@ from jaxtune.checks import check_measured, check_set, check_states
 from jaxtune.gate import Verify, calibrated_gate
 from jaxtune.loop import Info
 from jaxtune.misfits import Misfits, Phase, misfits, share_of_episode
-from jaxtune.readings import examine
+from jaxtune.readings import cut_alike, examine
 from jaxtune.replay import Replay
 from jaxtune.settings import TunerConfig
 from jaxtune.tuner import Measure, TrainPolicy, Tuner, TunerState, keep
@@ -157,7 +157,7 @@ class HostTuner:
             check_measured(measured, collected.trajectory, self.config)
             if self.replay is not None:
                 check_states(measured, collected.held_out, self.config, self.replay.needs)
-            return *keys, collected, loop.counted(carry, collected)
+            return *keys, cut_alike(collected, measured), loop.counted(carry, collected)
 
         while carry["left"] > 0:
             key_verify, key_update, collected, carry = collect(carry)
@@ -176,7 +176,8 @@ class HostTuner:
 
     def misfits(self, key: jax.Array, state: TunerState, measured: Trajectory) -> Misfits:
         """Says which observations and actions no parameters explain, and in which phase, as `Tuner.misfits` does."""
-        return self._misfits(self._tuner.collect(key, state.policy, state.dist), measured)
+        collected = self._tuner.collect(key, state.policy, state.dist)
+        return self._misfits(cut_alike(collected, measured), measured)
 
     @cached_property
     def _tuner(self) -> Tuner:

@@ -128,7 +128,8 @@ def refine(config: TunerConfig, carry: dict, moved: ParamDist, update: UpdateInf
     """Takes an update of an accepted set, and decides whether the set is read again, in the narrower distribution.
 
     That needs no further measured episode. It ends after `TunerConfig.refinements`, where the distribution hardly
-    changed, or where the set does not fit the distribution that the update before had narrowed.
+    changed, or where the set does not fit the distribution that the update before had narrowed. That reading is taken
+    back then, and what earlier sets said is forgotten, since it may have misled.
 
     Args:
       config: sizes.
@@ -199,9 +200,10 @@ def sharpen(
       knobs: for the level that the measured set must fit at.
 
     Returns:
-      What the loop carries on; it ends. The centre is the new estimate if, on simulated sets, its errors (rms, in
-      radii) are smaller than those of the estimate before, and if the measured set fits it. Radii only narrow. The
-      verdict is `unexplained` where the set fits worse than 99 simulated ones, each fitted within the bounds.
+      What the loop carries on; it ends. The centre is the new estimate if, on simulated sets, its errors (rms over
+      coordinates that one of both identifies, in radii) are smaller than those of the estimate before, and if the
+      measured set fits it. Coordinates that it does not identify stay. Radii only narrow. The verdict is `unexplained`
+      where the set fits worse than 99 simulated ones, each fitted within the bounds.
     """
     dist, tested, before = carry["dist"], carry["tested"], carry["update"]
     held_out = collected.held_out, collected.held_out_coords
@@ -210,18 +212,24 @@ def sharpen(
     found = replays.estimate(config.replay, replay, *held_out, measured, dist, config.coverage, *last, pool)
     radius, unit = dists.ravel(dist.radius), dists.ravel(tested.radius)
     errors = found.errors * jnp.outer(radius / unit, radius / unit)
+    # What no estimate tells errs by as much in both, and would drown the others.
+    identifiable = before.identifiable | found.identifiable
+    left, was = (jnp.where(identifiable, jnp.diag(one), 0.0).sum() for one in (errors, before.errors))
     # An update that gives no errors gives no reason to keep its estimate.
-    closer = jnp.isnan(before.errors).any() | (jnp.trace(errors) < jnp.trace(before.errors))
+    closer = jnp.isnan(before.errors).any() | (left < was)
     # What the estimate before errs by is what earlier sets err by, if it is joined with them; these misled.
     closer |= _contradicts(found)
     fits = ~conformal.rejects(found.p_value, knobs.level)
     known = (found.estimate, found.interval, errors, found.p_value)
     taken = closer & fits & jnp.stack([jnp.isfinite(values).all() for values in known]).all()
-    moved = dists.narrow(dists.move(dist, found.estimate), found.interval, config.min_radius)
+    step, narrower = (
+        jnp.where(found.identifiable, *both) for both in ((found.estimate, 0.0), (found.wide, jnp.ones_like(radius)))
+    )
+    moved = dists.narrow(dists.move(dist, step), narrower, config.min_radius)
     update = before.replace(
         step=(dists.ravel(moved.centre) - dists.ravel(tested.centre)) / unit,
         interval=found.interval * radius / unit,
-        identifiable=before.identifiable | (found.interval < 1.0),
+        identifiable=identifiable,
         errors=errors,
         replayed=jnp.asarray(True),
         pooled=found.pooled,

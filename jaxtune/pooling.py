@@ -23,8 +23,8 @@ robot, if they err as `past` does: past + (1 - C) (truth - past) + a draw of C (
 than the box does, that is its middle with its errors, and where they said all it is the truth.
 
 A set may contradict the earlier ones: the robot was repaired, or an early set misled. Then they count no longer. The
-conformal p-value of (unshrunk - past)' (C + R)^-1 (unshrunk - past) tells, at 1 %; of fewer than 99 simulated sets, the
-smallest p-value where it is also beyond the 0.99-quantile of chi-square.
+conformal p-value of (unshrunk - past)' (C + R)^-1 (unshrunk - past) tells, at 1 % or, of fewer than 99 simulated sets,
+by the smallest p-value, if it is also beyond the 0.99-quantile of chi-square.
 """
 
 import chex

@@ -52,6 +52,30 @@ class Reading:
     beyond: jax.Array  # [sets + 1] likewise
 
 
+def cut_alike(collected: Collected, measured: Trajectory) -> Collected:
+    """Hides of simulated episodes what is not known of measured ones, so that all sets are treated alike.
+
+    An episode that was cut short without a fall, as by a hole in a log, says nothing of the rest of its time. Motion
+    differs from the start of an episode to its end, so simulated episodes may not have that rest either. Episode i of
+    each set goes without what measured episode i lacks, and so does every `set_episodes`-th episode of D_q.
+
+    Args:
+      collected: whole simulated episodes.
+      measured: the measured set, [set_episodes, time].
+    """
+    known = measured.alive | (measured.fell | measured.not_finite)[:, None]
+
+    def cut(episodes, known):
+        # What ends an episode in a hidden step is hidden as well.
+        within = ~(episodes.alive & ~known).any(axis=-1)
+        return episodes.replace(
+            alive=episodes.alive & known, fell=episodes.fell & within, not_finite=episodes.not_finite & within
+        )
+
+    like = jnp.arange(len(collected.trajectory.alive)) % len(known)
+    return collected.replace(trajectory=cut(collected.trajectory, known[like]), held_out=cut(collected.held_out, known))
+
+
 def examine(config: TunerConfig, collected: Collected, measured: Trajectory) -> Reading:
     """Estimates all sets by regression, and computes how well they fit."""
     model, ways = fit(config, collected)

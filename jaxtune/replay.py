@@ -85,6 +85,8 @@ class Replayed:
 
     estimate: jax.Array  # [coords]
     interval: jax.Array  # [coords] half widths, in which all true coordinates lie together
+    wide: jax.Array  # [coords] likewise, a tenth as often not
+    identifiable: jax.Array  # [coords] whether simulated sets are estimated better than by what they were drawn from
     errors: jax.Array  # [coords, coords] mean product of the errors of simulated sets
     p_value: jax.Array  # (1 + #{simulated sets that misfit at least as much}) / (sets + 1)
     pooled: jax.Array  # whether earlier sets count in the estimate (`jaxtune.pooling`)
@@ -139,7 +141,9 @@ def estimate(
     Each set is fitted by itself, from the centre of the distribution. With Q the conformal quantile over simulated
     sets and e the standard errors of a fit, joined with the median error of the other simulated sets,
 
-        interval = e(measured) Q(max over coordinates of |estimate - truth| / e).
+        interval     = e(measured) Q(max over coordinates of |estimate - truth| / e)
+        wide         = the same with a quantile of 1 - (1 - coverage) / 10
+        identifiable = rms of estimate - truth < 0.9 rms of truth.
 
     Simulated sets are fitted until one fits as badly as the measured one, `ReplayConfig.sets` or one more at a time.
 
@@ -178,9 +182,17 @@ def estimate(
     deviations = jnp.hypot(deviations, jnp.maximum(_medians(jnp.abs(error)), _CLOSEST))
     scaled = (jnp.abs(error) / deviations[:-1]).max(axis=-1)
     off = jnp.nan_to_num(error)
+    interval, wide = (
+        deviations[-1] * conformal.quantile(scaled, level)
+        for level in (coverage, 1.0 - conformal.EACH * (1.0 - coverage))
+    )
+    # A coordinate that shows nowhere stays where the fit began, at zero.
+    ignorant = jnp.where(known[:-1, None], truth**2, 0.0).sum(axis=0)
     return Replayed(
         estimate=jnp.where(known[-1], best[-1], jnp.nan),
-        interval=deviations[-1] * conformal.quantile(scaled, coverage),
+        interval=interval,
+        wide=wide,
+        identifiable=(off**2).sum(axis=0) < conformal.IDENTIFIABLE**2 * ignorant,
         errors=off.T @ off / known[:-1].sum(),
         p_value=conformal.p_value(left),
         pooled=pooled,
@@ -306,13 +318,15 @@ def _cut(config: ReplayConfig, replay: Replay, episodes: Trajectory) -> _Pieces:
     states = lambda where: jax.tree.map(lambda leaf: devices.merged(leaf[:, where]), episodes.state)  # noqa: E731
     # The state after a fall may be anything, so the step of the end must be alive too.
     alive = devices.merged(episodes.alive[:, within].all(axis=-1) & episodes.alive[:, starts + config.window])
+    start, action, end = states(starts), devices.merged(episodes.action[:, within]), states(starts + config.window)
+    end = jax.vmap(replay.read)(end)
+    # A camera may lose a robot that stands.
+    rows = [leaf.reshape(len(alive), -1) for leaf in (*jax.tree.leaves(start), action, end)]
+    valid = alive & jnp.stack([jnp.isfinite(row).all(axis=-1) for row in rows]).all(axis=0)
     # What is simulated in the place of others does not matter, but a simulator may not bear what it never was.
-    instead = jnp.where(alive, jnp.arange(len(alive)), jnp.argmax(alive))
+    instead = jnp.where(valid, jnp.arange(len(valid)), jnp.argmax(valid))
     return _Pieces(
-        start=jax.tree.map(lambda leaf: leaf[instead], states(starts)),
-        action=devices.merged(episodes.action[:, within]),
-        end=jax.vmap(replay.read)(states(starts + config.window)),
-        valid=alive,
+        start=jax.tree.map(lambda leaf: leaf[instead], start), action=action[instead], end=end[instead], valid=valid
     )
 
 

@@ -6,6 +6,7 @@ import chex
 import jax
 import jax.numpy as jnp
 
+from jaxtune.conformal import ROUNDING
 from jaxtune.dvm import DVMConfig
 from jaxtune.regression import RegressionConfig
 from jaxtune.replay import ReplayConfig
@@ -63,6 +64,18 @@ class TunerConfig:
             raise ValueError(f"coverage: got {self.coverage}, expected a number between 0 and 1")
         if not self.min_radius > 0:
             raise ValueError(f"min_radius: got {self.min_radius}, expected a positive number")
+
+    def check_level(self, level: float) -> None:
+        """Checks that so many held-out sets can tell a quantile: at 0.95 that takes 19.
+
+        Raises:
+          ValueError: they cannot.
+        """
+        most = self.held_out_sets / (self.held_out_sets + 1)
+        if level > most + ROUNDING:
+            raise ValueError(
+                f"level: got {level:g}, expected {most:.3g} or less with {self.held_out_sets} simulated sets"
+            )
 
     @property
     def may_be_unexplained(self) -> bool:

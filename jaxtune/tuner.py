@@ -90,7 +90,7 @@ from jaxtune.gate import GateInfo, Verify, calibrated_gate
 from jaxtune.loop import Info
 from jaxtune.misfits import Misfits, Phase, misfits, share_of_episode
 from jaxtune.pooling import Past
-from jaxtune.readings import Collected, examine
+from jaxtune.readings import Collected, cut_alike, examine
 from jaxtune.replay import Replay
 from jaxtune.settings import Knobs, TunerConfig, knobs
 from jaxtune.types import Coords, ParamDist, Trajectory, Verdict
@@ -238,9 +238,10 @@ class Tuner:
             # Every round simulates new robots and trains its models anew, because the distribution has changed.
             key_collect, key_verify, key_update = jax.random.split(jax.random.fold_in(key, carry["rounds"]), 3)
             collected = self.collect(key_collect, state.policy, carry["dist"])
+            carry, last = loop.counted(carry, collected), carry["left"] <= 0
+            collected = cut_alike(collected, measured)
             # Once for gate and update; left out of the program where neither reads it.
             collected = collected.replace(reading=examine(self.config, collected, measured), past=carry["past"])
-            carry, last = loop.counted(carry, collected), carry["left"] <= 0
             # Branches, so that (unless vmapped) no model is trained that is not needed.
             carry = jax.lax.cond(
                 carry["verdict"] == Verdict.WIDEN,
@@ -307,4 +308,5 @@ class Tuner:
 
         It simulates anew, in the state's distribution.
         """
-        return misfits(self.config, self.collect(key, state.policy, state.dist), measured, self.phase)
+        collected = cut_alike(self.collect(key, state.policy, state.dist), measured)
+        return misfits(self.config, collected, measured, self.phase)

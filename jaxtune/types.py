@@ -111,8 +111,8 @@ class Verdict(enum.IntEnum):
     NOT_FINITE = 4
     """No score could be computed: a number was not finite, or no simulated observation ever changed."""
     NOT_COMPARABLE = 5
-    """There is too little to compare: no measured episode holds a whole window or moves, all are copies of one, or too
-    few simulated sets have a window."""
+    """There is too little to compare: no measured episode holds a whole window or moves, two are copies, simulated ones
+    show no coordinate, or too few simulated sets have a window."""
 
 
 Scale = Literal[

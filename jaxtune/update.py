@@ -28,10 +28,7 @@ from jaxtune.readings import LEAST_ERROR, Collected, excess, misses, reading_of
 from jaxtune.settings import Knobs, TunerConfig
 from jaxtune.types import ParamDist, Trajectory
 
-# An interval counts as informative if it is narrower than this share of the interval that ignores the data. The share
-# is below 1 because both are quantiles over a few dozen sets and differ by chance.
-_IDENTIFIABLE = 0.9
-_EACH, _MOST = 0.1, 5  # share of all misses that one reading's box may have, and readings that are allowed for
+_MOST = 5  # readings of one set that are allowed for
 
 
 @chex.dataclass(frozen=True)
@@ -209,7 +206,7 @@ def _calibrate(
     missed = 1.0 - config.coverage
     interval, wide = (
         scale * conformal.quantile((error / scale).max(axis=-1), 1.0 - share * missed)
-        for share in (1.0 - _EACH * min(config.refinements, _MOST), _EACH)
+        for share in (1.0 - conformal.EACH * min(config.refinements, _MOST), conformal.EACH)
     )
     sure, unsure = (conformal.quantile(values, config.coverage) for values in (error, ignorant))
-    return interval, wide, sure < _IDENTIFIABLE * unsure
+    return interval, wide, sure < conformal.IDENTIFIABLE * unsure

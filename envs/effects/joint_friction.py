@@ -54,7 +54,8 @@ ROWS = (
             Parameter(name="nm_s_per_rad", scale="damping", bounds=(-0.5, 5.0), prior=0.3, fields=("dof_damping",)),
         ),
         sizes=(0.03,),
-        forms=(Form("quadratic", "learned_torque", ("square_nm_s2_per_rad2",)),),
+        # Where the model has damping, what is free under every hypothesis takes all that grows with speed itself.
+        forms=(Form("quadratic", "learned_torque", ("square_nm_s2_per_rad2",), screened=True),),
         differs=True,
         sentence="The joint loses a torque in proportion to its speed.",
         excited_by="a motor-off swing, or chirps at two amplitudes",

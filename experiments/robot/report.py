@@ -19,8 +19,8 @@ VERDICTS = {
     "radius_exhausted": "The simulator does not cover what was measured, and its distribution cannot grow any wider.",
     "not_finite": "Nothing could be compared: a value is not finite.",
     "not_comparable": "There is too little to compare: walks, measured or simulated, were shorter than a window of 50 "
-    "steps, the robot did not move, its walks are copies of each other, or too few simulated sets are usable: a level "
-    "of 0.95 needs 19.",
+    "steps, the robot did not move or showed no parameter, two of its walks are copies, or too few simulated sets are "
+    "usable: a level of 0.95 needs 19.",
     None: "This method does not check whether the simulator covers what was measured.",
 }
 """What each verdict of the gate means; None stands for a method without a gate."""
@@ -32,8 +32,9 @@ ADVICE = {
     "radius_exhausted": "Check the bounds of the parameters and the log. If both are right, suspend the robot and run "
     "experiments.discover.",
     "not_finite": "Look for the value that is not finite: experiments.doctor names its signal.",
-    "not_comparable": "Start from a policy that stands longer: one that was trained in a wider distribution "
-    "(--method dr), or with the robot held by a rope.",
+    "not_comparable": "Look at the log: does the robot walk in each of its walks, and is none there twice? If it falls "
+    "at once, start from a policy that stands longer: one that was trained in a wider distribution (--method dr), or "
+    "with the robot held by a rope.",
     None: "Use --method ours if you want to know.",
 }
 """What to do next, by verdict."""

@@ -42,7 +42,8 @@ class Evidence:
     relief: float
     """Fall of what the prior says against the other coordinates: without the effect they imitate it."""
     interval: tuple[float, float]
-    """95 % interval of the coordinate that is clearest of zero."""
+    """95 % interval of the coordinate that is clearest of zero, of the effect or of its forms: where damping is free
+    under every hypothesis, friction with the square of speed is what may be missing."""
     inside: bool
     """True if all coordinates are inside their bounds; of sizes for each place, the one that is clearest of zero."""
     horizons: int
@@ -94,15 +95,13 @@ def weigh_evidence(
     ablated = or_known(ablate(at, candidate, hypothesis), fitted)
     now, before = squares(at, candidate), squares(at, ablated)
     held_out = len(problem.data["train"][at.horizon].run)
-    own = candidate.fit.along(hypothesis)
-    unit = units_of(problem, at, now)[:held_out]
-    errors = standard_errors(candidate.fit, unit)[own]
-    values, (low, high) = candidate.fit.coordinates[own], hypothesis.bounds.T
-    # A parameter without a probe of its own means nothing alone.
-    distance = np.where((hypothesis.probes != 0).any(axis=0), np.abs(values) / errors, 0.0)
-    clearest = int(distance.argmax())
+    fit, parts = candidate.fit, (hypothesis, *candidate.forms_of(hypothesis))
+    errors = standard_errors(fit, units_of(problem, at, now)[:held_out])
+    clear = [_clearest(fit, errors, part) for part in parts]
+    (_, clearest, _, _), (_, _, value, error) = clear[0], max(clear)
+    values, (low, high) = fit.coordinates[fit.along(hypothesis)], hypothesis.bounds.T
     inside = (low < values) & (values < high)
-    relief = ablated.fit.penalty - candidate.fit.penalty
+    relief = ablated.fit.penalty - fit.penalty
     mean_squares = [finite(one) / at.counts.bins for one in (before, now)]
     falls = [_largest_fall(*(measure(one) for one in mean_squares)) for measure in measures(at)]
     falls += _falls_of_runs(*mean_squares, runs_of(problem, at), at.counts.usual(mean_squares[1]))
@@ -113,10 +112,7 @@ def weigh_evidence(
         floors=floors,
         left=left,
         relief=relief,
-        interval=(
-            float(values[clearest] - 1.96 * errors[clearest]),
-            float(values[clearest] + 1.96 * errors[clearest]),
-        ),
+        interval=(value - 1.96 * error, value + 1.96 * error),
         # Of several places one may have nothing of it, or less than nothing.
         inside=bool(inside[clearest] if hypothesis.each else inside.all()),
         horizons=_horizons_better(floor, candidate.fit, ablated.fit),
@@ -175,6 +171,18 @@ def or_known(candidate: Candidate, fitted: Mapping[str, Candidate]) -> Candidate
     """
     known = fitted.get(candidate.key)
     return known if known and known.fit.cost <= candidate.fit.cost else candidate
+
+
+def _clearest(fit: Fit, errors: np.ndarray, part: Hypothesis) -> tuple[float, int, float, float]:
+    """The coordinate of an effect or form that is clearest of zero: by how many errors, its number, it and its error.
+
+    A parameter without a probe of its own means nothing alone.
+    """
+    along = fit.along(part)
+    values, errors = fit.coordinates[along], errors[along]
+    distance = np.where((part.probes != 0).any(axis=0), np.abs(values) / errors, 0.0)
+    number = int(distance.argmax())
+    return float(distance[number]), number, float(values[number]), float(errors[number])
 
 
 def _in_smallest(values: np.ndarray, probes: np.ndarray) -> float:

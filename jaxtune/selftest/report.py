@@ -81,7 +81,7 @@ class SelfTest:
     tuned: dict[str, tuple[Tuned, ...]]
     """Whole tunings in their order, by case; empty where none was run."""
     unusable: dict[str, int]
-    """Sets that were too short or not finite, by case, where there are any. No rate counts them."""
+    """Sets that were not comparable or not finite, by case, where there are any. No rate counts them."""
 
 
 def summary(report: SelfTest) -> str:
@@ -98,7 +98,7 @@ def summary(report: SelfTest) -> str:
         lines.append(f"{name}: {told}; rejected one radius outside: {percent(rate)}, or then inside: {held}")
     lines += [f"{name}: rejected: {percent(rate)}" for name, rate in report.others.items()]
     lines += [f"{place}: {text}" for place, text in whole_tunings(report).items()]
-    lines += [f"{name}: {count} sets are too short or not finite" for name, count in report.unusable.items()]
+    lines += [f"{name}: {count} sets are not comparable or not finite" for name, count in report.unusable.items()]
     return "\n".join(lines)
 
 

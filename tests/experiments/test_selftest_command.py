@@ -110,7 +110,7 @@ def test_tables_say_what_was_counted(monkeypatch):
     assert "all true values in their intervals: 0.90" in text
     assert "tuning 1, inside the distribution: 3 accept, truth in the distribution: 3 of 3" in text
     assert "in its intervals: 2 of 3" in text
-    assert "torque_scale=0.75: 3 sets are too short or not finite, and are not counted" in text
+    assert "torque_scale=0.75: 3 sets are not comparable or not finite, and are not counted" in text
 
 
 def test_the_plot_has_a_row_for_every_case(tmp_path):

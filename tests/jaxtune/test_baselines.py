@@ -70,6 +70,11 @@ def test_open_gate_needs_a_step_to_read(spm):
     assert gate.novelty <= gate.threshold
     empty = measured.replace(alive=jnp.zeros_like(measured.alive))
     assert np.isnan(baselines.open_gate(None, toys.TINY, None, empty, knobs()).novelty)
+    # A number that is not finite would move the centre to nowhere; after an end it is not read.
+    broken = measured.replace(obs=measured.obs.at[0, 40, 0].set(jnp.nan))
+    assert np.isnan(baselines.open_gate(None, toys.TINY, None, broken, knobs()).novelty)
+    ended = broken.replace(alive=broken.alive.at[0, 40:].set(False))
+    assert baselines.open_gate(None, toys.TINY, None, ended, knobs()).novelty == 0.0
 
 
 def test_untuned_trains_and_leaves_the_distribution_alone(tuner):

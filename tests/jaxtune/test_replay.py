@@ -13,6 +13,7 @@ from jaxtune import mjx, pooling, replay, tuner
 from jaxtune.replay import ReplayConfig
 from jaxtune.tuner import Tuner, TunerConfig
 from jaxtune.types import Verdict
+from jaxtune.update import no_update
 
 EPISODES, SETS = 3, 19
 NAMES = ("friction", "mass")
@@ -146,7 +147,33 @@ def test_pieces_that_break_do_not_spoil_the_others(dist):
     broken = measured(EXACT, friction=0.1, mass=0.1)
     # Of one step alone: the piece that begins there cannot be simulated.
     broken = broken.replace(state={"slider": broken.state["slider"].at[0, 10].set(jnp.inf)})
-    np.testing.assert_allclose(0.2 * estimate(EXACT, dist, broken).estimate, [0.1, 0.1], atol=2e-3)
+    found = estimate(EXACT, dist, broken)
+    np.testing.assert_allclose(0.2 * found.estimate, [0.1, 0.1], atol=2e-4)
+    # A camera that lost the robot once is no physics that is missing.
+    assert found.p_value == 1.0
+
+
+def test_a_coordinate_that_shows_nowhere_stays_where_it_is(dist):
+    idle = toys.uniform(dict.fromkeys(("friction", "idle", "mass"), 0.0), radius=0.2)
+    found = estimate(EXACT, idle, measured(EXACT, friction=0.13, mass=-0.18, idle=0.05))
+    np.testing.assert_array_equal(found.identifiable, [True, False, True])
+    assert (found.wide >= found.interval).all()
+
+    def some(key, config, collected, measured, dist, knobs):
+        # An update that errs as much in it, and more in the others.
+        off = jnp.diag(jnp.array([1e-3, 0.2, 1e-3]))
+        info = no_update(dist).replace(identifiable=jnp.array([True, False, True]), errors=off)
+        return dist, info
+
+    one = machine(EXACT, verify=accept, update=some)
+    state, tune = one.init(toys.policy(), idle, tuner.knobs()), jax.jit(one.tune)
+    for seed in range(3):
+        after, info = tune(jax.random.key(seed), state, measured(EXACT, seed=seed, friction=0.1, mass=-0.15, idle=0.1))
+        assert info.update.replayed
+        np.testing.assert_allclose(dists.ravel(after.dist.centre), [0.1, 0.0, -0.15], atol=1e-3)
+        np.testing.assert_allclose(after.dist.radius["idle"], 0.2, rtol=1e-6)
+        assert after.dist.radius["mass"] < 0.05
+        np.testing.assert_array_equal(info.update.identifiable, [True, False, True])
 
 
 def test_a_simulated_set_without_a_piece_counts_as_a_bad_fit(dist):

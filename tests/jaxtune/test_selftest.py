@@ -182,7 +182,7 @@ def test_sets_that_tell_nothing_are_counted_apart():
     assert found.others["falls"].of == 0
     assert np.isnan(found.others["falls"].share)
     assert found.alarms.of == found.others["push"].of == ROBOTS
-    assert f"falls: {ROBOTS} sets are too short or not finite" in selftest.summary(found)
+    assert f"falls: {ROBOTS} sets are not comparable or not finite" in selftest.summary(found)
 
 
 def test_gates_that_differ_count_for_fewer_robots():

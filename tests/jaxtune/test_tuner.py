@@ -602,6 +602,77 @@ def test_a_set_that_shows_nothing_is_not_comparable(gate, spoil):
     assert not gate(spoil(sets)).comparable.any()
 
 
+def test_an_episode_that_is_there_twice_leaves_nothing_to_compare():
+    config = dataclasses.replace(toys.TINY, set_episodes=3)
+    collected = toys.collect(jax.random.key(0), toys.uniform(TWO, 0.2), config)
+    twice = lambda episodes: jax.tree.map(lambda leaf: leaf[jnp.array([0, 1, 1])], episodes)  # noqa: E731
+    measured = SLIDER.measure(TWO, 3)(jax.random.key(1), toys.policy())
+    assert tiny_gate(config, collected, measured, knobs()).comparable
+    assert not tiny_gate(config, collected, twice(measured), knobs()).comparable
+    # Episodes that end at once are all alike.
+    ended = measured.replace(alive=measured.alive.at[1:].set(False), obs=measured.obs.at[1:].set(0.0))
+    assert tiny_gate(config, collected, ended, knobs()).comparable
+    # Nor is it strange where simulated robots repeat themselves.
+    alike = collected.replace(held_out=jax.vmap(twice)(collected.held_out))
+    assert tiny_gate(config, alike, twice(measured), knobs()).comparable
+
+
+def test_episodes_that_show_no_coordinate_are_accepted_only_where_earlier_sets_told():
+    # As those of a robot at rest, whose readings are noise and a clock.
+    config = dataclasses.replace(toys.TINY, episodes=160)
+    collected = toys.collect(jax.random.key(0), toys.uniform(TWO, 0.2), config)
+    mixed = {name: jax.random.permutation(jax.random.key(3), v) for name, v in collected.sampled_coords.items()}
+    blind = collected.replace(sampled_coords=mixed)
+    told = blind.replace(past=pooling.nothing(blind.dist).replace(tunings=jnp.int32(1)))
+    measured = SLIDER.measure(TWO, 2)(jax.random.key(1), toys.policy())
+    far = SLIDER.measure({name: value + 1.0 for name, value in TWO.items()}, 2)(jax.random.key(1), toys.policy())
+    gate = lambda collected, measured: tiny_gate(config, collected, measured, knobs())  # noqa: E731
+    assert gate(collected, measured).comparable
+    assert not gate(blind, measured).comparable
+    assert gate(told, measured).comparable
+    # A robot that the simulation does not cover is rejected.
+    score = gate(blind, far)
+    assert score.comparable
+    assert score.novelty > score.threshold
+
+
+def test_simulated_episodes_lack_what_measured_ones_lack():
+    collected = toys.collect(jax.random.key(0), toys.uniform(TWO, 0.2), dataclasses.replace(toys.TINY, set_episodes=3))
+    held_out = collected.held_out
+    # One simulated robot falls before the hole in the log, another one after it.
+    falls = jnp.full(held_out.alive.shape[:2], 60).at[0, 1].set(20).at[1, 1].set(50)
+    alive = jnp.arange(60) < falls[..., None]
+    collected = collected.replace(held_out=held_out.replace(alive=alive, fell=falls < 60))
+    whole = SLIDER.measure(TWO, 3)(jax.random.key(1), toys.policy())
+    same = readings.cut_alike(collected, whole)
+    jax.tree.map(np.testing.assert_array_equal, same, collected)
+    # The second episode was cut short, and the third robot fell.
+    short = whole.replace(
+        alive=whole.alive.at[1, 40:].set(False).at[2, 30:].set(False), fell=jnp.array([False, False, True])
+    )
+    cut = readings.cut_alike(collected, short)
+    np.testing.assert_array_equal(cut.held_out.alive[2].sum(axis=-1), [60, 40, 60])
+    np.testing.assert_array_equal(cut.held_out.alive[:2, 1].sum(axis=-1), [20, 40])
+    np.testing.assert_array_equal(cut.held_out.fell[:2, 1], [True, False])
+    np.testing.assert_array_equal(cut.trajectory.alive.sum(axis=-1), [60, 40, 60, 60, 40, 60, 60, 40])
+
+
+def test_a_set_that_a_hole_cuts_short_is_as_usual_as_a_whole_one():
+    # The slider's tones repeat after seconds, so the end of an episode is not like its beginning.
+    config = dataclasses.replace(toys.TUNER, held_out_sets=19, refinements=0)
+    machine = Tuner(config=config, train_policy=tuners.keep, simulate=SLIDER.simulate, verify=baselines.open_gate)
+    state = machine.init(toys.policy(), toys.uniform(TWO, 0.2), knobs())
+    sets = stacked(dists.sample(jax.random.key(5), state.dist, SETS), seed=6)
+    cut = sets.replace(alive=sets.alive.at[:, 0, 51:].set(False))
+    tune = jax.jit(
+        lambda keys, sets: jax.lax.map(lambda pair: machine.tune(pair[0], state, pair[1])[1].update, (keys, sets))
+    )
+    found = tune(jax.random.split(jax.random.key(7), SETS), cut)
+    # 0.05 expected of each.
+    assert np.mean(found.p_value <= 0.0501) <= 0.25
+    assert np.mean(found.p_misfit <= 0.0501) <= 0.25
+
+
 @pytest.mark.parametrize(("usable", "comparable"), [(19, True), (18, False)], ids=str)
 def test_a_level_needs_so_many_simulated_sets_with_a_window(usable, comparable):
     config = dataclasses.replace(toys.TINY, held_out_sets=25)
