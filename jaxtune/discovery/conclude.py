@@ -163,16 +163,15 @@ def _where_it_shows(problem: Problem, at: Floor, state: State) -> State:
 def _with_what_passes(settings: Settings, problem: Problem, at: Floor, state: State) -> State:
     """Adds models in which something else is in the place of an effect of the best one that may pass for it.
 
-    The search may have come to that model by taking effects away, and never have looked there.
+    The search may have come to that model by taking effects away, and never have looked there, or from too far off.
     """
-    known, found = {one.key for one in state.candidates}, []
+    found = []
     for effect in state.best.effects:
         mine = {one.key for one in (effect, *state.best.forms_of(effect))}
         others = [one for one in state.best.hypotheses if one.key not in mine]
         point = state.best.fit.coordinates[state.best.fit.along(effect)]
         lead = Lead((effect,), point, state.null.fit.coordinates, state.null.fit.cost)
         leads = taken_for(lead, beside(problem.forms, others), beside(problem.hypotheses, others))
-        leads = [one for one in leads if key_of((*others, *one.hypotheses)) not in known]
         if leads:
             base = ablate(at, state.best, effect)
             (fit,) = polish([base.fit], at.residuals["train"], 0)

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from jaxtune.discovery.candidate import Candidate, of_further_sizes
+from jaxtune.discovery.candidate import Candidate, key_of, of_further_sizes
 from jaxtune.discovery.curves import on_segments, spread_segments
 from jaxtune.discovery.fit import Fit, begin, polish, refine, taken_over
 from jaxtune.discovery.noise_floor import Floor
@@ -73,7 +73,9 @@ def shaped(forms: Sequence[Hypothesis], free: Sequence[Hypothesis], leads: Seque
 def taken_for(lead: Lead, forms: Sequence[Hypothesis], free: Sequence[Hypothesis]) -> list[Lead]:
     """Lists what may pass for the one effect of a lead (`jaxtune.types.Form.like`), at the same places.
 
-    A load beside a link's centre looks like a shift of that centre, and a load at the centre like neither.
+    A load beside a link's centre looks like a shift of that centre, and a load at the centre like neither. A shift
+    tells the product of load and distance, and not which is large: each size of the load is tried with the distance at
+    which it shifts the centre as far.
 
     Args:
       lead: with one effect.
@@ -82,11 +84,11 @@ def taken_for(lead: Lead, forms: Sequence[Hypothesis], free: Sequence[Hypothesis
     """
     (effect,), found = lead.hypotheses, []
     for form in (form for form in forms if (form.like, form.places) == (effect.name, effect.places)):
-        # In the direction of what it passes for, and of the size that is tried.
-        point = form.probes.max() * lead.point / max(np.abs(lead.point).max(), 1e-9)
         for host in (h for h in free if form.shapes(h)):
-            size = host.probes[len(host.probes) // 2]
-            found.append(Lead((host, form), np.concatenate([size, point]), lead.start, lead.cost))
+            starts = [
+                np.concatenate([size, lead.point * (1.0 + 1.0 / size.max())]) for size in host.probes if size.max() > 0
+            ]
+            found += [Lead((host, form), start, lead.start, lead.cost) for start in starts]
     return found
 
 
@@ -144,6 +146,8 @@ def fit_leads(
     groups, points, starts = zip(*((lead.hypotheses, lead.point, lead.start) for lead in leads), strict=True)
     fits = refine(begin(some, groups, points, starts, evaluate), evaluate, settings.rounds)
     order = [index for index in np.argsort([fit.cost for fit in fits]) if np.isfinite(fits[index].cost)]
+    # Of several starts of one model the best stays.
+    order = [*{key_of(groups[index]): index for index in reversed(order)}.values()]
     if not order:
         return []
     whole = _on_all(at, [fits[index] for index in order])

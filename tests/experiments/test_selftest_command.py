@@ -39,6 +39,15 @@ def test_a_row_for_all_overlaps_every_row_of_its_field():
     assert selftest.other_cases(robot, {"masses": every}, ()).keys() < selftest.other_cases(robot, {}, ()).keys()
 
 
+def test_a_multiplier_that_may_only_grow_is_another_one_above():
+    entry = BITENO.entries["foot_friction"]
+    assert entry.log
+    assert selftest._different(replace(entry, bounds=(0.2, 5.0))) == 0.75
+    assert selftest._different(replace(entry, bounds=(0.9, 5.0))) == 0.9
+    assert selftest._different(replace(entry, bounds=(1.0, 2.0))) == pytest.approx(4 / 3)
+    assert selftest._different(replace(entry, bounds=(1.0, 1.1))) == 1.1
+
+
 def test_other_cases_may_be_given_and_a_pattern_stands_for_tuned_parameters():
     cases = selftest.other_cases(BITENO, LEGS, ("*_thigh_mass=2,foot_friction=0.5", "torque_scale=0.9"))
     assert cases == {
@@ -71,6 +80,7 @@ def test_a_case_that_cannot_be_is_named(option, message):
         ({"states": True}, "states: got true, expected whole robots"),
         ({"episodes": (5, 0)}, "episodes: got 0"),
         ({"level": 1.5}, "level: got 1.5"),
+        ({"level": 0.999}, "level: got 0.999, expected 0.99 or less with 99 simulated sets"),
         ({"radius": 0.0}, "radius: got 0.0"),
     ],
     ids=str,

@@ -36,6 +36,7 @@ from experiments.walking.robots import BITENO
         ("widen_factor", 0.9, "0.9"),
         ("step_size", -1.0, "-1.0"),
         ("level", 1.5, "1.5"),
+        ("level", 0.995, "0.99 or less with 99 simulated sets"),
     ],
 )
 def test_bad_input_is_named(field, value, named, monkeypatch):

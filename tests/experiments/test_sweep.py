@@ -29,6 +29,7 @@ def test_a_folder_in_which_another_process_works_is_refused(tmp_path, monkeypatc
     [
         ({"step_sizes": (0.5, 0.0)}, "step_size: got 0.0"),
         ({"levels": (1.5,)}, "level: got 1.5"),
+        ({"levels": (0.95, 0.99)}, "level: got 0.99, expected 0.95 or less with 19 simulated sets"),
         ({"seeds": ()}, "seeds: got none"),
         ({"seeds": (1, 1)}, "seeds: got 1 among 2"),
         ({"update": "leap"}, "update: got 'leap', expected one of posterior, vote"),

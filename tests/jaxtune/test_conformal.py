@@ -27,6 +27,14 @@ def test_a_quantile_is_exceeded_as_rarely_as_it_says():
     assert both[0] == 18 and jnp.isnan(both[1])
 
 
+@pytest.mark.parametrize("sets", [19, 39, 99, 199])
+def test_no_level_costs_a_rank_by_rounding(sets):
+    for per_cent in range(1, 100):
+        rank = -((sets + 1) * -per_cent // 100) - 1
+        got = conformal.quantile(jnp.arange(sets), jnp.float32(per_cent / 100))
+        assert got == min(max(rank, 0), sets - 1), per_cent
+
+
 def test_a_p_value_counts_what_is_at_least_as_large():
     assert conformal.p_value(jnp.array([3.0, 1.0, 2.0, 2.0])) == 0.75
     assert np.isnan(conformal.p_value(jnp.array([3.0, jnp.nan])))

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from slider import HYPOTHESES, problem
+from slider import HYPOTHESES, WARPED, problem
 
 from jaxtune.discovery import noise_floor, state, step
 from jaxtune.discovery.belief import believed, posterior, rivals
@@ -59,6 +59,24 @@ def test_a_size_is_seen_in_the_smallest_of_interest(stepped):
     assert _in_smallest(
         np.array([0.3, -1.0, 9.0]), np.array([[0.1, 0, 0], [-0.3, 0, 0], [0, 0.5, 0]])
     ) == pytest.approx(3.0)
+
+
+def test_an_effect_that_is_free_anyway_may_be_clear_of_zero_in_its_form():
+    damping = HYPOTHESES[1]
+    form = replace(WARPED, name="damping")
+    asked = problem({"cubic": 8.0}, forms=(form,))
+    floor, begun = state.begin(asked, noise_floor.measure(asked, lambda text: None))
+    at = floor[asked.main_horizon]
+    evaluate = at.residuals["train"]
+    start = [begun.nominal.coordinates]
+    fits = begin(begun.nominal, [(damping, form)], [np.array([0.1, 1.0])], start, evaluate)
+    (fit,) = polish(fits, evaluate, 6)
+    candidate = Candidate((damping, form), fit, at.residuals["select"](fit.vector[None])[0])
+    evidence, ablated = weigh_evidence(asked, floor, candidate, damping, {})
+    assert ablated.hypotheses == ()
+    assert evidence.gain > 100.0
+    assert evidence.interval[0] > 0.0
+    assert evidence.interval[0] < 8.0 < evidence.interval[1]
 
 
 def test_a_fit_that_was_not_finished_is_no_evidence(stepped):
