@@ -754,6 +754,7 @@ def test_a_parameter_that_the_episodes_do_not_show_is_said_so(play):
     info = play(0.5)[2]
     info = info.replace(update=info.update.replace(identifiable=jnp.array([True, False])))
     assert "mass: 0.000, not identifiable from these episodes" in tuners.explain(info)
+    np.testing.assert_array_equal(np.isnan(explain.intervals(info)), [False, True])
 
 
 def test_keep_leaves_the_policy():
