@@ -146,8 +146,6 @@ def fit_leads(
     groups, points, starts = zip(*((lead.hypotheses, lead.point, lead.start) for lead in leads), strict=True)
     fits = refine(begin(some, groups, points, starts, evaluate), evaluate, settings.rounds)
     order = [index for index in np.argsort([fit.cost for fit in fits]) if np.isfinite(fits[index].cost)]
-    # Of several starts of one model the best stays.
-    order = [*{key_of(groups[index]): index for index in reversed(order)}.values()]
     if not order:
         return []
     whole = _on_all(at, [fits[index] for index in order])
@@ -162,10 +160,12 @@ def fit_leads(
     ):
         every[number] = fit
     select = at.residuals["select"](np.stack([fit.vector for fit in every]))
-    return [
+    found = [
         Candidate((*present, *groups[order[index]]), fit, residual)
         for (index, _), fit, residual in zip(whole, every, select, strict=True)
     ]
+    # Of several starts of one model the best stays.
+    return [*{one.key: one for one in sorted(found, key=lambda one: one.fit.cost, reverse=True)}.values()][::-1]
 
 
 def _finalists(
@@ -173,7 +173,8 @@ def _finalists(
 ) -> list[int]:
     """Picks the fits that get fresh slopes, of those that gain enough: the best single effects and half as many pairs.
 
-    Pairs have a list of their own, since a pair costs less than its better half for want of rounds alone.
+    Pairs have a list of their own, since a pair costs less than its better half for want of rounds alone. Starts of one
+    model count once: a few rounds do not tell which of them ends lowest.
 
     Args:
       settings: how many.
@@ -186,9 +187,12 @@ def _finalists(
     """
     near = [index for index, cost in enumerate(costs) if before - cost >= _REACH * (before - costs[0])]
     effects = [sum(not hypothesis.form for hypothesis in groups[index]) for index in near]
-    single = [index for index, count in zip(near, effects, strict=True) if count < 2][: settings.finalists]
-    pairs = [index for index, count in zip(near, effects, strict=True) if count >= 2][: settings.finalists // 2]
-    return [*single, *pairs]
+    chosen = []
+    for alone, most in ((True, settings.finalists), (False, settings.finalists // 2)):
+        mine = [index for index, count in zip(near, effects, strict=True) if (count < 2) == alone]
+        best = [*dict.fromkeys(key_of(groups[index]) for index in mine)][:most]
+        chosen += [index for index in mine if key_of(groups[index]) in best]
+    return chosen
 
 
 def _on_all(at: Floor, fits: Sequence[Fit]) -> list[tuple[int, Fit]]:
