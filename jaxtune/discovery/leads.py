@@ -74,8 +74,8 @@ def taken_for(lead: Lead, forms: Sequence[Hypothesis], free: Sequence[Hypothesis
     """Lists what may pass for the one effect of a lead (`jaxtune.types.Form.like`), at the same places.
 
     A load beside a link's centre looks like a shift of that centre, and a load at the centre like neither. A shift
-    tells the product of load and distance, and not which is large: each size of the load is tried with the distance at
-    which it shifts the centre as far.
+    tells the product of load and distance, and not which is large: loads are tried from small to large, each at the
+    distance at which it shifts the centre as far.
 
     Args:
       lead: with one effect.
@@ -85,10 +85,16 @@ def taken_for(lead: Lead, forms: Sequence[Hypothesis], free: Sequence[Hypothesis
     (effect,), found = lead.hypotheses, []
     for form in (form for form in forms if (form.like, form.places) == (effect.name, effect.places)):
         for host in (h for h in free if form.shapes(h)):
+            sizes = host.probes[host.probes.max(axis=1) > 0]
+            # Each a third of the next: from farther off a fit may not come.
             starts = [
-                np.concatenate([size, lead.point * (1.0 + 1.0 / size.max())]) for size in host.probes if size.max() > 0
+                (size, lead.point * (1.0 + 1.0 / size.max())) for size in (*sizes, *np.sqrt(sizes[:-1] * sizes[1:]))
             ]
-            found += [Lead((host, form), start, lead.start, lead.cost) for start in starts]
+            # What a screen saw may be any shift in that direction.
+            starts.append(
+                (sizes[len(sizes) // 2], form.probes.max() * lead.point / max(np.abs(lead.point).max(), 1e-9))
+            )
+            found += [Lead((host, form), np.concatenate(start), lead.start, lead.cost) for start in starts]
     return found
 
 
