@@ -222,9 +222,8 @@ def sharpen(
     fits = ~conformal.rejects(found.p_value, knobs.level)
     known = (found.estimate, found.interval, errors, found.p_value)
     taken = closer & fits & jnp.stack([jnp.isfinite(values).all() for values in known]).all()
-    step, narrower = (
-        jnp.where(found.identifiable, *both) for both in ((found.estimate, 0.0), (found.wide, jnp.ones_like(radius)))
-    )
+    step = jnp.where(found.identifiable, found.estimate, 0.0)
+    narrower = jnp.where(found.identifiable, found.wide, 1.0)
     moved = dists.narrow(dists.move(dist, step), narrower, config.min_radius)
     update = before.replace(
         step=(dists.ravel(moved.centre) - dists.ravel(tested.centre)) / unit,

@@ -14,10 +14,10 @@ from jaxtune.types import Effect, Form, Parameter
 _ACTUATOR = {"family": "actuator", "on": "joint"}
 
 
-def _torque_scale(values, torque, now, memory):
-    """torque' = ratio torque; `values` hold the logarithm of the ratio."""
+def scaled(values, signal, now, memory):
+    """signal' = ratio signal; `values` hold the logarithm of the ratio."""
     del now
-    return torque * jnp.exp(values["ratio"]), memory
+    return signal * jnp.exp(values["ratio"]), memory
 
 
 def _torque_limit(values, torque, now, memory):
@@ -88,12 +88,6 @@ def _deadband(values, error, now, memory):
     return jnp.sign(error) * jnp.maximum(jnp.abs(error) - 0.5 * values["rad"], 0.0), memory
 
 
-def _gain_error(values, error, now, memory):
-    """error' = ratio error, which scales the proportional gain alone; `values` hold the logarithm of the ratio."""
-    del now
-    return error * jnp.exp(values["ratio"]), memory
-
-
 def _torque_lag(values, torque, now, memory):
     """seconds d torque' / dt = torque - torque'."""
     return lagged(memory, torque, values["seconds"], now.dt)
@@ -132,7 +126,8 @@ ROWS = (
         enters="error",
         parameters=(Parameter(name="ratio", form="ratio", bounds=(-1.0, 1.0), prior=0.3),),
         sizes=(0.05,),
-        act=_gain_error,
+        # Of the error, which scales the proportional gain alone.
+        act=scaled,
         sentence="The controller's proportional gain is not the one that was set.",
         excited_by="postures of low and of high gravity torque at two controller gains",
         **_ACTUATOR,
@@ -188,7 +183,7 @@ ROWS = (
         enters="torque",
         parameters=(Parameter(name="ratio", form="ratio", bounds=(-1.0, 1.0), prior=0.3),),
         sizes=(0.05,),
-        act=_torque_scale,
+        act=scaled,
         sentence="The motor gives a fixed share of the commanded torque.",
         excited_by="a motor-off swing beside driven motion, which distinguishes torque from mass",
         **_ACTUATOR,

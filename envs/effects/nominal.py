@@ -6,33 +6,13 @@ a torque that was computed from a motor's current is as good as its constant. Di
 hypothesis, or it would call them a delay, friction, a load or a weak motor.
 """
 
-import jax.numpy as jnp
-
+from envs.effects.actuator import scaled
 from jaxtune.types import Effect, Parameter
-
-
-def _damping_gain(values, speed, now, memory):
-    """speed' = ratio speed, as the controller damps it; `values` hold the logarithm of the ratio."""
-    del now
-    return speed * jnp.exp(values["ratio"]), memory
-
-
-def _back_emf(values, braking, now, memory):
-    """braking' = ratio braking, the damping by a motor's back electromotive force; `values` hold the logarithm of the
-    ratio."""
-    del now
-    return braking * jnp.exp(values["ratio"]), memory
 
 
 def _target_between_rows(values, target, now, memory):
     """target' = target + share (linear - held): targets that move on in a straight line to the next row."""
     return target + values["share"] * now.between, memory
-
-
-def _torque_reading(values, torque, now, memory):
-    """read = ratio torque; `values` hold the logarithm of the ratio."""
-    del now
-    return torque * jnp.exp(values["ratio"]), memory
 
 
 ROWS = (
@@ -43,7 +23,7 @@ ROWS = (
         enters="speed",
         parameters=(Parameter(name="ratio", form="ratio", bounds=(-1.0, 1.0), prior=0.05),),
         sizes=(0.05,),
-        act=_damping_gain,
+        act=scaled,
         sentence="The controller's damping gain is not the one that was set.",
         excited_by="chirps at two controller gains",
     ),
@@ -54,7 +34,7 @@ ROWS = (
         enters="back_emf",
         parameters=(Parameter(name="ratio", form="ratio", bounds=(-1.0, 1.0), prior=0.1),),
         sizes=(0.05,),
-        act=_back_emf,
+        act=scaled,
         sentence="The motor's back electromotive force brakes more, or less, than its constants say.",
         excited_by="a swing with the motor's terminals closed",
     ),
@@ -86,7 +66,7 @@ ROWS = (
         enters="torque_reading",
         parameters=(Parameter(name="ratio", form="ratio", bounds=(-1.0, 1.0), prior=0.2),),
         sizes=(0.05,),
-        act=_torque_reading,
+        act=scaled,
         sentence="The recorded torque is a multiple of the motor's.",
         excited_by="slow motion through postures of known gravity torque",
     ),

@@ -50,6 +50,15 @@ def of_further_sizes(hypotheses: Sequence[Hypothesis], price: float) -> float:
     return price * sum(hypothesis.further for hypothesis in hypotheses)
 
 
+def cheapest_of_each(candidates: Sequence[Candidate]) -> tuple[Candidate, ...]:
+    """Of fitted models with the same effects the one that costs less on `train`, in the order in which they came."""
+    found = {}
+    for one in candidates:
+        if one.key not in found or one.fit.cost < found[one.key].fit.cost:
+            found[one.key] = one
+    return tuple(found.values())
+
+
 def key_of(hypotheses: Sequence[Hypothesis]) -> str:
     """The key of a model with these effects."""
     return " + ".join(sorted(hypothesis.key for hypothesis in hypotheses)) or "null"

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from jaxtune.discovery.candidate import Candidate, key_of, of_further_sizes
+from jaxtune.discovery.candidate import Candidate, cheapest_of_each, key_of, of_further_sizes
 from jaxtune.discovery.curves import on_segments, spread_segments
 from jaxtune.discovery.fit import Fit, begin, polish, refine, taken_over
 from jaxtune.discovery.noise_floor import Floor
@@ -86,7 +86,7 @@ def taken_for(lead: Lead, forms: Sequence[Hypothesis], free: Sequence[Hypothesis
     for form in (form for form in forms if (form.like, form.places) == (effect.name, effect.places)):
         for host in (h for h in free if form.shapes(h)):
             sizes = host.probes[host.probes.max(axis=1) > 0]
-            # Each a third of the next: from farther off a fit may not come.
+            # Sizes in between too: from farther off a fit may not come.
             starts = [
                 (size, lead.point * (1.0 + 1.0 / size.max())) for size in (*sizes, *np.sqrt(sizes[:-1] * sizes[1:]))
             ]
@@ -171,7 +171,7 @@ def fit_leads(
         for (index, _), fit, residual in zip(whole, every, select, strict=True)
     ]
     # Of several starts of one model the best stays.
-    return [*{one.key: one for one in sorted(found, key=lambda one: one.fit.cost, reverse=True)}.values()][::-1]
+    return [*cheapest_of_each(found)]
 
 
 def _finalists(

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxtune.discovery.candidate import Candidate
+from jaxtune.discovery.candidate import Candidate, cheapest_of_each
 from jaxtune.discovery.curves import Library
 from jaxtune.discovery.fit import Fit, Free, refine
 from jaxtune.discovery.noise_floor import NoiseFloor, with_systematic_share
@@ -67,11 +67,7 @@ class State:
 
     def with_candidates(self, fitted: Sequence[Candidate]) -> "State":
         """Adds fitted models; of two with the same effects the one that costs less stays."""
-        found = {one.key: one for one in self.candidates}
-        for one in fitted:
-            if one.key not in found or one.fit.cost < found[one.key].fit.cost:
-                found[one.key] = one
-        return replace(self, candidates=tuple(found.values()))
+        return replace(self, candidates=cheapest_of_each((*self.candidates, *fitted)))
 
     def with_seen(self, settings: Settings, problem: Problem, testable: frozenset[str], chances: np.ndarray) -> "State":
         """Settles what holds for all steps: what these logs cannot show, and what chance gains (`screen.seen`)."""
