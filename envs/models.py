@@ -210,6 +210,11 @@ def suspended(spec: mujoco.MjSpec, joints: Sequence[str] | None = None) -> mujoc
     return model
 
 
+def hinges(model: mujoco.MjModel, joints: Sequence[str]) -> np.ndarray:
+    """Tells hinges (in rad) from slides (in m), [joints]."""
+    return np.array([model.joint(name).type[0] == mujoco.mjtJoint.mjJNT_HINGE for name in joints])
+
+
 def links(model: mujoco.MjModel) -> np.ndarray:
     """Numbers of the bodies of a suspended robot that effects may have as places.
 

@@ -6,10 +6,10 @@ coordinate of one is a large effect for all of them, on a servo as on a biped.
 
 from collections.abc import Sequence
 
-import mujoco
 import numpy as np
 
 from envs.logs import Run
+from envs.models import hinges
 from envs.regimes import control_torque
 from envs.rig import Rig
 from envs.segments import smoothed
@@ -65,7 +65,7 @@ def measure_scales(rig: Rig, runs: Sequence[Run]) -> dict[str, np.ndarray]:
     mass, inertia = rig.inertias(mean_pose)
     moves = inertia * _rms(rise)
     torque = np.where(_rms(torque) > _DRIVEN * moves, _rms(torque), moves)
-    turns = np.array([rig.mj_model.joint(name).type[0] == mujoco.mjtJoint.mjJNT_HINGE for name in rig.joints])
+    turns = hinges(rig.mj_model, rig.joints)
     angle = np.where(turns, 1.0, _PINION_M)
     wound = _WOUND * angle
     pace = _rms(speed)

@@ -1,9 +1,10 @@
 """The log doctor: finds errors of a log itself, before discovery or the tuner learn from it.
 
-`columns` looks at names, `structure` at time stamps and rows, `contacts` at the model's geometry. `physics` tries
-repairs: two joints swapped back, a sign flipped, degrees converted to radians, an offset or a delay removed. A repair
-is believed if the log then agrees much better with itself and with the model. Disagreement is the sum over joints of up
-to five parts, in units of the signals' own size. Each goes from 0 (agreement) to 2, that of the targets to 1:
+`columns` looks at names, `structure` at time stamps and rows, `stuck` at signals that do not move with the others,
+`contacts` at the model's geometry. `physics` tries repairs: two joints swapped back, a sign flipped, degrees converted
+to radians, an offset or a delay removed. A repair is believed if the log then agrees much better with itself and with
+the model. Disagreement is the sum over joints of up to five parts, in units of the signals' own size. Each goes from 0
+(agreement) to 2, that of the targets to 1:
 
 - measured velocities against the slopes of measured positions;
 - the controller's torque against the model's inverse dynamics of the measured motion (on a fixed base only);
@@ -26,8 +27,9 @@ from envs.diagnosis.contacts import contacts
 from envs.diagnosis.finding import Finding
 from envs.diagnosis.physics import physics
 from envs.diagnosis.structure import structure
+from envs.diagnosis.stuck import stuck, wrapped
 from envs.logs import Log, Run
-from envs.models import suspended
+from envs.models import hinges, suspended
 
 __all__ = ["Finding", "diagnose", "diagnose_log", "shared_findings"]
 
@@ -97,8 +99,9 @@ def diagnose(run: Run, joints: tuple[str, ...], model: mujoco.MjModel, base: str
     Returns:
       Findings of names and structure first, then of physics and of clipping; an empty list where nothing is suspected.
     """
+    turned, run = wrapped(run, joints, hinges(model, joints))
     found, clean = structure(run)
-    found = misspelt(run, joints) + found
+    found = misspelt(run, joints) + found + turned + stuck(run, joints)
     cut_off = clipped(run, joints)
     if len(clean.time) < _LEAST_ROWS:
         text = (

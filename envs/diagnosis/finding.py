@@ -12,6 +12,10 @@ MISLEADING = (
     "radians twice",
     "millimetres",
     "millinewtonmetres",
+    "scale",
+    "motors off",
+    "frozen",
+    "wrapped",
     "missing rows",
     "clock jump",
     "misspelt column",
@@ -21,7 +25,16 @@ MISLEADING = (
 rate, short gaps, repeated rows, quantisation, clipping, drift, a delay, an offset) limit what can be learnt, or are
 effects."""
 
-_WRONG = ("swapped joints", "flipped sign", "degrees", "radians twice", "millimetres", "millinewtonmetres")
+_WRONG = (
+    "swapped joints",
+    "flipped sign",
+    "degrees",
+    "radians twice",
+    "millimetres",
+    "millinewtonmetres",
+    "scale",
+    "motors off",
+)
 
 
 @dataclass(frozen=True)

@@ -3,17 +3,18 @@
 Drift and quantisation are looked for in the repaired run, because an encoder would look coarse in degrees.
 """
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
-from functools import partial, reduce
-from itertools import combinations
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import reduce
 
 import mujoco
 import numpy as np
 
 from envs.diagnosis.disagreement import Disagreement, relative_difference
-from envs.diagnosis.finding import MEASURED, Finding
+from envs.diagnosis.finding import Finding
+from envs.diagnosis.repairs import Repair, possible_repairs
 from envs.logs import Run
+from envs.models import hinges
 from envs.readings import quantum_of
 
 # A repair is believed if the disagreement falls by more than both of these.
@@ -26,25 +27,9 @@ _KEPT_ROWS = 1500  # of a long run; more take time and change nothing
 _ANGLES = ("degrees", "radians twice", "millimetres")
 _UNITS = (*_ANGLES, "millinewtonmetres")
 _LEAST_UNITS = 1.0  # by which a change of units must lower `Disagreement.magnitudes` to be tried with another repair
-_DELAYS_S = (0.004, 0.008, 0.012, 0.016, 0.024, 0.032, 0.045)
-_LONGEST_DELAY = 0.25  # of the rows, so that most of them remain
-_LEAST_OFFSET_RAD = 0.025
-_LEAST_DRIFT = 0.015
+_DRIFT = (0.015, 0.5)  # of a clock; with more, velocities have another unit
 _MOVES = 0.02  # of the largest motion, in rad or m, below which a joint counts as still
 _COARSE = 0.004  # largest step of an encoder, as a share of the joint's range of motion
-
-
-@dataclass(frozen=True)
-class _Repair:
-    """One repair to be tried: what it would mean, and the function that applies it."""
-
-    kind: str
-    signal: str
-    joints: tuple[int, ...]
-    size: float
-    apply: Callable[[Run], Run]
-    places: tuple[int, ...] = ()
-    """Joints that a change of units changes, also where it is of all hinges and names none."""
 
 
 def physics(run: Run, joints: tuple[str, ...], model: mujoco.MjModel, held: bool) -> list[Finding]:
@@ -64,10 +49,10 @@ def physics(run: Run, joints: tuple[str, ...], model: mujoco.MjModel, held: bool
         return _coarse(run, joints) if (np.ptp(run.signals["q"], axis=0) > _LEAST_MOTION[0]).any() else []
     # With coarse encoders accelerations are mostly rounding errors, so the inverse dynamics are not compared.
     disagreement = Disagreement(run, joints, model, held and not _is_coarse(run))
-    turns = np.array([model.joint(name).type[0] == mujoco.mjtJoint.mjJNT_HINGE for name in joints])
+    turns = hinges(model, joints)
     now = disagreement(run)
     for _ in range(_MOST_REPAIRS):
-        repairs = _repairs(run, disagreement, turns)
+        repairs = possible_repairs(run, disagreement, turns)
         chain, repaired, then = _best([[repair] for repair in repairs], run, disagreement)
         if chain[0].kind in _UNITS or not _believed(now, then):
             # Nothing agrees in wrong units, so a second error shows only once the units are repaired: try both at once.
@@ -86,16 +71,16 @@ def physics(run: Run, joints: tuple[str, ...], model: mujoco.MjModel, held: bool
     return [*found, *_drift(run, disagreement), *_coarse(run, joints)]
 
 
-def _summed(repairs: list[_Repair]) -> list[_Repair]:
+def _summed(repairs: list[Repair]) -> list[Repair]:
     """Makes one delay of those of one signal, which are taken back in steps."""
-    total: dict[tuple, _Repair] = {}
+    total: dict[tuple, Repair] = {}
     for number, one in enumerate(repairs):
         key = (one.kind, one.signal) if one.kind == "late" else (number,)
         total[key] = replace(one, size=one.size + (total[key].size if key in total else 0.0))
     return list(total.values())
 
 
-def _best(chains: list[list[_Repair]], run: Run, disagreement: Disagreement) -> tuple[list[_Repair], Run, float]:
+def _best(chains: list[list[Repair]], run: Run, disagreement: Disagreement) -> tuple[list[Repair], Run, float]:
     """Returns the chain of repairs after which a run disagrees least, the repaired run, and its disagreement."""
     found, before = [], disagreement.by_joint(run)
     for chain in chains:
@@ -123,103 +108,6 @@ def _thinned(run: Run) -> Run:
     return replace(run, time=run.time[rows], signals={name: values[rows] for name, values in run.signals.items()})
 
 
-def _repairs(run: Run, disagreement: Disagreement, turns: np.ndarray) -> list[_Repair]:
-    """Lists every repair to be tried; `turns` [joints] tells hinges from slides."""
-    count = run.signals["q"].shape[1]
-    # An error may be in one signal, in all signals of sensors (a mistake in the driver), or in targets as well.
-    measured = tuple(name for name in MEASURED if name in run.signals)
-    groups = {"measured": measured} | {name: (name,) for name in (*MEASURED, "target") if name in run.signals}
-    groups["all"] = tuple(dict.fromkeys([*measured, *(["target"] if "target" in run.signals else [])]))
-    found = []
-    # Groups may be of the same signals; the first name is kept.
-    for label, names in {names: (label, names) for label, names in reversed(groups.items())}.values():
-        for pair in combinations(range(count), 2):
-            order = np.arange(count)
-            order[list(pair)] = pair[::-1]
-            found.append(_Repair("swapped joints", label, pair, 0.0, _on(names, lambda v, order=order: v[:, order])))
-        for joint in range(count):
-            sign = np.where(np.arange(count) == joint, -1.0, 1.0)
-            found.append(_Repair("flipped sign", label, (joint,), -1.0, _on(names, lambda v, sign=sign: v * sign)))
-        # Torques are not angles, so a group is converted without them.
-        angles = tuple(name for name in names if name != "tau")
-        found += _positions(label, angles, turns) if angles else []
-    if "tau" in run.signals:
-        found.append(_Repair("millinewtonmetres", "tau", (), 1e-3, _on(("tau",), lambda v: v * 1e-3)))
-    return found + _delays(run, measured, disagreement) + _offsets(run, disagreement)
-
-
-def _positions(label: str, names: tuple[str, ...], turns: np.ndarray) -> list[_Repair]:
-    """Repairs of the units of positions: of all hinges or all slides, and of one joint alone."""
-    found = []
-    for kind, factor, own in (
-        ("degrees", np.pi / 180.0, turns),
-        ("radians twice", 180.0 / np.pi, turns),
-        ("millimetres", 1e-3, ~turns),
-    ):
-        places = tuple(np.flatnonzero(own))
-        alone = [(joint,) for joint in places] if len(places) > 1 and kind != "radians twice" else []
-        for joints in filter(None, (places, *alone)):
-            factors = np.where(np.isin(np.arange(len(turns)), joints), factor, 1.0)
-            # `units` in meta.yaml is about all hinges, so these are not named.
-            named = () if len(joints) == turns.sum() and kind != "millimetres" else joints
-            found.append(
-                _Repair(kind, label, named, factor, _on(names, lambda v, factors=factors: v * factors), joints)
-            )
-    return found
-
-
-def _on(names: tuple[str, ...], change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Run], Run]:
-    """Returns a function that changes some signals of a run."""
-    return lambda run: replace(run, signals={**run.signals, **{name: change(run.signals[name]) for name in names}})
-
-
-def _delays(run: Run, measured: tuple[str, ...], disagreement: Disagreement) -> list[_Repair]:
-    """Repairs of a delay: all measured signals taken earlier, or velocities alone."""
-    period, found = float(np.median(np.diff(run.time))), []
-    # Only the inverse dynamics distinguish a delay from the time that a joint takes to follow its target; behind coarse
-    # encoders and without torques they are not compared.
-    told_apart = "dynamics" in disagreement.parts(run) and not _is_coarse(run)
-    groups = {"dq": ("dq",)} | ({"measured": measured} if told_apart else {})
-    for label, names in groups.items():
-        for delay in _DELAYS_S if "target" in run.signals and set(names) <= set(measured) else ():
-            rows = round(delay / period)
-            if 0 < rows <= _LONGEST_DELAY * len(run.time):
-                found.append(_Repair("late", label, (), rows * period, partial(_earlier, names, rows)))
-    return found
-
-
-def _earlier(names: tuple[str, ...], rows: int, run: Run) -> Run:
-    """Takes some signals of a run some rows earlier."""
-    signals = {name: values[rows:] if name in names else values[:-rows] for name, values in run.signals.items()}
-    return replace(run, time=run.time[:-rows], signals=signals)
-
-
-def _offsets(run: Run, disagreement: Disagreement) -> list[_Repair]:
-    """Repairs of a constant offset of positions.
-
-    An offset shows as a constant difference of the controller's torque from what the model needs, kp times the offset.
-    """
-    commanded = disagreement.commanded(run)
-    if commanded is None or not disagreement.dynamics:
-        return []
-    needed, rows = disagreement.needed(run)
-    # A torque at its limit, at a stop or of motors that are off says nothing of the offset.
-    free = disagreement.free(run)[rows] & (np.abs(commanded[rows]) < 0.98 * run.controller.gains["torque_limit_nm"])
-    on = run.signals.get("enabled", np.ones(len(run.time)))[rows, None] > 0
-    lacks = np.where(free & on, commanded[rows] - needed, np.nan)
-    found = []
-    for joint, (column, gain) in enumerate(zip(lacks.T, run.controller.gains["kp"], strict=True)):
-        # A passive joint has no gain.
-        if np.isnan(column).all() or not gain:
-            continue
-        # The median, because friction adds to the difference with both signs.
-        offset = float(np.nanmedian(column)) / gain
-        if abs(offset) >= _LEAST_OFFSET_RAD:
-            shift = np.where(np.arange(len(run.signals["q"][0])) == joint, offset, 0.0)
-            found.append(_Repair("offset", "q", (joint,), -offset, _on(("q",), lambda v, shift=shift: v + shift)))
-    return found
-
-
 def _drift(run: Run, disagreement: Disagreement) -> list[Finding]:
     """Finds a clock that runs fast or slow: velocities and slopes of positions differ by one factor at all joints."""
     moving = _moving(run)
@@ -230,7 +118,8 @@ def _drift(run: Run, disagreement: Disagreement) -> list[Finding]:
     ratio = (speed * slope).sum(axis=0) / np.maximum((slope**2).sum(axis=0), 1e-12)
     drift = float(np.median(ratio) - 1.0)
     apart = [relative_difference(speed, slope * factor).mean() for factor in (1.0, np.median(ratio))]
-    if abs(drift) < _LEAST_DRIFT or np.ptp(ratio) > 0.5 * abs(drift) or apart[1] > 0.6 * apart[0]:
+    least, most = _DRIFT
+    if not least <= abs(drift) <= most or np.ptp(ratio) > 0.5 * abs(drift) or apart[1] > 0.6 * apart[0]:
         return []
     pace = "fast" if drift > 0 else "slow"
     text = f"the clock drifts: it is {abs(drift):.1%} too {pace}, by velocities against positions"
@@ -267,14 +156,20 @@ _SENTENCES: Mapping[str, str] = {
     "radians twice": "{signal}: angles are 57 times too small; they were converted to radians twice",
     "millimetres": "{signal}: {joints} in mm, expected m; divide the columns by 1000",
     "millinewtonmetres": "{signal}: torques are in mNm; set `units: {{torque: mNm}}` in meta.yaml",
+    "scale": "{signal}: {joints} would agree with the rest of the log if multiplied by {factors}; check the unit, and "
+    "whether it was measured before a gear",
+    "gains": "controller: kp of {joints} would agree with the motion and the model if multiplied by {factors}",
+    "motors off": "enabled: is 0 in all rows, but joints follow their targets; correct the column",
     "late": "{signal}: an apparent delay of {size:.0f} ms",
     "offset": "{signal}: {joints} has a constant offset of {size:+.3f} rad",
 }
 
 
-def _as_finding(repair: _Repair, joints: tuple[str, ...]) -> Finding:
+def _as_finding(repair: Repair, joints: tuple[str, ...]) -> Finding:
     names = tuple(joints[joint] for joint in repair.joints)
     size = 1e3 * repair.size if repair.kind == "late" else repair.size
     kind = "degrees of one" if repair.kind == "degrees" and names else repair.kind
-    sentence = _SENTENCES[kind].format(signal=repair.signal, joints=" and ".join(names), size=size)
+    factors = ", ".join(dict.fromkeys(f"{factor:.2g}" for factor in repair.factors))
+    which = "all joints" if repair.factors and len(names) == len(joints) > 2 else " and ".join(names)
+    sentence = _SENTENCES[kind].format(signal=repair.signal, joints=which, size=size, factors=factors)
     return Finding(repair.kind, repair.signal, names, size, sentence)

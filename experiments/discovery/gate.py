@@ -92,6 +92,10 @@ def _check_length(log: Log, longest_s: float) -> None:
 
 def _check_driven(log: Log) -> None:
     """Refuses joints whose torque nobody knows: targets without gains."""
+    if log.runs[0].controller.kind == "unknown" and not any(
+        np.ptp(run.signals["tau"], axis=0).any() for run in log.runs
+    ):
+        raise ValueError("tau: got constant torques, expected measured ones: nothing else says what the motors did")
     silent = np.ones(len(log.joints), bool)
     goes = np.zeros(len(log.joints), bool)
     for run in log.runs:

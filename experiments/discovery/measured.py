@@ -13,6 +13,7 @@ import numpy as np
 from envs import models, readings, segments
 from envs.clock import evened, retimed
 from envs.diagnosis.structure import pieces
+from envs.diagnosis.stuck import stuck
 from envs.held import held_joints, unread_joints
 from envs.logs import Log, Run, read_any, splits, with_halves_swapped, with_splits
 from experiments.discovery.cutting import row_rate, split_in_time
@@ -180,8 +181,8 @@ def without_sealed(log: Log) -> Log:
     return replace(log, runs=(*parts["train"], *parts["select"]))
 
 
-def drop_filtered(log: Log) -> tuple[Log, tuple[str, ...]]:
-    """Leaves out signals that were filtered, because their lag would be mistaken for a sensor's.
+def drop_useless(log: Log) -> tuple[Log, tuple[str, ...]]:
+    """Leaves out signals that were filtered, because their lag would be mistaken for a sensor's, or never written.
 
     A signal counts as filtered if the log says so. Velocities are left out too if those of a joint lag the derivative
     of its position by more than 1 ms, or are as much ahead of it: states are estimated from signals that agree.
@@ -196,6 +197,12 @@ def drop_filtered(log: Log) -> tuple[Log, tuple[str, ...]]:
     """
     log, notes = _drop_declared(log)
     # Sealed runs are left out here too: nothing may be decided by them.
+    constant = {
+        one.signal for run in without_sealed(log).runs for one in stuck(run, log.joints) if one.kind == "constant"
+    }
+    for name in sorted(constant):
+        notes.append(f"{name} is constant while its joints move, and is not used")
+        log = _without(log, name)
     if runs := [run for run in without_sealed(log).runs if "dq" in run.signals]:
         apart = segments.lateness(runs)
         worst = int(np.abs(apart).argmax())

@@ -21,7 +21,7 @@ from experiments.discovery.cutting import BIN_S, cut_log, fitting_horizons, told
 from experiments.discovery.hypotheses import forms, hypotheses, learned_torque, unknown_directions
 from experiments.discovery.measured import (
     check_simulatable,
-    drop_filtered,
+    drop_useless,
     on_read_times,
     stale_notes,
     without_sealed,
@@ -102,7 +102,7 @@ def build_question(
     horizons = fitting_horizons(log, horizons)
     rate = check_simulatable(log, spec, horizons)
     log, moved = on_read_times(with_splits(log))
-    log, notes = drop_filtered(log)
+    log, notes = drop_useless(log)
     log = replace(log, runs=readings.with_noise(log.runs, without_sealed(log).runs))
     controller, ours = log.runs[0].controller.kind, follower(without_sealed(log), spec)
     log = followed(log, ours)

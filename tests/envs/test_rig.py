@@ -251,7 +251,7 @@ def test_a_segment_begins_as_the_effect_has_left_the_robot(arm, name, value, mos
     ("name", "value"), [("sensor_lag", {"seconds": 0.008, "velocity_faster": 1.0}), ("velocity_lag", {"seconds": 0.02})]
 )
 def test_a_segment_begins_right_where_one_signal_alone_is_filtered(arm, name, value):
-    # Velocities that do not agree with positions are not used (`experiments.discovery.measured.drop_filtered`).
+    # Velocities that do not agree with positions are not used (`experiments.discovery.measured.drop_useless`).
     effect = {name: dict.fromkeys(rigs.ARM_JOINTS, value)}
     cut = recut(arm, np.repeat(SWING[::5], 5, axis=0), signals=("q",), **effect)
     error, without = (np.sqrt((one**2).mean()) for one in (errors(arm, cut, **effect), errors(arm, cut)))

@@ -19,7 +19,7 @@ from experiments.discovery.blind_drive import Truth
 from experiments.discovery.blind_robots import OUTSIDE, record
 from experiments.discovery.excitation import excitation
 from experiments.discovery.hypotheses import forms, hypotheses, place_sets, unknown_directions
-from experiments.discovery.measured import drop_filtered, read_logs
+from experiments.discovery.measured import drop_useless, read_logs
 from experiments.discovery.question import build_question
 from jaxtune.discovery.problem import Problem, are_distinct
 
@@ -117,14 +117,14 @@ def test_readings_are_rounded_and_noisy(spec, motions):
     ("signal", "said"), [("dq", "dq lags q by 20 ms at elbow"), ("q", "dq is ahead of q by 10 ms at elbow")]
 )
 def test_a_velocity_that_lags_or_leads_is_left_out_and_said_so(plain, signal, said):
-    assert drop_filtered(plain)[1] == ()
+    assert drop_useless(plain)[1] == ()
     # At one joint alone.
     runs, seconds = [], np.array([0.0, 0.02 if signal == "dq" else 0.01])
     for run in plain.runs:
         columns = zip(seconds, run.signals[signal].T, strict=True)
         late = np.stack([np.interp(run.time - behind, run.time, column) for behind, column in columns], axis=1)
         runs.append(replace(run, signals={**run.signals, signal: late}))
-    kept, notes = drop_filtered(replace(plain, runs=tuple(runs)))
+    kept, notes = drop_useless(replace(plain, runs=tuple(runs)))
     assert notes == (f"{said}, so one of them was filtered or read late, and dq is not used",)
     assert all("dq" not in run.signals for run in kept.runs)
 
