@@ -194,19 +194,17 @@ class Parts:
         return found["part"]
 
 
-def digest(robot: str, policy: Any, table: Mapping[str, Entry], others: Mapping[str, Mapping[str, float]]) -> str:
+def digest(robot: Kind, policy: Any, table: Mapping[str, Entry], others: Mapping[str, Mapping[str, float]]) -> str:
     """Names what the parts of a self-test depend on beside its options: they may change behind the same names.
 
     Args:
-      robot: as `Args.robot`; a file's content counts.
+      robot: that is tested; of one's own, the content of its file counts.
       policy: arrays of the policy that walks.
       table: of all parameters.
       others: coordinates of the cases.
     """
     found = hashlib.sha256(json.dumps(files.as_json([table, others])).encode())
-    file = Path(robot.rpartition(":")[0])
-    if file.is_file():
-        found.update(file.read_bytes())
+    found.update((robot.digest or "").encode())
     for leaf in jax.tree.leaves(policy):
         found.update(np.asarray(leaf).tobytes())
     return found.hexdigest()[:16]
@@ -232,7 +230,7 @@ def tested(args: Args, robot: Kind, entries, others, episodes: int, progress: Pr
         for name, values in others.items()
     }
     task = progress.add_task(f"{episodes} episodes", total=None)
-    parts = Parts(args.out / "parts" / digest(args.robot, policy.learner, table, coords) / str(episodes))
+    parts = Parts(args.out / "parts" / digest(robot, policy.learner, table, coords) / str(episodes))
 
     def done(number: int, total: int) -> None:
         progress.update(task, total=total)
@@ -307,7 +305,7 @@ def main(args: Args) -> None:
     tell_limits(preset(args.preset))
     identity = {name: value for name, value in vars(args).items() if name != "out"}
     # A policy that is trained first is kept in the folder, and is another one for other sizes.
-    checkpoint.open_run(args.out, identity | {"sizes": preset(args.preset)})
+    checkpoint.open_run(args.out, identity | robot.identity | {"sizes": preset(args.preset)})
     path = args.out / "selftest.json"
     with checkpoint.lock(path), bars() as progress:
         found = {number: tested(args, robot, entries, others, number, progress) for number in numbers}

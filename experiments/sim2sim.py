@@ -221,7 +221,7 @@ def main(args: Args) -> None:
     hosts.join(args)
     sizes, robot, entries, case, knobs = check(args)
     args = dataclasses.replace(args, policy=args.policy or default_policy(robot))
-    identity = {**dataclasses.asdict(args), "sizes": sizes}
+    identity = {**dataclasses.asdict(args), **robot.identity, "sizes": sizes}
     # Other calls may play other methods and seeds in the same folder, on other machines.
     for option in ("out", "methods", "seeds", *hosts.OPTIONS):
         del identity[option]
@@ -230,9 +230,11 @@ def main(args: Args) -> None:
     memory.check(learner)
     if "ours" in args.methods:
         tell_limits(sizes)
+    # A policy that cannot be loaded must be an error before the folder is made. One from scratch is kept in the folder.
+    policy = None if args.policy == "scratch" else starting_policy(args.policy, learner)
     checkpoint.open_run(args.out, identity)
     target = robot.engines[case.target](learner.robot, case.true_params(entries, args.start))
-    runner = Runner(args, learner, target, starting_policy(args.policy, learner, args.out), knobs)
+    runner = Runner(args, learner, target, policy or starting_policy(args.policy, learner, args.out), knobs)
     with bars() as progress:
         results = {name: [runner(name, seed, progress) for seed in args.seeds] for name in args.methods}
     off = case.off(entries)

@@ -191,23 +191,25 @@ def main(args: Args) -> None:
     learner = Learner(sizes, entries, kind=robot)
     side_by_side = min(args.lanes or sizes.sweep_lanes, lanes(args)[..., 0].size)
     memory.check(learner, math.ceil(side_by_side / len(jax.devices())))
-    identity = {**dataclasses.asdict(args), "sizes": sizes}
+    identity = {**dataclasses.asdict(args), **robot.identity, "sizes": sizes}
     for option in ("out", *hosts.OPTIONS):
         del identity[option]
+    # A policy that cannot be loaded must be an error before the folder is made. One from scratch is kept in the folder.
+    policy = None if args.policy == "scratch" else starting_policy(args.policy, learner)
     checkpoint.open_run(args.out, identity)
     with checkpoint.lock(args.out / "summary.json"):
-        sweep(args, learner, case)
+        sweep(args, learner, case, policy or starting_policy(args.policy, learner, args.out))
 
 
-def sweep(args: Args, learner: Learner, case: Case) -> None:
+def sweep(args: Args, learner: Learner, case: Case, policy: Policy) -> None:
     """Tunes in all lanes, and writes and prints what they found.
 
     Args:
       args: options of the sweep.
       learner: gives the tuner its functions.
       case: how the target differs.
+      policy: that walks, on both sides.
     """
-    policy = starting_policy(args.policy, learner, args.out)
     grid = lanes(args)
     truth, off = case.true_params(learner.entries, args.start), case.off(learner.entries)
     several = jax.vmap(lane(args, learner, truth, policy))

@@ -128,7 +128,7 @@ def play(transfer: Transfer, programs: Programs) -> list[Round]:
     transfer = replace(transfer, policy=transfer.policy or default_policy(learner.kind))
     # A policy that cannot be loaded must be an error before the folder is made. One from scratch is kept in the folder.
     policy = None if transfer.policy == "scratch" else starting_policy(transfer.policy, learner)
-    checkpoint.open_run(transfer.out, _identity(transfer, learner.preset))
+    checkpoint.open_run(transfer.out, learner.kind.identity | _identity(transfer, learner.preset))
     with checkpoint.lock(transfer.out / "summary.json"):
         policy = policy or starting_policy(transfer.policy, learner, transfer.out)
         rounds = Rounds(transfer.out, transfer.terms, programs, transfer.method, policy, start, transfer.radius)

@@ -6,6 +6,7 @@
 for which a parameter table is then proposed (`jaxtune.mjx.parameters_of`).
 """
 
+import hashlib
 import importlib.util
 import inspect
 import sys
@@ -17,6 +18,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from envs import corrected, go2, sensing
 from envs.biteno import TaskConfig, constants, gait, onboard, walks
@@ -76,6 +78,13 @@ class Kind:
     """A file that is exported beside a policy, to run it on the robot's computer."""
     policy: Path | None = None
     """Folder of a policy that ships with the robot."""
+    digest: str | None = None
+    """SHA-256 of a robot's own file and model, which may change behind the same name; None for those that ship."""
+
+    @property
+    def identity(self) -> dict[str, str]:
+        """What the config of a run says of the robot beside its name, so that none goes on with another robot."""
+        return {} if self.digest is None else {"robot_sha256": self.digest}
 
     def chosen(self, parameters: str | None) -> dict[str, Entry]:
         """Returns the rows of the robot's parameter table that `--parameters` names.
@@ -110,7 +119,9 @@ def kind(name: str) -> Kind:
     if colon and place.endswith(".py"):
         if not Path(place).is_file():
             raise ValueError(f"robot: {place} does not exist")
-        return _foreign(name, _from_file(Path(place).resolve(), what), saved=f"{Path(place).name}:{what}")
+        path = Path(place).resolve()
+        robot = _foreign(name, made := _from_file(path, what), saved=f"{path.name}:{what}")
+        return replace(robot, digest=_digest(path, made))
     raise ValueError(
         f"robot: got '{name}', expected {', '.join(_SHIPPED)}, playground:NAME, playground-warp:NAME or "
         "path/to/file.py:function"
@@ -149,6 +160,15 @@ def _foreign(name: str, made: Any, saved: str = "") -> Kind:
         findings=lambda log: [],
         episode_steps=made.steps,
     )
+
+
+def _digest(path: Path, made: Any) -> str:
+    """A SHA-256 of a file and of the model that its robot has: the file may read it from another one."""
+    found = hashlib.sha256(path.read_bytes())
+    model = getattr(made, "model", None)
+    for leaf in jax.tree.leaves(model_of(made) if model is None else model):
+        found.update(np.asarray(leaf).tobytes())
+    return found.hexdigest()
 
 
 def _state_key(env: Any) -> str | None:

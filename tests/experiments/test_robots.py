@@ -16,6 +16,7 @@ from experiments import export, robot_stub, sim2real, sim2sim, sweep, train
 from experiments.common.config import PRESETS
 from experiments.robot.rounds import Terms
 from experiments.robot.surrogate import Body
+from experiments.walking import robots
 from experiments.walking.learner import Learner
 from experiments.walking.policies import default_policy, starting_policy
 from experiments.walking.robots import kind
@@ -317,3 +318,26 @@ def test_a_go2_goes_through_every_step(tmp_path):
     (line,) = json.loads((args.out / "summary.json").read_text())["rounds"]
     assert line["measured"]["episodes"] == len(falls)
     assert line["tuning"]["verdicts"]
+
+
+def test_a_run_is_of_a_robot_as_its_file_and_its_model_were(tmp_path):
+    file = tmp_path / "own.py"
+    text = FILE.read_text()
+    file.write_text(text)
+    before = kind(f"{file}:simulator").identity
+    assert before == kind(f"{file}:simulator").identity
+    (changed := tmp_path / "changed").mkdir()
+    (changed / "own.py").write_text(text + "\nMORE = 1\n")
+    assert kind(f"{changed / 'own.py'}:simulator").identity != before
+    made = robots._from_file(file, "simulator")
+    heavier = replace(made, model=made.model.replace(body_mass=1.5 * made.model.body_mass))
+    assert robots._digest(file, heavier) != before["robot_sha256"]
+    assert kind("go2").identity == {}
+
+
+@pytest.mark.parametrize("command", [sim2sim, sweep])
+def test_a_policy_that_cannot_be_loaded_leaves_no_run_behind(command, tmp_path):
+    out = tmp_path / "run"
+    with pytest.raises(ValueError, match="no/policy"):
+        command.main(command.Args(robot=ROBOT, out=out, policy="no/policy", preset="smoke"))
+    assert not (out / "config.json").exists()

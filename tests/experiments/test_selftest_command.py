@@ -155,17 +155,14 @@ def test_parts_are_computed_once_and_a_damaged_one_is_named(tmp_path):
             second.keep("gate_0", compute)
 
 
-def test_parts_of_another_policy_table_case_or_robot_are_others(tmp_path):
-    file = tmp_path / "robot.py"
-    file.write_text("a = 1")
-    robot, policy, cases = f"{file}:robot", {"mean": np.zeros(3)}, {"weak": {"torque_scale": -0.1}}
+def test_parts_of_another_policy_table_case_or_robot_are_others():
+    robot, policy, cases = replace(BITENO, digest="1a"), {"mean": np.zeros(3)}, {"weak": {"torque_scale": -0.1}}
     same = selftest.digest(robot, policy, LEGS, cases)
-    assert same == selftest.digest(robot, {"mean": np.zeros(3)}, BITENO.chosen("legs6"), cases)
+    assert same == selftest.digest(replace(robot), {"mean": np.zeros(3)}, BITENO.chosen("legs6"), cases)
     others = [
         selftest.digest(robot, {"mean": np.ones(3)}, LEGS, cases),
         selftest.digest(robot, policy, dict(reversed(LEGS.items())), cases),
         selftest.digest(robot, policy, LEGS, {"weak": {"torque_scale": -0.2}}),
+        selftest.digest(replace(robot, digest="1b"), policy, LEGS, cases),
     ]
-    file.write_text("a = 2")
-    others.append(selftest.digest(robot, policy, LEGS, cases))
     assert len({same, *others}) == 5
