@@ -141,6 +141,9 @@ def _alike(folder: Path, robot: str | None) -> tuple[str, tuple[str, ...], Contr
 
 def _check(args: Args) -> None:
     """Checks every number, before the model is read."""
+    for name in ("joints", "kp", "kd", "torque_limit_nm", "control_hz") if args.like else ():
+        if getattr(args, name) != Args.__dataclass_fields__[name].default:
+            raise ValueError(f"{name}: got {getattr(args, name)} and like, expected one of the two: a log has its own")
     for name, most in _MOST.items():
         for value in np.atleast_1d(getattr(args, name)):
             if not 0 < value <= most:

@@ -95,6 +95,10 @@ def check(args: Args) -> tuple[Preset, Kind, dict[str, Entry], Case]:
     entries = robot.chosen(args.parameters)
     truth = named_values("truth", args.truth, entries)
     case = checked_case(args.case, args.start, entries, engines=robot.engines, truth=truth)
+    for option in ("step_sizes", "widen_factors", "radii", "levels"):
+        values = getattr(args, option)
+        if len(set(values)) < len(values):
+            raise ValueError(f"{option}: got {values}, expected each value once")
     combinations = itertools.product(args.step_sizes, args.widen_factors, args.radii, args.levels)
     for step_size, widen_factor, radius, level in combinations:
         check_positive(radius=radius)

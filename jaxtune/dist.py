@@ -30,9 +30,11 @@ def make(centre: Coords, radius: float | Coords, lower: Coords, upper: Coords) -
       upper: largest coordinate by name.
 
     Raises:
-      ValueError: names differ, a radius is not a positive number, bounds leave no room, or a centre lies outside
-        them.
+      ValueError: there are no names or they differ, a radius is not a positive number, bounds leave no room, or a
+        centre lies outside them.
     """
+    if not centre:
+        raise ValueError("centre: got no coordinates, expected one or more")
     radii = radius if isinstance(radius, Mapping) else dict.fromkeys(centre, radius)
     for name, value in radii.items():
         if isinstance(value, str) or not 0 < value < math.inf:

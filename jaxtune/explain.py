@@ -12,7 +12,7 @@ MEANING = {
     Verdict.UNEXPLAINED: "No parameters explain what was measured (tested at 1 %): the model lacks physics.",
     Verdict.RADIUS_EXHAUSTED: "What was measured is not covered, and the distribution may grow no wider.",
     Verdict.NOT_FINITE: "No score could be computed.",
-    Verdict.NOT_COMPARABLE: "There is too little to compare.",
+    Verdict.NOT_COMPARABLE: "What was measured cannot be compared with simulated sets.",
 }
 """What the verdict that ended a tuning means."""
 ADVICE = {
@@ -23,7 +23,7 @@ ADVICE = {
     Verdict.NOT_FINITE: "Look for numbers that are not finite, and for simulated observations that never change.",
     Verdict.NOT_COMPARABLE: "Measure episodes in which the robot moves so that parameters show, that differ from each "
     "other and last for a window at least. Simulated ones must last as long, in enough held-out sets for the level: "
-    "0.95 needs 19, and 0.99 needs 99.",
+    "0.95 needs 19, and 0.99 needs 99. An observation that never changes in simulation must have the same value.",
 }
 """What to do next."""
 

@@ -83,8 +83,9 @@ def calibrated_gate(
     sets are treated alike. The test is calibrated per set, because windows and episodes of one robot depend on each
     other. A set of which no window is known has `lost` alone.
 
-    The set is not comparable if it has no valid window of both models, if its observations never change, if two of its
-    episodes are copies though no simulated ones are, or if fewer held-out sets have a window than the level needs
+    The set is not comparable if it has no valid window of both models, if its observations never change, if one that
+    never changes in simulation has another value, if two of its episodes are copies though no simulated ones are, or if
+    fewer held-out sets have a window than the level needs
     (level / (1 - level), which is 19 at 0.95). A set that would be covered is not comparable either if simulated
     episodes show none of the coordinates, such as those of a robot at rest with noise or a clock: the regression errs
     as much as if it had not seen them. That is asked where no earlier set said anything, of 150 episodes or more.
@@ -121,7 +122,12 @@ def calibrated_gate(
         novelty=value,
         threshold=threshold,
         p_value=conformal.p_value(every),
-        comparable=usable[-1] & enough & told & _moves(measured, model.scaler) & ~_copied(measured, collected),
+        comparable=usable[-1]
+        & enough
+        & told
+        & _moves(measured, model.scaler)
+        & _as_constant(measured, model.scaler)
+        & ~_copied(measured, collected),
         uncovered=jnp.sum(valid[-1] & ~covered[-1]) / jnp.maximum(valid[-1].sum(), 1),
         elbo=elbo,
         **{name: values[-1] for name, values in found.items()},
@@ -183,6 +189,17 @@ def _moves(measured: Trajectory, scaler: windows.Scaler) -> jax.Array:
     first, usual = measured.obs[:, :1], scaler.std[: measured.obs.shape[-1]]
     changes = jnp.abs(measured.obs - first) > _SAME * (usual + jnp.abs(first))
     return (changes & measured.alive[..., None]).any()
+
+
+def _as_constant(measured: Trajectory, scaler: windows.Scaler) -> jax.Array:
+    """Tells whether channels that never change in simulation are where they are there: ranks hardly tell how far off.
+
+    Within a hundredth of their value, or of one where it is zero.
+    """
+    alive = measured.alive[..., None]
+    steps = jnp.where(alive, scaler.clipped(windows.steps(measured)), 0.0)
+    off = jnp.abs(steps.sum(axis=(0, 1))) / jnp.maximum(alive.sum(), 1)
+    return (scaler.varies | (off < 0.99 * windows.FAR)).all()
 
 
 def _copied(measured: Trajectory, collected: Collected) -> jax.Array:

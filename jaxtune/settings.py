@@ -1,6 +1,7 @@
 """Settings of a tuning: sizes, which fix array shapes and loop lengths (`TunerConfig`), and scalars (`Knobs`)."""
 
 from dataclasses import dataclass, field
+from numbers import Integral
 
 import chex
 import jax
@@ -58,8 +59,8 @@ class TunerConfig:
     def __post_init__(self):
         least = {"episodes": 1, "set_episodes": 1, "held_out_sets": 1, "max_widenings": 0, "refinements": 0}
         for name, value in least.items():
-            if getattr(self, name) < value:
-                raise ValueError(f"{name}: got {getattr(self, name)}, expected {value} or more")
+            if not isinstance(given := getattr(self, name), Integral) or given < value:
+                raise ValueError(f"{name}: got {given!r}, expected a whole number, {value} or more")
         if not 0 < self.coverage < 1:
             raise ValueError(f"coverage: got {self.coverage}, expected a number between 0 and 1")
         if not self.min_radius > 0:

@@ -112,7 +112,7 @@ class Verdict(enum.IntEnum):
     """No score could be computed: a number was not finite, or no simulated observation ever changed."""
     NOT_COMPARABLE = 5
     """There is too little to compare: no measured episode holds a whole window or moves, two are copies, simulated ones
-    show no coordinate, or too few simulated sets have a window."""
+    show no coordinate or too few of their sets have a window, or what never changes in them has another value."""
 
 
 Scale = Literal[

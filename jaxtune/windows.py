@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxtune import devices
 from jaxtune.types import Trajectory
 
-_FAR = 10.0  # standard deviations
+FAR = 10.0  # standard deviations, at which values are clipped
 _APART, _CHANNELS = 1e3, 0.25  # how many times as far as usual a share of the channels of a robot goes that flies apart
 
 _LEAST = 1e-3  # smallest standard deviation by which values are divided, of values whose typical size is one
@@ -150,7 +150,7 @@ class Scaler:
 
     def clipped(self, values: Float[Array, "... channels"]) -> Float[Array, "... channels"]:
         """Standardises values, and clips them at ten deviations: one that hardly varied must not drown all others."""
-        return jnp.clip(self(values), -_FAR, _FAR)
+        return jnp.clip(self(values), -FAR, FAR)
 
 
 def scaler(values: Float[Array, "... channels"], weight: Float[Array, "... 1"] | None = None) -> Scaler:

@@ -94,7 +94,8 @@ class Meta:
         try:
             meta = yaml.load(self.path.read_text(encoding="utf-8"), _Loader)
         except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
-            raise ValueError(f"{self.path}: {error}") from error
+            # The parser draws the place on several lines.
+            raise ValueError(f"{self.path}: {' '.join(str(error).split())}") from error
         meta = self._mapping("", meta, _META if robots is not None else _META | {"base": False, "controller": False})
         self.robot, movable = self._text("robot", meta["robot"]), None
         if model is not None:

@@ -92,9 +92,11 @@ def _read_csv(path: Path, used: Callable[[str], bool]) -> dict[str, np.ndarray |
         check_size(path, _CELL_BYTES * max(_cells(path), path.stat().st_size // _LONGEST_CELL))
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
-            names = next(csv.reader(file, strict=True), [])
+            names = [name.strip() for name in next(csv.reader(file, strict=True), [])]
     except (UnicodeDecodeError, csv.Error) as error:
         raise ValueError(f"{path}: {error}") from error
+    if len(names) == 1 and (";" in names[0] or "\t" in names[0]):
+        raise ValueError(f"{path}: got columns between semicolons or tabs, expected commas")
     for name in names:
         if not name or names.count(name) > 1:
             raise ValueError(f"{path}, column '{name}': expected a name that is there once")
@@ -117,7 +119,9 @@ def _parse_csv(path: Path, types: dict[str, pyarrow.DataType]) -> dict[str, pyar
     options = pyarrow.csv.ConvertOptions(column_types=types, null_values=[], strings_can_be_null=False)
     # An empty line is a row without cells, which is refused too.
     parse = pyarrow.csv.ParseOptions(ignore_empty_lines=False)
-    table = pyarrow.csv.read_csv(path, convert_options=options, parse_options=parse)
+    # Names without the spaces that a header may have around them.
+    read = pyarrow.csv.ReadOptions(column_names=list(types), skip_rows=1)
+    table = pyarrow.csv.read_csv(path, read_options=read, convert_options=options, parse_options=parse)
     return {name: table[name] for name in types}
 
 

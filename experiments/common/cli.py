@@ -1,5 +1,6 @@
 """What every command shares: it reads arguments, prints, shows progress, and turns a user's error into one line."""
 
+import os
 import shlex
 import signal
 import sys
@@ -21,8 +22,11 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+_WIDE = 160  # columns of a file or a pipe, where nothing says how wide it is and tables must not be cut off
 console = Console()
 """Where commands print their results."""
+if not console.is_terminal and not os.environ.get("COLUMNS"):
+    console.width = _WIDE
 
 _errors = Console(stderr=True)
 _INTERRUPTED = 130  # exit code of a command that Ctrl-C ended, by the shell's convention

@@ -178,11 +178,14 @@ def named_values(option: str, items: Sequence[str], entries: Mapping[str, Entry]
       Values by name.
 
     Raises:
-      ValueError: an item is not of this form, its name is not in the table, or its value is out of bounds.
+      ValueError: an item is not of this form, its name comes twice or is not in the table, or its value is out of
+        bounds.
     """
     found = {}
     for item in items:
         name, _, value = item.partition("=")
+        if name in found:
+            raise ValueError(f"{option}: got '{name}' twice, expected each once")
         try:
             found[name] = float(value)
         except ValueError:

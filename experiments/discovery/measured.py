@@ -39,8 +39,8 @@ def read_logs(
       its conditions are too few, and the model.
 
     Raises:
-      ValueError: a log cannot be read, the logs are not of one robot, its base is free, or its model has flags that
-        switch physics off.
+      ValueError: a log cannot be read, a recording is there twice, the logs are not of one robot, its base is free, or
+        its model has flags that switch physics off.
     """
     logs = [read_any(folder, robot) for folder in folders]
     if not logs:
@@ -63,12 +63,23 @@ def read_logs(
     runs = first.runs
     if len(logs) > 1:
         runs = tuple(_numbered(run, number) for number, log in enumerate(logs) for run in log.runs)
+    _check_recorded_once(runs)
     notes += tuple(note for log in logs for note in log.notes)
     # Splits go by what motors do, so they are settled before stamps move.
     log = with_splits(split_in_time(replace(first, runs=runs, notes=notes)))
     log = with_halves_swapped(log) if swap_halves else log
     parts = len(log.runs) // len(runs)
     return _in_pieces(_on_lines(log, [parts * len(one.runs) for one in logs])), spec
+
+
+def _check_recorded_once(runs: Sequence[Run]) -> None:
+    """Refuses a recording that is there twice: it would be fitted, and tested on itself."""
+    found: dict[bytes, str] = {}
+    for run in runs:
+        signals = b"".join(np.ascontiguousarray(values).tobytes() for _, values in sorted(run.signals.items()))
+        first = found.setdefault(signals, run.name)
+        if first != run.name:
+            raise ValueError(f"runs: got one recording twice, as {first} and as {run.name}; expected each once")
 
 
 def _on_lines(log: Log, sizes: Sequence[int]) -> Log:

@@ -19,8 +19,8 @@ VERDICTS = {
     "radius_exhausted": "The simulator does not cover what was measured, and its distribution cannot grow any wider.",
     "not_finite": "Nothing could be compared: a value is not finite.",
     "not_comparable": "There is too little to compare: walks, measured or simulated, were shorter than a window of 50 "
-    "steps, the robot did not move or showed no parameter, two of its walks are copies, or too few simulated sets are "
-    "usable: a level of 0.95 needs 19.",
+    "steps, the robot did not move or showed no parameter, two of its walks are copies, something that never changes "
+    "in simulation has another value, or too few simulated sets are usable: a level of 0.95 needs 19.",
     None: "This method does not check whether the simulator covers what was measured.",
 }
 """What each verdict of the gate means; None stands for a method without a gate."""

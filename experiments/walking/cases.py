@@ -138,4 +138,4 @@ def check_seeds(seeds: Sequence[int]) -> None:
         raise ValueError("seeds: got none, expected one or more")
     for seed in seeds:
         if not 0 <= seed <= _LARGEST_SEED or seeds.count(seed) > 1:
-            raise ValueError(f"seeds: got {seed} among {len(seeds)}, expected numbers up to {_LARGEST_SEED}, each once")
+            raise ValueError(f"seeds: got {', '.join(map(str, seeds))}, expected 0 to {_LARGEST_SEED}, each once")

@@ -64,7 +64,9 @@ def data_of(state: Any) -> Any:
 
 def with_data(state: Any, data: Any) -> Any:
     """Copies a state, with other data where `data_of` finds it."""
-    return dataclasses.replace(state, **{next(name for name in _DATA if hasattr(state, name)): data})
+    changed = {next(name for name in _DATA if hasattr(state, name)): data}
+    # A named tuple is no dataclass.
+    return state._replace(**changed) if hasattr(state, "_replace") else dataclasses.replace(state, **changed)
 
 
 def raw(key: jax.Array) -> jax.Array:
@@ -100,6 +102,8 @@ def check_reach(env: Any, model: mjx.Model, give: WithModel) -> None:
     if not callable(give):
         raise ValueError(f"with_model: got {give!r}, expected a function (env, model) -> env")
     if give is not with_model:
+        if not hasattr(made := give(env, model), "step"):
+            raise ValueError(f"with_model: got a function that returns {type(made).__name__}, expected an environment")
         return
     inner = getattr(env, "unwrapped", env)
     if inner is not env:

@@ -198,6 +198,7 @@ def test_a_model_of_several_files_becomes_one_with_the_same_masses(tmp_path, com
         ({"motion": "dance"}, "motion: got 'dance', expected one of medley, powered_medley, slow_triangles"),
         ({"seconds": 0.01}, "seconds: got 0.01 s at 500 rows a second, expected 10 rows"),
         ({"robot": "nobody.xml"}, "robot: got 'nobody.xml'"),
+        ({"like": ARM.parent, "kp": (200.0,)}, r"kp: got \(200.0,\) and like, expected one of the two"),
     ],
 )
 def test_options_that_are_wrong_are_named(tmp_path, change, message):

@@ -286,6 +286,12 @@ def test_runs_of_one_name_in_several_folders_are_conditions_of_their_own(tmp_pat
     assert log.notes == ()
 
 
+def test_a_recording_that_is_there_twice_is_refused(tmp_path, good):
+    write(good, tmp_path / "log")
+    with pytest.raises(ValueError, match="got one recording twice, as run_000_0 and as run_000_1"):
+        read_logs([tmp_path / "log", tmp_path / "log"])
+
+
 def test_a_log_that_was_corrected_is_another_question(tmp_path, good):
     write(good, tmp_path / "log")
     log, spec = read_logs([tmp_path / "log"])

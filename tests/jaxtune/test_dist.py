@@ -106,6 +106,11 @@ def test_make_needs_room_between_the_bounds():
         dists.make({"a": 0.0, "b": 0.0}, 0.2, {"a": 0.0, "b": -1.0}, {"a": 0.0, "b": 1.0})
 
 
+def test_make_needs_a_coordinate():
+    with pytest.raises(ValueError, match="centre: got no coordinates"):
+        dists.make({}, 0.2, {}, {})
+
+
 def test_make_needs_a_positive_radius():
     for radius in (0.0, -0.5, float("nan")):
         with pytest.raises(ValueError, match=f"radius: got {radius}"):

@@ -602,6 +602,22 @@ def test_a_set_that_shows_nothing_is_not_comparable(gate, spoil):
     assert not gate(spoil(sets)).comparable.any()
 
 
+@pytest.mark.parametrize(("simulated", "usual", "other"), [(1.0, 1.005, 1.5), (0.0, 0.005, 0.5), (-40.0, -39.9, -30.0)])
+def test_what_never_changes_in_simulation_must_have_the_same_value(simulated, usual, other):
+    def told(episodes, value):
+        more = jnp.full_like(episodes.obs[..., :1], value)
+        return episodes.replace(obs=jnp.concatenate([episodes.obs, more], axis=-1))
+
+    collected = toys.collect(jax.random.key(0), toys.uniform(TWO, 0.2), toys.TINY)
+    collected = collected.replace(
+        trajectory=told(collected.trajectory, simulated), held_out=told(collected.held_out, simulated)
+    )
+    measured = SLIDER.measure(TWO, 2)(jax.random.key(1), toys.policy())
+    # The robot's own may be a little off, as a sensor is.
+    assert tiny_gate(toys.TINY, collected, told(measured, usual), knobs()).comparable
+    assert not tiny_gate(toys.TINY, collected, told(measured, other), knobs()).comparable
+
+
 def test_an_episode_that_is_there_twice_leaves_nothing_to_compare():
     config = dataclasses.replace(toys.TINY, set_episodes=3)
     collected = toys.collect(jax.random.key(0), toys.uniform(TWO, 0.2), config)
@@ -1176,7 +1192,8 @@ def test_tuner_does_not_bend_its_parameters_to_physics_that_it_lacks(find):
     ("sizes", "message"),
     [
         ({"refinements": -1}, "refinements: got -1, expected 0 or more"),
-        ({"held_out_sets": 0}, "held_out_sets: got 0, expected 1 or more"),
+        ({"held_out_sets": 0}, "held_out_sets: got 0, expected a whole number, 1 or more"),
+        ({"episodes": 2.5}, "episodes: got 2.5, expected a whole number, 1 or more"),
         ({"coverage": 90}, "coverage: got 90, expected a number between 0 and 1"),
         ({"min_radius": 0.0}, "min_radius: got 0.0, expected a positive number"),
     ],

@@ -545,6 +545,8 @@ def test_bad_rows_are_named(tmp_path, table, named):
         ("t,q.left_hip\n0,1\n\n0.02,2\n", "row 2: got 0 cells, expected 2"),
         ("t,q.left_hip\n0,1\n0.01\n", "row 2: got 1 cells, expected 2"),
         ('t,q.left_hip\n0,"1\n', "row 1: unexpected end of data"),
+        ("t;q.left_hip\n0;1\n", "got columns between semicolons or tabs, expected commas"),
+        ("t, t \n0,1\n", "column 't': expected a name that is there once"),
     ],
 )
 def test_a_damaged_csv_is_named(tmp_path, text, named):
@@ -552,6 +554,23 @@ def test_a_damaged_csv_is_named(tmp_path, text, named):
     (tmp_path / "log" / "run_000.csv").write_text(text)
     with pytest.raises(ValueError, match=named):
         logs.read(tmp_path / "log")
+
+
+@pytest.mark.parametrize("more", ["", "note"])
+def test_names_of_columns_may_have_spaces_around_them(tmp_path, more):
+    table = columns() | ({more: ["walks"] * ROWS} if more else {})
+    spaced = {f" {name}  ": values for name, values in table.items()}
+    found, wanted = (logs.read(put(tmp_path / name, each)) for name, each in {"a": spaced, "b": columns()}.items())
+    for name, values in wanted.runs[0].signals.items():
+        np.testing.assert_array_equal(found.runs[0].signals[name], values)
+
+
+def test_broken_yaml_is_said_in_a_line(tmp_path):
+    put(tmp_path / "log")
+    (tmp_path / "log" / "meta.yaml").write_text("robot: biteno\njoints: [a\nbase: fixed\n")
+    with pytest.raises(ValueError, match="expected ',' or ']'") as error:
+        logs.read(tmp_path / "log")
+    assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".npz", ".parquet"])
@@ -573,7 +592,7 @@ def test_columns_that_nobody_uses_may_hold_what_they_like(tmp_path, suffix, bad)
 
 @pytest.mark.parametrize("name", ["reward", " enabled", "enable", "q.left_hip "])
 def test_what_is_used_or_misspelt_is_not_left_out(tmp_path, name):
-    with pytest.raises(ValueError, match=f"column '{name}'"):
+    with pytest.raises(ValueError, match=f"column '{name.strip()}'"):
         logs.read(put(tmp_path / "log", columns() | {name: np.array(["1.0"] * (ROWS - 1) + ["nan"])}))
 
 

@@ -322,6 +322,7 @@ class Silent(Sled):
         ({"observe": 3}, "observe: got 3, expected a key, keys, or a function"),
         ({"observe": ["state", 3]}, "observe: got .'state', 3., expected a key, keys"),
         ({"with_model": None}, "with_model: got None, expected a function"),
+        ({"with_model": lambda env, model: None}, "with_model: got a function that returns NoneType"),
         ({"model": Sled().mj_model}, "model: got MjModel, expected mjx.Model"),
         ({"env": Elsewhere()}, "with_model: got none, and the default does not reach the model of Elsewhere"),
         ({"env": Wrapped()}, "env: got Wrapped around Sled, expected an environment without wrappers"),
