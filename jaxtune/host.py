@@ -32,8 +32,8 @@ from jaxtune.gate import Verify, calibrated_gate
 from jaxtune.loop import Info
 from jaxtune.misfits import Misfits, Phase, misfits, share_of_episode
 from jaxtune.readings import cut_alike, examine
-from jaxtune.replay import Replay
 from jaxtune.settings import TunerConfig
+from jaxtune.shooting import Replay
 from jaxtune.tuner import Measure, TrainPolicy, Tuner, TunerState, keep
 from jaxtune.types import Trajectory, Verdict
 from jaxtune.update import Update, posterior_update

@@ -17,8 +17,8 @@ from jaxtune import replay as replays
 from jaxtune.gate import GateInfo, no_gate_log
 from jaxtune.pooling import Past
 from jaxtune.readings import Collected
-from jaxtune.replay import Replay
 from jaxtune.settings import UNEXPLAINED, Knobs, TunerConfig
+from jaxtune.shooting import Replay
 from jaxtune.types import ParamDist, Trajectory, Verdict
 from jaxtune.update import UpdateInfo, no_update
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtune.conformal import ROUNDING
 from jaxtune.dvm import DVMConfig
 from jaxtune.regression import RegressionConfig
-from jaxtune.replay import ReplayConfig
+from jaxtune.shooting import ReplayConfig
 from jaxtune.spm import SPMConfig
 
 UNEXPLAINED = 0.01

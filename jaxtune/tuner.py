@@ -91,8 +91,8 @@ from jaxtune.loop import Info
 from jaxtune.misfits import Misfits, Phase, misfits, share_of_episode
 from jaxtune.pooling import Past
 from jaxtune.readings import Collected, cut_alike, examine
-from jaxtune.replay import Replay
 from jaxtune.settings import Knobs, TunerConfig, knobs
+from jaxtune.shooting import Replay
 from jaxtune.types import Coords, ParamDist, Trajectory, Verdict
 from jaxtune.update import Update, UpdateInfo, posterior_update, vote_update
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtune import dist as dists
 from jaxtune import dvm, spm
 from jaxtune.dvm import DVMConfig
-from jaxtune.replay import Replay
+from jaxtune.shooting import Replay
 from jaxtune.spm import SPMConfig
 from jaxtune.tuner import Collected, TunerConfig
 from jaxtune.types import ParamDist, Trajectory

@@ -11,7 +11,7 @@ from jaxtune import devices
 from jaxtune.mjx import parameters
 from jaxtune.mjx.entry import Entry
 from jaxtune.mjx.parameters import Params
-from jaxtune.replay import Replay
+from jaxtune.shooting import Replay
 from jaxtune.types import Trajectory
 
 _CHUNK = {"cpu": 256, "other": 8192}  # robots side by side on a device: small batches stay in a CPU's cache

@@ -31,7 +31,7 @@ from jaxtune.mjx.entry import Entry
 from jaxtune.mjx.environments import WithModel, data_of, model_of, with_data, with_model
 from jaxtune.mjx.episodes import replay, rollout
 from jaxtune.mjx.parameters import Params
-from jaxtune.replay import Replay
+from jaxtune.shooting import Replay
 from jaxtune.types import Coords, ParamDist, Trajectory
 
 Act = Callable[[Any, Any, jax.Array], jax.Array]

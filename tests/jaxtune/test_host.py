@@ -9,7 +9,7 @@ import toys
 from jaxtune import pooling
 from jaxtune.gate import calibrated_gate
 from jaxtune.host import HostTuner, one_by_one, pieces_one_by_one
-from jaxtune.replay import ReplayConfig
+from jaxtune.shooting import ReplayConfig
 from jaxtune.tuner import Tuner, TunerState, explain, keep, knobs
 from jaxtune.types import Trajectory, Verdict
 from jaxtune.update import posterior_update

@@ -10,7 +10,7 @@ import toys
 
 from jaxtune import dist as dists
 from jaxtune import mjx, pooling, replay, tuner
-from jaxtune.replay import ReplayConfig
+from jaxtune.shooting import ReplayConfig
 from jaxtune.tuner import Tuner, TunerConfig
 from jaxtune.types import Verdict
 from jaxtune.update import no_update
