@@ -16,7 +16,7 @@ from rich.table import Table
 from envs.biteno import constants
 from envs.targets.protocol import Commands
 from experiments.common import checkpoint, compiler, film, plots
-from experiments.common.cli import console, run
+from experiments.common.cli import bars, console, run
 from experiments.common.config import PRESETS, named_values, preset
 from experiments.common.files import write_json
 from experiments.walking.learner import Learner
@@ -99,10 +99,14 @@ def main(args: Args) -> None:
     key = jax.random.PRNGKey(args.seed)
     short, long = (round(seconds / constants.POLICY_DT_S) for seconds in (_GRID_S, task.episode_s))
     command = np.repeat(np.array(GRID, np.float32)[:, None], short, axis=1)
-    grid = record_walks(targets["none"], key, act, len(GRID), short, Commands(command=command))
-    rows = {"grid": quality(*grid)}
-    for name, target in targets.items():
-        rows[name] = quality(*record_walks(target, jax.random.fold_in(key, len(rows)), act, args.episodes, long))
+    with bars() as progress:
+        task = progress.add_task("walks", total=1 + len(targets))
+        grid = record_walks(targets["none"], key, act, len(GRID), short, Commands(command=command))
+        rows = {"grid": quality(*grid)}
+        for name, target in targets.items():
+            progress.advance(task)
+            rows[name] = quality(*record_walks(target, jax.random.fold_in(key, len(rows)), act, args.episodes, long))
+        progress.advance(task)
 
     _print_table(args, rows)
     by_command = [

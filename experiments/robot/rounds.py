@@ -131,12 +131,13 @@ class Rounds:
         self._kind = self._learner.kind
         self._steps = round(terms.walk_s / self._kind.control_s)
 
-    def play(self, index: int, last: Round | None) -> Round:
+    def play(self, index: int, last: Round | None, tell: Callable[[str], None] = lambda what: None) -> Round:
         """Plays a round: predict, request, wait, check, tune, and train the policy for the next one.
 
         Args:
           index: of the round, from 0.
           last: the round before it, if any; its measurements decide whether the simulated fall rate is trusted.
+          tell: is called with what is done next.
 
         Returns:
           The record of the round.
@@ -145,14 +146,18 @@ class Rounds:
           ValueError: too many falls are expected, the robot has not answered, or its log cannot be used.
         """
         place = self._place(index)
+        tell("predicts how the robot walks")
         state = self._start(index, lambda: self._first)
         predicted = self._predicted(index, state)
         if not (place / "tuning.json").exists():
             if not (place / "log").exists():
                 self._permit(index, predicted, last)
                 self._request(index, state)
+            tell("waits for the robot")
             wait(place, self._terms.timeout_s)
+            tell("tunes the simulator")
             self._learn(index, state)
+        tell("trains the policy")
         tuned = checkpoint.load(place / "tuned", self._first, {})
         following = self._start(index + 1, lambda: self._programs.train(self._key(index, 2), tuned)[0])
         measured, tuning = _read(Measured, place / "measured.json"), _read(Tuning, place / "tuning.json")

@@ -12,7 +12,7 @@ import tyro
 
 from envs import corrected
 from experiments.common import checkpoint, files
-from experiments.common.cli import console
+from experiments.common.cli import bars, console
 from experiments.common.config import Preset, named_values, preset
 from experiments.robot import policy_files, report
 from experiments.robot.records import Round
@@ -133,12 +133,16 @@ def play(transfer: Transfer, programs: Programs) -> list[Round]:
         policy = policy or starting_policy(transfer.policy, learner, transfer.out)
         rounds = Rounds(transfer.out, transfer.terms, programs, transfer.method, policy, start, transfer.radius)
         history: list[Round] = []
-        for index in range(transfer.rounds):
-            history.append(rounds.play(index, history[-1] if history else None))
-            page = transfer.out / f"round_{index:03d}" / "report.html"
-            report.write(page, history, transfer.terms, programs.learner.kind.name)
-            report.show(console, history[-1])
-            console.print(f"report in {page}")
+        with bars() as progress:
+            task = progress.add_task("", total=transfer.rounds)
+            for index in range(transfer.rounds):
+                tell = lambda what, index=index: progress.update(task, description=f"round {index} {what}")  # noqa: E731
+                history.append(rounds.play(index, history[-1] if history else None, tell))
+                page = transfer.out / f"round_{index:03d}" / "report.html"
+                report.write(page, history, transfer.terms, programs.learner.kind.name)
+                report.show(console, history[-1])
+                console.print(f"report in {page}")
+                progress.advance(task)
         files.write_json(transfer.out / "summary.json", {"rounds": history, "versions": checkpoint.versions()})
     return history
 
