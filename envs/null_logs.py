@@ -28,6 +28,7 @@ from envs.readings import hermite, noise_of, read_later, rounding_of, stale
 from envs.smoothing import smoothed
 
 _STEP_S = 0.0005  # half the step of `Rig`
+_HOLDS = 0.999  # impedance of friction that holds (MuJoCo's `solimpfriction`)
 _SPREAD = 0.1  # standard deviation of the logarithm of every drawn parameter, as in `Axis.prior_sd`
 
 
@@ -96,6 +97,9 @@ def _drawn(spec: mujoco.MjSpec, joints: Sequence[str], rng: np.random.Generator)
     model.body_inertia[:] *= (masses * _factors(rng, model.nbody))[:, None]
     for name in ("dof_armature", "dof_damping", "dof_frictionloss"):
         getattr(model, name)[:] *= _factors(rng, model.nv)
+    # Half of all robots have friction that holds, and half the engine's, which creeps under a load.
+    if rng.integers(0, 2):
+        model.dof_solimp[:, :2] = np.maximum(model.dof_solimp[:, :2], _HOLDS)
     mujoco.mj_setConst(model, mujoco.MjData(model))
     return model
 

@@ -276,7 +276,7 @@ class Rig:
         model = parameters.apply(self._model, params, entries)
         for name, row in rows.items():
             if row.act is not None:
-                model = row.act(values[name], model, self._bodies)
+                model = row.act(values[name], model, self.dof if row.on == "joint" else self._bodies)
         return set_const(model)
 
     def inner(self, vectors: np.ndarray) -> np.ndarray:

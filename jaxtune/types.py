@@ -233,9 +233,9 @@ class Effect:
     Of the first kind the parameters name the model's fields, to which they add or which they multiply. Where that does
     not describe it, there is
 
-        act(values, model, bodies) -> model
+        act(values, model, places) -> model
 
-    with the ids of the bodies that are its places. Of the second kind there is always
+    with the ids of its bodies, or of the degrees of freedom of its joints. Of the second kind there is always
 
         act(values, signal, now, memory) -> (signal, memory)
 

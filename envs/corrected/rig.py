@@ -48,6 +48,7 @@ def _corrected_spec(spec: mujoco.MjSpec, rig: Rig, vector: np.ndarray) -> mujoco
         joint.damping = [float(device.dof_damping[dof]), *np.ravel(joint.damping)[1:]]
         # From the nominal model: on the device every joint has a trace of friction, which MJX needs.
         joint.frictionloss = max(float(model.dof_frictionloss[dof] + values["coulomb"]["torque_nm"][number]), 0.0)
+        joint.solimp_friction = np.asarray(device.dof_solimp[dof], float)
     # A spec is written as XML only after it compiled.
     spec.compile()
     return spec

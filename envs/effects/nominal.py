@@ -2,12 +2,19 @@
 
 A controller's damping gain is rarely known to a percent, the constants of a servo's motor are those of a data sheet,
 and the inertia of a link is known no better than its mass. Few logs say how their targets went on between two rows, and
-a torque that was computed from a motor's current is as good as its constant. Discovery fits these under every
-hypothesis, or it would call them a delay, friction, a load or a weak motor.
+a torque that was computed from a motor's current is as good as its constant. The engine's dry friction lets a joint
+creep under a load, which that of gears does not. Discovery fits these under every hypothesis, or it would call them a
+delay, friction, a load or a weak motor.
 """
+
+import jax.numpy as jnp
+import numpy as np
+from mujoco import mjx
 
 from envs.effects.actuator import scaled
 from jaxtune.types import Effect, Parameter
+
+_LEAST_CREEP = 0.01  # of the engine's; friction that is stiffer makes a solver slow, and holds no better
 
 
 def _target_between_rows(values, target, now, memory):
@@ -15,7 +22,27 @@ def _target_between_rows(values, target, now, memory):
     return target + values["share"] * now.between, memory
 
 
+def _holding(values, model: mjx.Model, dof: np.ndarray) -> mjx.Model:
+    """Makes dry friction stiffer: the creep, (1 - d) / d of an impedance d, falls to a hundredth at a share of one."""
+    least, most = model.dof_solimp[dof, 0], model.dof_solimp[dof, 1]
+    creep = (1.0 - least) / least * _LEAST_CREEP ** values["share"]
+    stiff = jnp.where(values["share"] > 0, 1.0 / (1.0 + creep), least)
+    solimp = model.dof_solimp.at[dof, 0].set(stiff).at[dof, 1].set(jnp.maximum(stiff, most))
+    return model.replace(dof_solimp=solimp)
+
+
 ROWS = (
+    Effect(
+        name="holding",
+        family="joint_friction",
+        on="joint",
+        enters="model",
+        parameters=(Parameter(name="share", bounds=(0.0, 1.0), prior=0.5),),
+        sizes=(0.2,),
+        act=_holding,
+        sentence="Dry friction holds the joint, where the engine's lets it creep under a load.",
+        excited_by="a load that is held for seconds",
+    ),
     Effect(
         name="damping_gain",
         family="actuator",
