@@ -13,6 +13,8 @@ from jaxtune.types import Effect, Parameter
 # so, since the velocity that it multiplies was filtered.
 _PRIOR_SHARE = 0.1
 _NOMINAL_RATIOS = {"link_mass": _PRIOR_SHARE, "link_inertia": _PRIOR_SHARE, "gain_error": 0.035, "damping_gain": 0.05}
+# And by how much, as a share of a link's radius of gyration, its centre of mass is off in each direction.
+LOOSE = 0.03
 # What else a servo's log gives, and instead: of its motor's constants it gives the torque at the stall (kt volts /
 # resistance_ohm) and the braking (kt^2 / resistance_ohm), each as a data sheet does. It has no damping gain.
 SERVO_RATIOS = {"torque_scale": 0.07, "back_emf": 0.1, "damping_gain": 0.0}

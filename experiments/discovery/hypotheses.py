@@ -3,6 +3,7 @@
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from types import MappingProxyType
 
 import numpy as np
 
@@ -104,7 +105,11 @@ def _kind(place: str) -> str:
 
 
 def unknown_directions(
-    axes: Sequence[Axis], control_hz: float, signals: Sequence[str] = (), follows: bool = False
+    axes: Sequence[Axis],
+    control_hz: float,
+    signals: Sequence[str] = (),
+    follows: bool = False,
+    centres: Mapping[str, np.ndarray] = MappingProxyType({}),
 ) -> tuple[np.ndarray, np.ndarray]:
     """Returns directions in the rig's coordinates along what neither log nor model says, and their bounds.
 
@@ -121,6 +126,7 @@ def unknown_directions(
       signals: that are compared.
       follows: whether the controller is one that follows measured motion (`envs.following`), of which all is known.
         What it asks for was measured, by sensors of unknown scale and offset.
+      centres: by how much links' centres of mass may be off (`envs.rig.Rig.loose_centres`).
 
     Returns:
       [unknowns, axes] of the size of half a period, of half of the way between rows or to no creep, of a typical
@@ -142,6 +148,13 @@ def unknown_directions(
     ):
         mine = [number for number, axis in enumerate(axes) if axis.effect == effect and axis.place in places]
         found += [(size * np.eye(len(axes))[number], bounds) for number in mine]
+    for body, shifts in centres.items():
+        mine = [axis.effect == "com_offset" and axis.place == body for axis in axes]
+        scales = [axis.scale for axis, its in zip(axes, mine, strict=True) if its]
+        for shift in shifts:
+            direction = np.zeros(len(axes))
+            direction[mine] = shift / scales
+            found.append((direction, (-_MOST_SHARES, _MOST_SHARES)))
     directions, bounds = zip(*found, strict=True)
     return np.array(directions, float), np.array(bounds)
 

@@ -146,7 +146,7 @@ def _free_or_asked(rig: Rig, signals: Sequence[str], controller: str, sensed: np
     follows, constants = controller == "unknown", SERVO_RATIOS if controller == "servo" else {}
     told = {name: row for name, row in rig.effects.items() if not follows or tells(row)}
     every = hypotheses(rig.axes, rig.places, {name: row for name, row in told.items() if name in LIBRARY})
-    unknowns, bounds = unknown_directions(rig.axes, rig.control_hz, signals, follows)
+    unknowns, bounds = unknown_directions(rig.axes, rig.control_hz, signals, follows, rig.loose_centres())
     shapes = forms(rig.axes, rig.effects, every)
     return {
         "hypotheses": every,

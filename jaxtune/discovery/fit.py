@@ -254,11 +254,9 @@ def taken_over(free: Free, hypothesis: Hypothesis) -> np.ndarray:
     """Mask [coordinates] of the nominal parameters that a hypothesis takes over, prior and all.
 
     A hypothesis about a link's mass replaces the mass that is free from the start: it has wider bounds and its own
-    prior, and beside it the old coordinate would be the same direction twice. Only a hypothesis with one parameter,
-    or with one for each place, can be a nominal one.
+    prior, and beside it the old coordinate would be the same direction twice. So does one about where a link's centre
+    of mass is.
     """
-    if len(hypothesis.directions) > 1 and not hypothesis.each:
-        return np.zeros(len(free.sd), bool)
     mine = hypothesis.directions.any(axis=0)
     within = np.array([not (direction[~mine] != 0).any() for direction in free.directions])
     return within & free.nominal

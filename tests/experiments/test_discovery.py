@@ -266,20 +266,42 @@ def test_the_travel_of_friction_is_unknown_where_the_model_has_friction(spec):
     spec.joint("elbow").frictionloss = 0.1
     rig = Rig(spec, JOINTS, 1000.0)
     directions, bounds = unknown_directions(rig.axes, 1000.0)
-    assert directions.shape == (4, len(rig.axes)) and bounds.shape == (4, 2)
-    (number,) = np.flatnonzero(directions[3])
+    assert directions.shape == (5, len(rig.axes)) and bounds.shape == (5, 2)
+    (number,) = np.flatnonzero(directions[4])
     assert (rig.axes[number].effect, rig.axes[number].place) == ("presliding", "elbow")
     assert (bounds[:, 0] == 0).all()
     # When velocities were read is, by one period for all joints, and what lags more is an effect.
     lag, most = unknown_directions(rig.axes, 500.0, ("dq", "q"))
-    moved = [rig.axes[number] for number in np.flatnonzero(lag[3])]
+    moved = [rig.axes[number] for number in np.flatnonzero(lag[4])]
     assert [(axis.effect, axis.place) for axis in moved] == [("velocity_lag", joint) for joint in JOINTS]
-    np.testing.assert_allclose(lag[3][lag[3] != 0] * most[3, 1], 1.0 / 500.0)
+    np.testing.assert_allclose(lag[4][lag[4] != 0] * most[4, 1], 1.0 / 500.0)
     # The scale of torques is unknown where they are compared.
     more, _ = unknown_directions(rig.axes, 1000.0, ("abs_tau", "q"))
-    np.testing.assert_array_equal(more[:4], directions)
-    places = [rig.axes[number] for row in more[4:] for number in np.flatnonzero(row)]
+    np.testing.assert_array_equal(more[:5], directions)
+    places = [rig.axes[number] for row in more[5:] for number in np.flatnonzero(row)]
     assert [(axis.effect, axis.place) for axis in places] == [("torque_reading", joint) for joint in JOINTS]
+
+
+def test_centres_of_mass_are_loose_across_their_hinges(spec):
+    from envs.rig import Rig
+
+    rig = Rig(spec, JOINTS, 1000.0)
+    centres, plain = rig.loose_centres(), unknown_directions(rig.axes, 1000.0)[0]
+    directions, bounds = unknown_directions(rig.axes, 1000.0, centres=centres)
+    np.testing.assert_array_equal(directions[: len(plain)], plain)
+    assert (bounds[len(plain) :] == [-3.0, 3.0]).all()
+    shifts = np.concatenate(list(centres.values()))
+    axes = [np.cross(*rows) for rows in centres.values()]
+    for direction, shift in zip(directions[len(plain) :], shifts, strict=True):
+        moved = [rig.axes[number] for number in np.flatnonzero(direction)]
+        assert {axis.effect for axis in moved} == {"com_offset"} and len({axis.place for axis in moved}) == 1
+        before, after = (rig.model(rig.values(rig.tree(at))).body_ipos for at in (0.0 * direction, direction))
+        np.testing.assert_allclose(np.abs(after - before).sum(axis=0), np.abs(shift), atol=1e-7)
+    for axis, name in zip(axes, JOINTS, strict=True):
+        hinge = rig.mj_model.joint(name).axis
+        assert abs(axis @ hinge) == pytest.approx(np.linalg.norm(axis))
+    # A long uniform rod's radius of gyration is its length over the root of twelve.
+    assert all(0.001 < np.linalg.norm(shift) < 0.01 for shift in shifts)
 
 
 def test_more_friction_is_a_change_of_the_model_and_stiction_is_missing_in_it(spec):
