@@ -195,6 +195,17 @@ def test_a_joint_sticks_within_its_friction(pendulum):
     assert np.abs(pendulum.play(segment)["dq"]).max() > 0.3
 
 
+@pytest.mark.parametrize("share", [0.5, 1.0])
+def test_friction_that_holds_lets_a_joint_creep_less(pendulum, share):
+    # As above, and the creep is a tenth at half of the way, a hundredth at its end.
+    segment = rigs.segment(pendulum.rig, 0.0, 0.0, feed=0.05)
+    slow, held = (
+        pendulum.play(segment, coulomb={"hinge": {"torque_nm": 0.04}}, holding={"hinge": {"share": one}})["dq"][-1, 0]
+        for one in (0.0, share)
+    )
+    assert held == pytest.approx(0.01**share * slow, rel=0.1)
+
+
 def test_a_joint_slides_with_what_is_more_than_its_friction(pendulum):
     segment = rigs.segment(pendulum.rig, 0.0, 0.0, feed=0.2)
     read = pendulum.play(segment, coulomb={"hinge": {"torque_nm": 0.04}})

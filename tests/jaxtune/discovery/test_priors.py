@@ -1,10 +1,13 @@
 """What the prior says against coordinates: a Gaussian for nominal parameters, a heavy tail for sizes of effects."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from jaxtune.discovery.fit import Fit, Free, refine
+from jaxtune.discovery.fit import Fit, Free, refine, taken_over
 from jaxtune.discovery.least_squares import Counts
+from jaxtune.discovery.problem import Hypothesis
 
 NOISE = np.random.default_rng(1).standard_normal(200)
 SLOPE = 3.0 * np.random.default_rng(2).standard_normal(200)
@@ -46,3 +49,23 @@ def test_an_effect_of_ten_deviations_costs_no_more_than_what_ten_sizes_are_worth
 
 def test_a_nominal_parameter_of_ten_deviations_is_held_back():
     assert fitted(0.1, True).cost > fitted(10.0, True).cost + 50.0
+
+
+def test_a_hypothesis_takes_over_what_is_free_along_its_own_axes_alone():
+    # Four axes: three of one link's centre of mass, one of another parameter.
+    directions = np.array([[0.6, 0.8, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0], [0.5, 0.0, 0.0, 0.5]])
+    known = Free(directions, np.ones(4), np.tile([-3.0, 3.0], (4, 1)), np.array([True, True, True, True]))
+    centre = Hypothesis(
+        name="com_offset",
+        family="inertia",
+        places=("link",),
+        directions=np.eye(3, 4),
+        probes=np.eye(3),
+        bounds=np.tile([-1.0, 1.0], (3, 1)),
+        prior=np.ones(3),
+        joints=(0,),
+    )
+    np.testing.assert_array_equal(taken_over(known, centre), [True, True, False, False])
+    # What another effect moves is not free under every hypothesis.
+    tried = replace(known, nominal=np.array([False, True, True, True]))
+    np.testing.assert_array_equal(taken_over(tried, centre), [False, True, False, False])
