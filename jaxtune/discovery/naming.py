@@ -13,6 +13,7 @@ from jaxtune.discovery.problem import Hypothesis, Problem, acts_within
 from jaxtune.discovery.result import AcceptedTerm
 
 _CLEAR = 2.0  # standard errors
+_LITTLE = 0.1  # of the largest size of an effect, below which it is not claimed of a place
 _ODDS = 10.0  # against the model with fewer places, up to which it is taken
 
 
@@ -118,6 +119,9 @@ def _size(candidate: Candidate, part: Hypothesis) -> float:
 def clear_places(fit: Fit, errors: np.ndarray, effect: Hypothesis) -> tuple[str, ...] | None:
     """The places at which an effect with a size for each is clear of zero, the clearest in any case; None for others.
 
+    Where logs are exact, a little of it makes up at other places for the form of a large one. So a place has to have a
+    tenth of the largest size, in the units of the places.
+
     Args:
       fit: of the model.
       errors: [coordinates] standard errors.
@@ -126,8 +130,9 @@ def clear_places(fit: Fit, errors: np.ndarray, effect: Hypothesis) -> tuple[str,
     if not effect.each:
         return None
     own = fit.along(effect)
-    distance = np.abs(fit.coordinates[own]) / errors[own]
-    clear = (distance > _CLEAR) | (distance == distance.max())
+    size = np.abs(fit.coordinates[own])
+    distance = size / errors[own]
+    clear = ((distance > _CLEAR) & (size >= _LITTLE * size.max())) | (distance == distance.max())
     return tuple(place for place, yes in zip(effect.places, clear, strict=True) if yes)
 
 

@@ -247,6 +247,10 @@ def test_an_effect_with_a_size_for_each_place_is_told_of_those_that_are_clear(as
     size = effect["parameters"]["torque_nm.elbow"]
     assert size["low"] < size["value"] < size["high"]
     assert report.brief_keys(question, f"beside {each.key}") == "beside coulomb@each joint"
+    # A place with less than a tenth of the largest size makes up for its form, however exact logs are.
+    sizes = [(0.04, ("elbow",)), (-0.04, ("elbow",)), (0.06, ("shoulder", "elbow"))]
+    for size, told in sizes:
+        assert clear_places(replace(fit, coordinates=np.array([size, 0.5])), np.full(2, 1e-4), each) == told
     # One place is told of in any case.
     assert clear_places(fit, np.array([1.0, 1.0]), each) == ("elbow",)
     assert clear_places(fit, errors, replace(each, each=False)) is None
