@@ -283,7 +283,12 @@ def lacking(reports: Mapping[int, SelfTest]) -> list[str]:
     for name in next(iter(reports.values())).outside:
         enough = [number for number, report in reports.items() if report.outside[name].share >= _ENOUGH]
         tested = ", ".join(map(str, reports))
-        if not enough:
+        if all(report.unusable.get(name, 0) > report.outside[name].of for report in reports.values()):
+            lines.append(
+                f"{name}: most sets cannot be compared, since robots fall within a window, or hardly move; start from "
+                "a policy that stands longer (--policy)"
+            )
+        elif not enough:
             lines.append(
                 f"{name}: outside by one radius, it is noticed in less than {_ENOUGH:.0%} with {tested} episodes; "
                 "more episodes (--episodes), or a policy that moves differently, may show it"

@@ -135,6 +135,9 @@ def test_parameters_that_the_walk_does_not_show_are_named_with_what_helps():
     assert mass == "mass: 10 episodes show it in 80% and more"
     assert "friction: outside by one radius, it is noticed in less than 80% with 5, 10 episodes" in friction
     assert selftest.lacking({5: REPORT}) == []
+    # More episodes of robots that fall at once tell no more.
+    (falls,) = selftest.lacking({5: replace(REPORT, outside={"mass": Rate(3, 10)}, unusable={"mass": 30})})
+    assert "most sets cannot be compared" in falls and "--episodes" not in falls
 
 
 def test_parts_are_computed_once_and_a_damaged_one_is_named(tmp_path):
