@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import mujoco
+import numpy as np
 
 from jaxtune.types import Effect, Parameter
 
@@ -13,13 +14,24 @@ from jaxtune.types import Effect, Parameter
 # so, since the velocity that it multiplies was filtered.
 _PRIOR_SHARE = 0.1
 _NOMINAL_RATIOS = {"link_mass": _PRIOR_SHARE, "link_inertia": _PRIOR_SHARE, "gain_error": 0.035, "damping_gain": 0.05}
-# And by how much, as a share of a link's radius of gyration, its centre of mass is off in each direction.
-LOOSE = 0.03
 # What else a servo's log gives, and instead: of its motor's constants it gives the torque at the stall (kt volts /
 # resistance_ohm) and the braking (kt^2 / resistance_ohm), each as a data sheet does. It has no damping gain.
 SERVO_RATIOS = {"torque_scale": 0.07, "back_emf": 0.1, "damping_gain": 0.0}
 _NOMINAL_FIELDS = {"armature": "dof_armature", "viscous": "dof_damping", "coulomb": "dof_frictionloss"}
+_LOOSE, _LEAST_LOOSE_M = 0.03, 1e-3  # by which a centre of mass is off: of the radius of gyration, and in m
 _MOST_TAKEN = 0.9  # of a field of the model: armature and damping must stay positive
+
+
+def loose(mass: np.ndarray, inertia: np.ndarray) -> np.ndarray:
+    """How far the centres of mass of links are off in each direction, [links] m, one prior standard deviation.
+
+    A share of the link's radius of gyration, and a millimetre at least.
+
+    Args:
+      mass: [links] kg.
+      inertia: [links, 3] kg m^2, about their principal axes.
+    """
+    return np.maximum(_LEAST_LOOSE_M, _LOOSE * np.sqrt(0.5 * inertia.sum(axis=-1) / np.maximum(mass, 1e-9)))
 
 
 @dataclass(frozen=True)

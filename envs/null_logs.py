@@ -21,7 +21,7 @@ import numpy as np
 from mujoco import rollout
 
 from envs import sensing
-from envs.axes import LOOSE
+from envs.axes import loose
 from envs.logs import Log, Run
 from envs.logs.controller import Impedance
 from envs.models import suspended
@@ -98,8 +98,8 @@ def _drawn(spec: mujoco.MjSpec, joints: Sequence[str], rng: np.random.Generator)
     model.body_inertia[:] *= (masses * _factors(rng, model.nbody))[:, None]
     for name in ("dof_armature", "dof_damping", "dof_frictionloss"):
         getattr(model, name)[:] *= _factors(rng, model.nv)
-    lengths = np.sqrt(0.5 * model.body_inertia.sum(axis=1) / np.maximum(model.body_mass, 1e-9))
-    model.body_ipos[:] += LOOSE * lengths[:, None] * rng.standard_normal((model.nbody, 3)).clip(-2.0, 2.0)
+    shifts = rng.standard_normal((model.nbody, 3)).clip(-2.0, 2.0)
+    model.body_ipos[:] += loose(model.body_mass, model.body_inertia)[:, None] * shifts
     # Half of all robots have friction that holds, and half the engine's, which creeps under a load.
     if rng.integers(0, 2):
         model.dof_solimp[:, :2] = np.maximum(model.dof_solimp[:, :2], _HOLDS)

@@ -18,7 +18,7 @@ import numpy as np
 from mujoco import mjx
 
 from envs import sensing
-from envs.axes import LOOSE, Axis, describe_axis
+from envs.axes import Axis, describe_axis, loose
 from envs.chain import MIN_FRICTION_NM, Chain
 from envs.effects import EVERY
 from envs.effects.memory import LONGEST_S
@@ -234,13 +234,13 @@ class Rig:
     def loose_centres(self) -> dict[str, np.ndarray]:
         """Directions along which centres of mass are known least, [directions, 3] m in the link's frame, by link.
 
-        A direction is as long as a centre is usually off, a share of the link's radius of gyration. Along the axis of
-        its own hinge a link's centre hardly shows, and is left out.
+        A direction is as long as a centre is usually off (`envs.axes.loose`). Along the axis of its own hinge a link's
+        centre hardly shows, and is left out.
         """
         model, found = self.mj_model, {}
         for name in self.bodies:
             body = model.body(name)
-            size = LOOSE * np.sqrt(0.5 * body.inertia.sum() / max(body.mass[0], 1e-9))
+            size = loose(body.mass, body.inertia[None])[0]
             hinged = body.jntnum[0] == 1 and model.jnt_type[body.jntadr[0]] == mujoco.mjtJoint.mjJNT_HINGE
             # Rows of `across` are orthonormal, the last two of them across the axis.
             axis = model.jnt_axis[body.jntadr[0]] if hinged else np.zeros(3)
