@@ -1191,7 +1191,7 @@ def test_tuner_does_not_bend_its_parameters_to_physics_that_it_lacks(find):
 @pytest.mark.parametrize(
     ("sizes", "message"),
     [
-        ({"refinements": -1}, "refinements: got -1, expected 0 or more"),
+        ({"refinements": -1}, "refinements: got -1, expected a whole number, 0 or more"),
         ({"held_out_sets": 0}, "held_out_sets: got 0, expected a whole number, 1 or more"),
         ({"episodes": 2.5}, "episodes: got 2.5, expected a whole number, 1 or more"),
         ({"coverage": 90}, "coverage: got 90, expected a number between 0 and 1"),
