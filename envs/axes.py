@@ -18,7 +18,7 @@ _NOMINAL_RATIOS = {"link_mass": _PRIOR_SHARE, "link_inertia": _PRIOR_SHARE, "gai
 # resistance_ohm) and the braking (kt^2 / resistance_ohm), each as a data sheet does. It has no damping gain.
 SERVO_RATIOS = {"torque_scale": 0.07, "back_emf": 0.1, "damping_gain": 0.0}
 _NOMINAL_FIELDS = {"armature": "dof_armature", "viscous": "dof_damping", "coulomb": "dof_frictionloss"}
-_LOOSE, _LEAST_LOOSE_M = 0.03, 1e-3  # by which a centre of mass is off: of the radius of gyration, and in m
+_LOOSE, _LEAST_LOOSE_M = 0.01, 1e-3  # by which a centre of mass is off: of the radius of gyration, and in m
 _MOST_TAKEN = 0.9  # of a field of the model: armature and damping must stay positive
 
 
