@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from envs.axes import loose
 from envs.logs import Controller, read, splits, write
 from envs.scales import measure_scales
 from envs.segments import noise
@@ -300,8 +301,9 @@ def test_centres_of_mass_are_loose_across_their_hinges(spec):
     for axis, name in zip(axes, JOINTS, strict=True):
         hinge = rig.mj_model.joint(name).axis
         assert abs(axis @ hinge) == pytest.approx(np.linalg.norm(axis))
-    # A long uniform rod's radius of gyration is its length over the root of twelve.
-    assert all(0.001 < np.linalg.norm(shift) < 0.01 for shift in shifts)
+    # Of short links a millimetre, of long ones a percent of the radius of gyration.
+    assert all(0.000999 < np.linalg.norm(shift) < 0.003 for shift in shifts)
+    assert loose(np.ones(1), np.full((1, 3), 2.0 / 3.0))[0] == pytest.approx(0.01)
 
 
 def test_more_friction_is_a_change_of_the_model_and_stiction_is_missing_in_it(spec):
