@@ -5,26 +5,6 @@ from dataclasses import dataclass
 MEASURED = ("q", "dq", "tau")
 """Signals of the joints that sensors give, in contrast to targets."""
 
-MISLEADING = (
-    "swapped joints",
-    "flipped sign",
-    "degrees",
-    "radians twice",
-    "millimetres",
-    "millinewtonmetres",
-    "scale",
-    "motors off",
-    "frozen",
-    "wrapped",
-    "missing rows",
-    "clock jump",
-    "misspelt column",
-    "contact",
-)
-"""Kinds of findings that would make a discovery name something else, so that it refuses the log. All others (a low
-rate, short gaps, repeated rows, quantisation, clipping, drift, a delay, an offset) limit what can be learnt, or are
-effects."""
-
 _WRONG = (
     "swapped joints",
     "flipped sign",
@@ -35,6 +15,10 @@ _WRONG = (
     "scale",
     "motors off",
 )
+MISLEADING = (*_WRONG, "frozen", "wrapped", "missing rows", "clock jump", "misspelt column", "contact")
+"""Kinds of findings that would make a discovery name something else, so that it refuses the log. All others (a low
+rate, short gaps, repeated rows, quantisation, clipping, drift, a delay, an offset, constant signals, still joints,
+gains) limit what can be learnt, are left out, or are effects."""
 
 
 @dataclass(frozen=True)

@@ -74,10 +74,12 @@ def read_logs(
 
 def _check_recorded_once(runs: Sequence[Run]) -> None:
     """Refuses a recording that is there twice: it would be fitted, and tested on itself."""
-    found: dict[bytes, str] = {}
+    found: dict[str, str] = {}
     for run in runs:
-        signals = b"".join(np.ascontiguousarray(values).tobytes() for _, values in sorted(run.signals.items()))
-        first = found.setdefault(signals, run.name)
+        signals = hashlib.sha256()
+        for _, values in sorted(run.signals.items()):
+            signals.update(np.ascontiguousarray(values))
+        first = found.setdefault(signals.hexdigest(), run.name)
         if first != run.name:
             raise ValueError(f"runs: got one recording twice, as {first} and as {run.name}; expected each once")
 

@@ -130,16 +130,16 @@ class Problem:
     """[axes]: standard deviation of the nominal parameters, which are free under every hypothesis; zero elsewhere."""
     unknowns: np.ndarray
     """[directions, axes]: one standard deviation along other unknowns that are free from the start: the delay with
-    which the controller reads its sensors and applies its commands, how targets go on between rows, the travel over
-    which dry friction sets in, and the scale of recorded torques."""
+    which the controller reads its sensors and applies its commands, how targets go on between rows, where centres of
+    mass are, how far dry friction creeps, the travel over which it sets in, and the scale of recorded torques."""
     unknown_bounds: np.ndarray
     """[directions, 2]: least and largest coordinate along each."""
     data: Mapping[str, Mapping[float, Segments]]
     """Measured segments by split and horizon (their length in s)."""
     null_logs: Sequence[Mapping[str, Mapping[float, Segments]]]
     """Segments, by split and horizon, of simulated logs of a robot that lacks nothing: the nominal model in another
-    engine, with masses, armatures, dampings and frictions drawn from the prior, and with the noise of the measured
-    log."""
+    engine, with masses, centres of mass, armatures, dampings and frictions drawn from the prior, and with the noise of
+    the measured log."""
     bin_rows: int
     """Rows of a signal whose residuals are averaged to one bin."""
     regimes: tuple[str, ...]
