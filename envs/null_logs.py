@@ -8,6 +8,8 @@ its integrator, the moment at which a controller reads the joint. A null log the
 - its masses, inertias, armatures, dampings and frictions are drawn from the prior, its controller's gains
   are those of the log;
 - if it is unknown whether targets are held between rows, or move on in straight lines, one of them is drawn;
+- half of all controllers act on readings with the noise and the rounding of the logged ones, as those robots' do whose
+  logs hold what their controllers read;
 - the readings get the noise, the rounding, the times and the repetitions that are found in the measured log, column by
   column.
 """
@@ -58,16 +60,20 @@ def simulate_null_logs(log: Log, spec: mujoco.MjSpec, count: int, seed: int) -> 
 
 @dataclass(frozen=True)
 class Robot:
-    """One robot that lacks nothing: its model, how its targets go on between rows, and its random numbers."""
+    """One robot that lacks nothing: its model, how its targets go on between rows, its random numbers, and whether its
+    controller acts on noisy readings."""
 
     model: mujoco.MjModel
     linear: bool
     rng: np.random.Generator
+    noisy: bool = False
 
     @staticmethod
     def drawn(spec: mujoco.MjSpec, joints: Sequence[str], rng: np.random.Generator) -> "Robot":
         """Draws a robot from the prior. Where a log does not say how targets go on, half of all robots go straight."""
-        return Robot(_drawn(spec, joints, rng), bool(rng.integers(0, 2)), rng)
+        model = _drawn(spec, joints, rng)
+        linear, noisy = rng.integers(0, 2, 2).astype(bool)
+        return Robot(model, bool(linear), rng, bool(noisy))
 
     def goes_straight(self, run: Run) -> bool:
         """Whether targets, or torques that were sent, move to the next row in a straight line; else they are held."""
@@ -142,6 +148,7 @@ def play(pairs: Sequence[tuple[Robot, Run]], joints: Sequence[str]) -> list[Moti
     phases = {id(robot): robot.rng.uniform(0.0, 1.0 / rate) for robot, _ in pairs}
     times = np.array([run.time[0] + phases[id(robot)] + looks for robot, run in pairs])
     drive = _Drive([run for _, run in pairs], times, [robot.goes_straight(run) for robot, run in pairs])
+    reads = {name: _Sensors(pairs, name, len(joints)) for name in ("q", "dq")}
     size = mujoco.mj_stateSize(first, mujoco.mjtState.mjSTATE_FULLPHYSICS)
     # Many robots begin a run alike; smoothed, so that noise there does not become an error of the start.
     begins = {number: smoothed(run)[0] for number, run in {id(run): run for _, run in pairs}.items()}
@@ -156,7 +163,8 @@ def play(pairs: Sequence[tuple[Robot, Run]], joints: Sequence[str]) -> list[Moti
         for look in range(len(looks)):
             # Positions of a semi-implicit step are half a step ahead of velocities, as on the rig (`Chain.lead_s`).
             q, dq = state[:, at_q] - 0.5 * first.opt.timestep * state[:, at_v], state[:, at_v]
-            held, brake = drive.torque(look, q, dq)
+            held = drive.torque(look, reads["q"](q, rng), reads["dq"](dq, rng))
+            brake = drive.back_emf(look) * dq
             found[look, :, 0], found[look, :, 1], torques[look] = q, dq, held - brake
             if look == len(gaps):
                 break
@@ -212,10 +220,35 @@ class _Drive:
         each = zip(runs, times, rows, straight, strict=True)
         self._wanted = by_tick([_sent(*one) for one in each])
 
-    def torque(self, look: int, q: np.ndarray, dq: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Commanded torques [runs, joints] at a tick, and what the back electromotive force takes from them."""
-        law, wanted = self._law[look], self._wanted[look]
-        return np.where(self._driven, law.torque(wanted, q, dq), wanted), law.back_emf * dq
+    def torque(self, look: int, q: np.ndarray, dq: np.ndarray) -> np.ndarray:
+        """Torques [runs, joints] that are commanded at a tick, of positions and velocities as they are read."""
+        wanted = self._wanted[look]
+        return np.where(self._driven, self._law[look].torque(wanted, q, dq), wanted)
+
+    def back_emf(self, look: int) -> np.ndarray:
+        """By how much each motor brakes with its velocity, [runs, joints] Nm s/rad."""
+        return self._law[look].back_emf
+
+
+class _Sensors:
+    """What the controllers of many robots read: the joints' exact states, or with the log's noise and rounding.
+
+    Args:
+      pairs: robots, and the runs that they play.
+      signal: `q` or `dq`.
+      joints: their number.
+    """
+
+    def __init__(self, pairs: Sequence[tuple[Robot, Run]], signal: str, joints: int):
+        self._white, self._quantum = np.zeros((2, len(pairs), joints))
+        for index, (robot, run) in enumerate(pairs):
+            # Whatever takes the place of an unknown controller follows measured motion, which has its noise already.
+            if robot.noisy and signal in run.signals and run.controller.kind != "unknown":
+                self._white[index], self._quantum[index] = _white(run, signal), rounding_of(run, signal)
+
+    def __call__(self, exact: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Reads exact values [robots, joints]."""
+        return _sensed(exact, self._white, self._quantum, rng)
 
 
 def as_recorded(robot: Robot, run: Run, motion: Motion) -> Run:
@@ -270,11 +303,18 @@ def _as_read(run: Run, signal: str, motion: Motion, values: np.ndarray, rng: np.
     else:
         last = np.clip(np.searchsorted(motion.times, at, side="right") - 1, 0, len(motion.times) - 1)
         read = np.take_along_axis(values, last, axis=0)
-    quantum = rounding_of(run, signal)
-    # Rounding brings a variance of quantum^2 / 12 of its own, which the noise contains as well.
-    extra = np.sqrt(np.maximum(noise_of(run, signal) ** 2 - quantum**2 / 12.0, 0.0))
-    read = read + extra * rng.standard_normal(read.shape)
-    read = np.where(quantum > 0, np.round(read / np.where(quantum > 0, quantum, 1.0)) * quantum, read)
+    read = _sensed(read, _white(run, signal), rounding_of(run, signal), rng)
     fresh = np.where(stale(run, signal), 0, np.arange(len(read))[:, None])
     read = np.take_along_axis(read, np.maximum.accumulate(fresh, axis=0), axis=0)
     return np.abs(read) if signal == "abs_tau" else read
+
+
+def _white(run: Run, signal: str) -> np.ndarray:
+    """The noise of a signal's columns without that of their rounding, a variance of quantum^2 / 12, [columns]."""
+    return np.sqrt(np.maximum(noise_of(run, signal) ** 2 - rounding_of(run, signal) ** 2 / 12.0, 0.0))
+
+
+def _sensed(exact: np.ndarray, white: np.ndarray, quantum: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Adds white noise to exact values and rounds them; a quantum of zero does not round."""
+    read = exact + white * rng.standard_normal(exact.shape)
+    return np.where(quantum > 0, np.round(read / np.where(quantum > 0, quantum, 1.0)) * quantum, read)

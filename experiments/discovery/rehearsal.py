@@ -46,6 +46,8 @@ def rehearsal(
     if controller.kind != "pd" or seconds * controller.rate_hz > _MOST_TICKS:
         return None
     robots = [Robot.drawn(spec, joints, np.random.default_rng(seed)) for seed in range(_ROBOTS)]
+    # No sensor has been seen yet.
+    robots = [replace(robot, noisy=False) for robot in robots]
 
     def rehearse(one: TargetRun) -> np.ndarray:
         run = run_of(one, controller)
