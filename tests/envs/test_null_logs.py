@@ -191,3 +191,24 @@ def test_torques_of_which_nothing_is_said_are_held_in_all_null_logs(spec):
         robot.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION
     held, too = (as_recorded(one, run, play([(one, run)], ARM_JOINTS)[0]).signals["q"] for one in robots)
     np.testing.assert_array_equal(held, too)
+
+
+def test_controllers_that_read_noise_shake_their_joints(spec):
+    # Encoders with steps of 20 mrad.
+    known = {"q": {"quantum": np.full(2, 0.02), "noise_sd": np.full(2, 0.02) / np.sqrt(12.0)}}
+    run = measured(known=known)
+    exact, noisy = (
+        play([(Robot(suspended(spec), False, np.random.default_rng(0), noisy), run)], ARM_JOINTS)[0]
+        for noisy in (False, True)
+    )
+    # In steps of 20 mrad the controller sees the joint, so its torque, less that of its damping, moves in steps of kp.
+    target = run.signals["target"][np.searchsorted(run.time, noisy.times + 1e-9, side="right") - 1]
+    stiff = noisy.torques + GAINS["kd"] * noisy.states[:, 1]
+    steps = (target - stiff / GAINS["kp"])[: len(noisy.times) - 1] / 0.02
+    np.testing.assert_allclose(steps, np.round(steps), atol=1e-6)
+    assert 0 < np.abs(noisy.states[:, 0] - exact.states[:, 0]).max() < 0.05
+
+
+def test_half_of_all_null_controllers_read_noise(spec):
+    drawn = [Robot.drawn(spec, ARM_JOINTS, np.random.default_rng(seed)).noisy for seed in range(200)]
+    assert 70 < sum(drawn) < 130
