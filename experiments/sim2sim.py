@@ -25,7 +25,7 @@ from experiments.walking import comparison, memory
 from experiments.walking.cases import Case, check_positive, check_seeds, checked_case, errors
 from experiments.walking.comparison import METHODS, UPDATES, contenders
 from experiments.walking.learner import Learner, Policy
-from experiments.walking.policies import default_policy, starting_policy
+from experiments.walking.policies import default_policy, policy_of_run
 from experiments.walking.robots import Kind, kind
 from jaxtune import tuner
 from jaxtune.mjx import Entry, parameters
@@ -230,11 +230,10 @@ def main(args: Args) -> None:
     memory.check(learner)
     if "ours" in args.methods:
         tell_limits(sizes)
-    # A policy that cannot be loaded must be an error before the folder is made. One from scratch is kept in the folder.
-    policy = None if args.policy == "scratch" else starting_policy(args.policy, learner)
+    policy = policy_of_run(args.policy, learner)
     checkpoint.open_run(args.out, identity)
     target = robot.engines[case.target](learner.robot, case.true_params(entries, args.start))
-    runner = Runner(args, learner, target, policy or starting_policy(args.policy, learner, args.out), knobs)
+    runner = Runner(args, learner, target, policy(args.out), knobs)
     with bars() as progress:
         results = {name: [runner(name, seed, progress) for seed in args.seeds] for name in args.methods}
     off = case.off(entries)

@@ -27,7 +27,7 @@ from experiments.walking import memory
 from experiments.walking.cases import Case, check_positive, check_seeds, checked_case, errors
 from experiments.walking.comparison import UPDATES
 from experiments.walking.learner import Learner, Policy
-from experiments.walking.policies import default_policy, starting_policy
+from experiments.walking.policies import default_policy, policy_of_run
 from experiments.walking.robots import Kind, kind
 from jaxtune import devices, tuner
 from jaxtune.mjx import Entry, parameters
@@ -198,11 +198,10 @@ def main(args: Args) -> None:
     identity = {**dataclasses.asdict(args), **robot.identity, "sizes": sizes}
     for option in ("out", *hosts.OPTIONS):
         del identity[option]
-    # A policy that cannot be loaded must be an error before the folder is made. One from scratch is kept in the folder.
-    policy = None if args.policy == "scratch" else starting_policy(args.policy, learner)
+    policy = policy_of_run(args.policy, learner)
     checkpoint.open_run(args.out, identity)
     with checkpoint.lock(args.out / "summary.json"):
-        sweep(args, learner, case, policy or starting_policy(args.policy, learner, args.out))
+        sweep(args, learner, case, policy(args.out))
 
 
 def sweep(args: Args, learner: Learner, case: Case, policy: Policy) -> None:

@@ -18,7 +18,7 @@ from experiments.robot import policy_files, report
 from experiments.robot.records import Round
 from experiments.robot.rounds import STRATEGIES, Programs, Rounds, Terms
 from experiments.walking.learner import Learner
-from experiments.walking.policies import default_policy, starting_policy
+from experiments.walking.policies import default_policy, policy_of_run
 from experiments.walking.robots import Kind, kind
 from jaxtune.mjx import Entry, nominal
 
@@ -126,12 +126,12 @@ def play(transfer: Transfer, programs: Programs) -> list[Round]:
     policy_files.require_onnx()
     learner = programs.learner
     transfer = replace(transfer, policy=transfer.policy or default_policy(learner.kind))
-    # A policy that cannot be loaded must be an error before the folder is made. One from scratch is kept in the folder.
-    policy = None if transfer.policy == "scratch" else starting_policy(transfer.policy, learner)
+    policy = policy_of_run(transfer.policy, learner)
     checkpoint.open_run(transfer.out, learner.kind.identity | _identity(transfer, learner.preset))
     with checkpoint.lock(transfer.out / "summary.json"):
-        policy = policy or starting_policy(transfer.policy, learner, transfer.out)
-        rounds = Rounds(transfer.out, transfer.terms, programs, transfer.method, policy, start, transfer.radius)
+        rounds = Rounds(
+            transfer.out, transfer.terms, programs, transfer.method, policy(transfer.out), start, transfer.radius
+        )
         history: list[Round] = []
         with bars() as progress:
             task = progress.add_task("", total=transfer.rounds)

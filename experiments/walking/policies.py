@@ -143,6 +143,25 @@ def default_policy(kind: Kind) -> str:
     return "scratch" if kind.policy is None else "walk"
 
 
+def policy_of_run(name: str, learner: Learner) -> Callable[[Path], Policy]:
+    """Loads the policy of a run before its folder is made, so that one that cannot be loaded leaves no folder.
+
+    Args:
+      name: as of `starting_policy`; `scratch` is not trained yet.
+      learner: robot and sizes of the run.
+
+    Returns:
+      What gives the policy once the folder of the run is there.
+
+    Raises:
+      ValueError: as `starting_policy`.
+    """
+    if name == "scratch":
+        return lambda out: starting_policy(name, learner, out)
+    policy = starting_policy(name, learner)
+    return lambda _: policy
+
+
 def starting_policy(name: str, learner: Learner, out: Path | None = None) -> Policy:
     """Loads the policy that a command begins with.
 

@@ -33,7 +33,7 @@ def learner(monkeypatch):
     made.play = made.step = lambda *_: None
     for command in (sim2sim, sweep):
         monkeypatch.setattr(command, "Learner", lambda *_, **__: made)
-        monkeypatch.setattr(command, "starting_policy", lambda *_: None)
+        monkeypatch.setattr(command, "policy_of_run", lambda *_: lambda _: None)
         monkeypatch.setattr(command.memory, "check", lambda *_: None)
     return made
 
