@@ -93,12 +93,19 @@ def read(folder: Path) -> Correction:
       The record of it; the MJCF is not compiled here.
 
     Raises:
-      ValueError: a file is missing, or an effect is not in the library.
+      ValueError: a file is missing or damaged, or an effect is not in the library.
     """
     for name in (MODEL, EFFECTS):
         if not (folder / name).exists():
             raise ValueError(f"model: {folder / name} is missing")
-    effects = json.loads((folder / EFFECTS).read_text())["effects"]
+    try:
+        effects = json.loads((folder / EFFECTS).read_text())["effects"]
+        values = [value for places in effects.values() for place in places.values() for value in place.values()]
+        finite = bool(np.isfinite(np.array(values, np.float64)).all())
+    except (ValueError, KeyError, TypeError, AttributeError):
+        finite = False
+    if not finite:
+        raise ValueError(f"{folder / EFFECTS}: is damaged, expected numbers by effect, place and parameter")
     # Checked here, not when it is simulated, so that a run is refused before anything is computed.
     for name in effects:
         if name not in EVERY:

@@ -140,6 +140,24 @@ def test_an_unknown_effect_or_place_is_refused_by_name(tmp_path):
         corrected.read(tmp_path / "nowhere")
 
 
+@pytest.mark.parametrize(
+    "content",
+    [
+        "",
+        "{}",
+        '{"effects": [1]}',
+        '{"effects": {"backlash": 0.1}}',
+        '{"effects": {"backlash": {"left_knee": {"rad": "wide"}}}}',
+        '{"effects": {"backlash": {"left_knee": {"rad": NaN}}}}',
+    ],
+)
+def test_damaged_effects_are_refused_by_the_name_of_their_file(tmp_path, content):
+    (tmp_path / "model.xml").write_text("<mujoco/>")
+    (tmp_path / "effects.json").write_text(content)
+    with pytest.raises(ValueError, match=r"effects\.json: is damaged"):
+        corrected.read(tmp_path)
+
+
 @pytest.mark.parametrize(("old", "new"), [('"left_knee"', '"third_knee"'), ('"home"', '"start"')])
 def test_a_model_of_another_robot_is_refused(tmp_path, old, new):
     text = constants.MODEL_PATH.read_text()
