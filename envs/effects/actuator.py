@@ -95,6 +95,7 @@ def _torque_lag(values, torque, now, memory):
 
 _HARDEST = 0.02  # softness below which powers leave single precision
 _SECONDS = Parameter(name="seconds", bounds=(0.0, 0.04), prior=0.01)  # `memory.LONGEST_S` at most
+_LAG_SECONDS = Parameter(name="seconds", bounds=(0.0, 0.15), prior=0.01)  # hydraulic drives take 0.1 s
 
 # The order counts within a stage: targets are delayed before they are slewed, torques limited before they lag.
 ROWS = (
@@ -169,7 +170,7 @@ ROWS = (
     Effect(
         name="torque_lag",
         enters="torque",
-        parameters=(_SECONDS,),
+        parameters=(_LAG_SECONDS,),
         sizes=(0.001, 0.008),
         act=_torque_lag,
         start=as_it_is,

@@ -78,9 +78,8 @@ def conclude(settings: Settings, problem: Problem, floor: NoiseFloor, state: Sta
     learned = learn(settings, problem, at, best)
     models = _by_select(problem, at, state, best, learned)
     usual, share, whole = _shares(settings, problem, at, (state.null, best, learned))
-    explains = usual[1].max() <= settings.at_floor or (
-        bool(terms) and share >= settings.share and whole >= settings.least
-    )
+    asked = settings.share_near if usual[1].max() <= settings.near else settings.share
+    explains = usual[1].max() <= settings.at_floor or (bool(terms) and share >= asked and whole >= settings.least)
     changed = _at_bounds(problem, best.fit, state.price) if explains else {}
     explains = explains and (len(changed) < settings.strained or usual[1].max() < settings.much)
     verdict = _verdict(problem, terms, changed) if explains else "unnamed"

@@ -35,6 +35,11 @@ class Settings:
     share: float = 0.7
     """Share of the explainable gap, and of the explainable cost, that the accepted effects must explain together; with
     less the verdict is `unnamed`."""
+    share_near: float = 0.5
+    """That share where at most `near` floor units are left. No form of the library is exactly the robot's, and what it
+    leaves weighs more in a small gap."""
+    near: float = 3.0
+    """Gap in floor units that is small."""
     least: float = 0.3
     """The same share of the whole gap above the floor: a learned torque cannot explain everything either."""
     strained: int = 2
