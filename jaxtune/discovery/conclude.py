@@ -18,7 +18,7 @@ from jaxtune.discovery.problem import Hypothesis, Problem
 from jaxtune.discovery.resample import standard_errors
 from jaxtune.discovery.result import AcceptedTerm, DroppedTerm, Settings, Suspect
 from jaxtune.discovery.screen import Lead
-from jaxtune.discovery.shares import energy, explained, explained_shares, open_gaps, speak
+from jaxtune.discovery.shares import energy, enough, explained, explained_shares, open_gaps, speak
 from jaxtune.discovery.state import State
 
 _SUSPECTS = 8
@@ -78,8 +78,7 @@ def conclude(settings: Settings, problem: Problem, floor: NoiseFloor, state: Sta
     learned = learn(settings, problem, at, best)
     models = _by_select(problem, at, state, best, learned)
     usual, share, whole = _shares(settings, problem, at, (state.null, best, learned))
-    asked = settings.share_near if usual[1].max() <= settings.near else settings.share
-    explains = usual[1].max() <= settings.at_floor or (bool(terms) and share >= asked and whole >= settings.least)
+    explains = enough(settings, usual[1].max(), share if terms else 0.0, whole)
     changed = _at_bounds(problem, best.fit, state.price) if explains else {}
     explains = explains and (len(changed) < settings.strained or usual[1].max() < settings.much)
     verdict = _verdict(problem, terms, changed) if explains else "unnamed"

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtune.discovery.candidate import Candidate, Measure, finite, squares
 from jaxtune.discovery.noise_floor import Floor
 from jaxtune.discovery.problem import Problem
+from jaxtune.discovery.result import Settings
 
 _PERFECT = 1.0  # floor units
 
@@ -51,6 +52,19 @@ def explained_shares(energies: Sequence[float], costs: Sequence[float]) -> tuple
     """
     both = [explained(null, after, min(after, bound)) for null, after, bound in (energies, costs)]
     return min(both), explained(energies[0], energies[1], 0.0)
+
+
+def enough(settings: Settings, left: float, share: float, whole: float) -> bool:
+    """Whether a model explains what there is, well enough to say what is missing, or that nothing is.
+
+    Args:
+      settings: how much is asked.
+      left: largest gap that it leaves in floor units.
+      share: what its effects explain of the explainable gap, zero without effects.
+      whole: what they explain of the whole gap above the floor.
+    """
+    asked = settings.share_near if left <= settings.near else settings.share
+    return left <= settings.at_floor or (share >= asked and whole >= settings.least)
 
 
 def energy(gaps: np.ndarray) -> float:

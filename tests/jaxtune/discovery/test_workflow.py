@@ -17,7 +17,7 @@ from jaxtune.discovery.fit import begin
 from jaxtune.discovery.naming import at_fewest_places, moved_forms, renamed, with_refinements
 from jaxtune.discovery.result import AcceptedTerm, Settings
 from jaxtune.discovery.screen import Lead
-from jaxtune.discovery.shares import explained, speak
+from jaxtune.discovery.shares import enough, explained, speak
 
 
 def discover(truth, seed=0, say=lambda line: None, **kwargs):
@@ -389,6 +389,21 @@ def test_typical_segments_speak_where_others_do_not_pay_for_them(typical, usual,
     of_usual, of_typical = ([np.array([value]) for value in gaps] for gaps in (usual, typical))
     heard = speak(of_usual, of_typical, Settings().at_floor)
     assert [gaps is of_typical for gaps in heard] == ([False, True] if speaks else [False])
+
+
+@pytest.mark.parametrize(
+    ("left", "share", "whole", "expected"),
+    [
+        (1.4, 0.0, 0.0, True),  # at the floor nothing need be explained
+        (2.1, 0.6, 0.5, True),
+        (2.1, 0.4, 0.4, False),
+        (5.0, 0.6, 0.5, False),  # of a large gap more has to be explained
+        (5.0, 0.8, 0.5, True),
+        (2.1, 1.0, 0.2, False),  # neither effects nor a learned torque explain much
+    ],
+)
+def test_effects_that_explain_enough(left, share, whole, expected):
+    assert enough(Settings(), left, share, whole) is expected
 
 
 def test_an_effect_costs_what_chance_gains_on_null_logs():
