@@ -101,7 +101,7 @@ def read(folder: Path) -> Correction:
     try:
         effects = json.loads((folder / EFFECTS).read_text())["effects"]
         values = [value for places in effects.values() for place in places.values() for value in place.values()]
-        finite = bool(np.isfinite(np.array(values, np.float64)).all())
+        finite = np.isfinite(values).all()
     except (ValueError, KeyError, TypeError, AttributeError):
         finite = False
     if not finite:

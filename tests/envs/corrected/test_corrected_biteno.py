@@ -148,6 +148,7 @@ def test_an_unknown_effect_or_place_is_refused_by_name(tmp_path):
         '{"effects": [1]}',
         '{"effects": {"backlash": 0.1}}',
         '{"effects": {"backlash": {"left_knee": {"rad": "wide"}}}}',
+        '{"effects": {"backlash": {"left_knee": {"rad": "0.1"}}}}',
         '{"effects": {"backlash": {"left_knee": {"rad": NaN}}}}',
     ],
 )
