@@ -42,6 +42,7 @@ _LONGEST_STEP_S = 0.001
 # Stages whose memories depend on where links are, not on measured motors alone.
 _FOLLOWED = ("transmission", "bristle", "sensor")
 _RATE_S = 0.012  # over which a light rotor's speed within its gears is taken, where a segment begins
+_GEARS_S = 0.06  # of the history, in which gears that give way are simulated
 _PRESSED_S = 0.01  # over which the torque on the gears is taken: that of a measured motor is noisy
 
 
@@ -320,8 +321,8 @@ class Rig:
     def simulate(self, values: ByEffect, segment: Segment, steps: jax.Array | None = None) -> dict[str, jax.Array]:
         """Simulates a segment of a log under one hypothesis.
 
-        First the measured history before the segment fills the memories of the effects. Where gears give way, the
-        history is simulated as well, to know where their links are, with rotors held to their measured motion. Where
+        First the measured history before the segment fills the memories of the effects. Where gears give way, its
+        end is simulated as well, to know where their links are, with rotors held to their measured motion. Where
         encoders are at joints, it is to know where rotors are, with links held. Then the robot starts from its measured
         state, with the errors of its sensors undone, and is simulated to the segment's end.
 
@@ -379,6 +380,11 @@ class Rig:
         def remember(memory, inputs):
             return chain.remember(values, memory, *inputs)
 
+        # Delays need the whole history, and gears the end of it: to simulate them takes longer than to remember.
+        early = before - round(_GEARS_S / self.dt)
+        first, _ = jax.lax.scan(remember, first, (truth[:early], jax.tree.map(lambda x: x[:early], past)))
+        past = jax.tree.map(lambda x: x[early:], past)
+        truth, acceleration, before = truth[early:], acceleration[early:], before - early
         memory, torque = jax.lax.scan(remember, first, (truth[:before], past))
         # Where joints are behind their motors was not measured. It matters, and takes time, only if gears give way.
         gears = {row.name: row.parameters[0].name for row in chain.entering("transmission")}

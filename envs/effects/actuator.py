@@ -8,7 +8,7 @@ separates it from the others.
 import jax
 import jax.numpy as jnp
 
-from envs.effects.memory import PAST_TARGET_STEP_S, as_it_is, delay_line, delayed, lagged
+from envs.effects.memory import LONGEST_S, PAST_TARGET_STEP_S, as_it_is, delay_line, delayed, lagged
 from jaxtune.types import Effect, Form, Parameter
 
 _ACTUATOR = {"family": "actuator", "on": "joint"}
@@ -94,7 +94,7 @@ def _torque_lag(values, torque, now, memory):
 
 
 _HARDEST = 0.02  # softness below which powers leave single precision
-_SECONDS = Parameter(name="seconds", bounds=(0.0, 0.04), prior=0.01)  # `memory.LONGEST_S` at most
+_SECONDS = Parameter(name="seconds", bounds=(0.0, LONGEST_S), prior=0.01)
 _LAG_SECONDS = Parameter(name="seconds", bounds=(0.0, 0.15), prior=0.01)  # hydraulic drives take 0.1 s
 
 # The order counts within a stage: targets are delayed before they are slewed, torques limited before they lag.

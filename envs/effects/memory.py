@@ -6,7 +6,7 @@ Each has a function that starts it in steady state and one that advances it by a
 import jax
 import jax.numpy as jnp
 
-LONGEST_S = 0.04
+LONGEST_S = 0.1
 """Longest delay that a line can hold, in s. Simulations start with at least as much history (`envs.segments`)."""
 
 PAST_STEP_S = 0.01

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.effects.memory import delay_line, delayed, filtered
+from envs.effects.memory import LONGEST_S, delay_line, delayed, filtered
 from jaxtune.types import Effect, Form, Parameter
 
 _SENSING = {"family": "sensing"}
@@ -92,7 +92,7 @@ def _imu_tilt(values, gravity, now, memory):
     return gravity + turn @ gravity, memory
 
 
-_SECONDS = Parameter(name="seconds", bounds=(0.0, 0.04), prior=0.01)  # `memory.LONGEST_S` at most
+_SECONDS = Parameter(name="seconds", bounds=(0.0, LONGEST_S), prior=0.01)
 
 ROWS = (
     Effect(

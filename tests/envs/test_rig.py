@@ -185,6 +185,8 @@ GAINS = {"kp": np.array([60.0, 40.0]), "kd": np.array([2.0, 1.0]), "torque_limit
 def recut(arm, target, signals=("q", "dq"), **effects):
     """Segments of 0.15 s of a run that the rig itself has played, read every 5 ms."""
     dt, rows = arm.rig.dt, slice(None, None, 5)
+    # The first segment begins 0.06 s after the motion.
+    target = np.concatenate([np.repeat(target[:1], round((segments.HISTORY_S - 0.06) / dt), axis=0), target])
     read = arm.play(rigs.segment(arm.rig, target[0], target, *GAINS.values(), steps=len(target)), **effects)
     run = Run(
         name="run_000",
@@ -207,7 +209,7 @@ def errors(arm, cut, **effects):
 
 
 def test_bristles_of_a_segment_are_where_its_motion_has_wound_them(arm):
-    # Up and down again by 60 mrad, in 2 s each: after the reversal bristles of 4 mrad need longer than the 0.06 s
+    # Up and down again by 60 mrad, in 2 s each: after the reversal bristles of 4 mrad need longer than the 0.12 s
     # before a segment to be wound the other way.
     target = START + np.concatenate([np.linspace(0.0, 0.06, 2000), np.linspace(0.06, 0.0, 2000)])[:, None]
     rubbing = {
@@ -231,6 +233,7 @@ SWING = np.array([0.4, -0.5]) + np.array([0.3, 0.4]) * np.sin(2 * np.pi * np.arr
         ("sensor_lag", {"seconds": 0.008}, 0.5e-3),
         ("sensor_delay", {"seconds": 0.008}, 0.5e-3),
         ("command_delay", {"seconds": 0.008}, 0.3e-3),
+        ("command_delay", {"seconds": 0.1}, 0.3e-3),
         ("torque_lag", {"seconds": 0.008}, 0.3e-3),
         ("target_slew", {"rad_per_s": 1.0}, 4e-3),
         ("backlash", {"rad": 0.02}, 1e-3),

@@ -288,14 +288,14 @@ def moving():
     return run(time, q=position, dq=velocity, target=number * [1.0, -1.0])
 
 
-# 0.06 s before, 0.04 s ahead, of 1 ms each.
-BEFORE, AHEAD = 60, 40
+# 0.12 s before, 0.1 s ahead, of 1 ms each.
+BEFORE, AHEAD = 120, 100
 
 
 def test_pieces_follow_on_each_other_and_have_a_history(moving):
     cut = segments.cut([moving], 0.15, DT)
-    # 0.15 s are 30 rows; the first with 0.06 s before it is row 12: from 12, 42, ... up to row 200.
-    np.testing.assert_array_equal(cut.row[:, 0], [13, 43, 73, 103, 133, 163])
+    # 0.15 s are 30 rows; the first with 0.12 s before it is row 24: from 24, 54, ... up to row 200.
+    np.testing.assert_array_equal(cut.row[:, 0], [25, 55, 85, 115, 145])
     np.testing.assert_array_equal(cut.row, cut.row[:, :1] + np.arange(30))
     np.testing.assert_array_equal(cut.run, 0)
     assert round(LONGEST_S / DT) == AHEAD
@@ -304,10 +304,10 @@ def test_pieces_follow_on_each_other_and_have_a_history(moving):
     # 0.15 s and one step for the end, or two where times are no multiples to the last bit.
     _, steps = one.sample.shape
     assert BEFORE + 151 <= steps <= BEFORE + 152
-    assert one.measured.shape == (6, BEFORE + 1 + AHEAD, 2, 2)
+    assert one.measured.shape == (5, BEFORE + 1 + AHEAD, 2, 2)
     for name in ("target", "between", "feed", "stiffness", "damping", "limit", "emf"):
-        assert getattr(one, name).shape == (6, steps, 2), name
-    assert one.row_step.shape == one.row_share.shape == (6, 30)
+        assert getattr(one, name).shape == (5, steps, 2), name
+    assert one.row_step.shape == one.row_share.shape == (5, 30)
 
 
 def test_what_was_measured_at_the_rows_is_what_was_measured(moving):
@@ -411,10 +411,10 @@ def test_the_controllers_numbers_are_the_logs(moving):
 
 
 def test_a_motor_that_is_off_has_no_stiffness_and_no_torque(moving):
-    enabled = (np.arange(len(moving.time)) < 20).astype(float)
+    enabled = (np.arange(len(moving.time)) < 32).astype(float)
     off = replace(moving, signals={**moving.signals, "enabled": enabled})
     cut = segments.cut([off], 0.15, DT)
-    # The first piece begins at row 12, so eight rows of five steps are left.
+    # The first piece begins at row 24, so eight rows of five steps are left.
     for name in ("stiffness", "damping", "limit"):
         values = np.asarray(getattr(cut.segments, name))
         assert np.all(values[0, : BEFORE + 40] > 0), name
@@ -445,12 +445,12 @@ def test_torques_that_were_sent_are_fed(moving):
 
 
 def test_runs_are_cut_alike_and_know_whose_they_are(moving):
-    short = run(times(0.4), name="run_001")
+    short = run(times(0.46), name="run_001")
     cut = segments.cut([moving, short], 0.15, DT)
-    # 0.4 s are 80 rows: from 12 and from 42.
-    np.testing.assert_array_equal(cut.run, [0] * 6 + [1] * 2)
-    np.testing.assert_array_equal(cut.row[6:, 0], [13, 43])
-    np.testing.assert_array_equal(cut.signals["q"][6:], 0.0)
+    # 0.46 s are 92 rows: from 24 and from 54.
+    np.testing.assert_array_equal(cut.run, [0] * 5 + [1] * 2)
+    np.testing.assert_array_equal(cut.row[5:, 0], [25, 55])
+    np.testing.assert_array_equal(cut.signals["q"][5:], 0.0)
     # Only one of them has velocities.
     assert set(cut.signals) == {"q"}
 
@@ -463,7 +463,7 @@ def test_a_segment_has_whole_bins():
 
 
 def test_runs_that_are_too_short_are_named():
-    with pytest.raises(ValueError, match=r"runs: the longest has 0\.2 s, expected more than 0\.21 s"):
+    with pytest.raises(ValueError, match=r"runs: the longest has 0\.2 s, expected more than 0\.27 s"):
         segments.cut([run(times(0.2))], 0.15, DT)
 
 
@@ -472,21 +472,21 @@ def test_runs_that_are_too_short_are_named():
 
 def test_a_whole_run_is_one_piece(moving):
     cut = segments.whole([moving], DT)
-    np.testing.assert_array_equal(cut.row, [np.arange(13, 201)])
-    np.testing.assert_allclose(cut.signals["q"][0], moving.signals["q"][13:], rtol=1e-6)
+    np.testing.assert_array_equal(cut.row, [np.arange(25, 201)])
+    np.testing.assert_allclose(cut.signals["q"][0], moving.signals["q"][25:], rtol=1e-6)
     at = DT * (cut.segments.row_step + cut.segments.row_share)
-    np.testing.assert_allclose(at[0], moving.time[13:] - moving.time[12], atol=1e-6)
+    np.testing.assert_allclose(at[0], moving.time[25:] - moving.time[24], atol=1e-6)
     # The last row can be read, and no more is simulated than it takes.
-    assert cut.segments.target.shape == (1, BEFORE + 941, 2)
+    assert cut.segments.target.shape == (1, BEFORE + 881, 2)
 
 
 def test_whole_runs_are_of_equal_shape(moving):
     short = run(times(0.4), name="run_001", q=np.ones((81, 2)))
     cut = segments.whole([moving, short], DT)
     np.testing.assert_array_equal(cut.run, [0, 1])
-    np.testing.assert_array_equal(cut.row[1], [*range(13, 81), *[80] * 120])
-    np.testing.assert_allclose(cut.segments.row_step[1, 68:], 340)
-    assert len(np.unique(cut.row[1])) == 68
+    np.testing.assert_array_equal(cut.row[1], [*range(25, 81), *[80] * 120])
+    np.testing.assert_allclose(cut.segments.row_step[1, 56:], 280)
+    assert len(np.unique(cut.row[1])) == 56
 
 
 def test_velocities_between_rows_are_as_good_as_those_at_rows():
