@@ -17,11 +17,10 @@ import mujoco
 import numpy as np
 from mujoco import mjx
 
-from envs import sensing
+from envs import beginning, sensing
 from envs.axes import Axis, describe_axis, loose
 from envs.chain import MIN_FRICTION_NM, Chain
 from envs.effects import EVERY
-from envs.effects.memory import LONGEST_S
 from envs.held import unread_joints
 from envs.models import links, suspended
 from envs.segments import Segment
@@ -39,11 +38,6 @@ System = tuple[mjx.Model, mjx.Data, jax.Array]
 # solver that has converged; with three iterations, up to 8.
 _ITERATIONS = 4
 _LONGEST_STEP_S = 0.001
-# Stages whose memories depend on where links are, not on measured motors alone.
-_FOLLOWED = ("transmission", "bristle", "sensor")
-_RATE_S = 0.012  # over which a light rotor's speed within its gears is taken, where a segment begins
-_GEARS_S = 0.06  # of the history, in which gears that give way are simulated
-_PRESSED_S = 0.01  # over which the torque on the gears is taken: that of a measured motor is noisy
 
 
 class Rig:
@@ -337,7 +331,7 @@ class Rig:
         """
         model = self.model(values)
         chain = self.chain
-        data, memory, future = self._begin(model, values, segment)
+        data, memory, future = beginning.begin(chain, model, self._data, values, segment)
         take = lambda index: jax.tree.map(lambda x: x[index], future)  # noqa: E731
 
         def move(index, carry):
@@ -356,66 +350,3 @@ class Rig:
         # The base does not move, so the IMU reads the same at all rows.
         gravity, _ = chain.stage("gravity", values, self._gravity, None, {})
         return read | {"gravity": jnp.broadcast_to(gravity, (len(step), 3))}
-
-    def _begin(self, model, values, segment) -> tuple[mjx.Data, dict, dict]:
-        """The robot and the memories at a segment's start, and what its controller is given from there on."""
-        # Measured states go on for `LONGEST_S` after the start, because undoing a delay needs later readings.
-        before = len(segment.measured) - 1 - round(LONGEST_S / self.dt)
-        drive = {
-            name: getattr(segment, name)
-            for name in ("target", "between", "feed", "stiffness", "damping", "limit", "emf", "sample")
-        }
-        drive["emf"], _ = self.chain.stage("back_emf", values, segment.emf, None, {})
-        past = jax.tree.map(lambda x: x[:before], drive)
-        future = jax.tree.map(lambda x: x[before:], drive)
-        # The readings as they would have been without this hypothesis' sensor errors.
-        truth, chain = segment.measured, self.chain
-        for row in chain.entering("sensor"):
-            if row.undo is not None:
-                truth = row.undo(values[row.name], truth, self.dt)
-        acceleration = jnp.gradient(truth[:, 1], self.dt, axis=0)
-        take = lambda inputs, index: jax.tree.map(lambda x: x[index], inputs)  # noqa: E731
-        first = chain.start(values, truth[0], take(drive, 0), segment.past, segment.past_target)
-
-        def remember(memory, inputs):
-            return chain.remember(values, memory, *inputs)
-
-        # Delays need the whole history, and gears the end of it: to simulate them takes longer than to remember.
-        early = before - round(_GEARS_S / self.dt)
-        first, _ = jax.lax.scan(remember, first, (truth[:early], jax.tree.map(lambda x: x[:early], past)))
-        past = jax.tree.map(lambda x: x[early:], past)
-        truth, acceleration, before = truth[early:], acceleration[early:], before - early
-        memory, torque = jax.lax.scan(remember, first, (truth[:before], past))
-        # Where joints are behind their motors was not measured. It matters, and takes time, only if gears give way.
-        gears = {row.name: row.parameters[0].name for row in chain.entering("transmission")}
-        gives = jnp.stack([values[name][size] != 0 for name, size in gears.items()]).any(axis=0)
-        pressing = torque - model.dof_armature[self.dof] * acceleration[:before]
-        first = first | chain.pressed(values, pressing[: round(_PRESSED_S / self.dt)])
-
-        def at(index, data, memory, speeding):
-            """The robot at a step of the history, with accelerations [joints]."""
-            state = truth[index] - chain.at_encoders(values, chain.ahead(memory))
-            return data.replace(
-                qpos=self._data.qpos.at[self.qpos].set(state[0] + chain.lead_s * state[1]),
-                qvel=self._data.qvel.at[self.dof].set(state[1]),
-                # The chain's first step needs an acceleration, for the rotors' torque.
-                qacc=self._data.qacc.at[self.dof].set(speeding),
-                qacc_warmstart=self._data.qacc.at[self.dof].set(speeding),
-            )
-
-        def follow(index, carry):
-            data, memory, rates = carry
-            data, memory = chain.follow(model, data, memory, values, truth[index], torque[index], take(past, index))
-            # A light rotor's speed within its gears jumps from step to step.
-            rates = {name: rate + self.dt / _RATE_S * (memory[name][1] - rate) for name, rate in rates.items()}
-            return data, memory, rates
-
-        begun = at(0, self._data, first, acceleration[0]), first, {name: first[name][1] for name in gears}
-        data, followed, rates = jax.lax.fori_loop(jnp.where(gives.any(), 0, before), before, follow, begun)
-        rows = (row.name for row in chain.rows if row.enters in _FOLLOWED and row.start is not None)
-        for name in ("passed", "within", *rows):
-            memory[name] = jnp.where(gives, followed[name], memory[name])
-        for name in gears:
-            memory[name] = memory[name].at[1].add(chain.light(model) * (rates[name] - memory[name][1]))
-        data = at(before, data, memory, jnp.where(gives, data.qacc[self.dof], acceleration[before]))
-        return data, memory, future

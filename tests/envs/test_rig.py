@@ -11,7 +11,7 @@ import pytest
 import reference
 import rigs
 
-from envs import models, segments
+from envs import beginning, models, segments
 from envs.biteno import constants
 from envs.effects import LIBRARY
 from envs.logs import Controller, Run
@@ -322,7 +322,7 @@ def of_two_bodies(effect, spec, at_motor, damping=0.05):
 def read_and_true(rig, values, segment):
     """Positions that are read of a robot, which are those of its motors, and those of its joints, [steps, 2 joints]."""
     model = rig.model(values)
-    data, memory, future = rig._begin(model, values, segment)
+    data, memory, future = beginning.begin(rig.chain, model, rig._data, values, segment)
 
     def step(carry, x):
         data, memory = carry
