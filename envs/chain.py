@@ -46,6 +46,10 @@ class Now:
     rigid: jax.Array  # [joints] share of dry friction that is not of bristles
     body_velocity: jax.Array  # [bodies, 3] m/s of the centres of mass
     between: jax.Array  # [joints] rad, how far targets are from the held ones if they move on between rows
+    before: (
+        jax.Array
+    )  # [joints] index of the joint before in the model's order; the number of joints where there is none
+    after: jax.Array  # [joints] the same of the joint after
 
 
 @chex.dataclass(frozen=True)
@@ -86,6 +90,20 @@ class Chain:
     lead_s: float = 0.0
     """How far positions of the simulation are ahead of its velocities; half a step makes semi-implicit Euler of second
     order, which is then the leapfrog scheme."""
+    trees: np.ndarray | None = None
+    """[joints] kinematic trees of the joints; one where None."""
+
+    @property
+    def beside(self) -> tuple[np.ndarray, np.ndarray]:
+        """Indices of the joints before and after each in the model's order, [joints]; as many as joints for none.
+
+        Those of another tree are none. Trees do not feel each other, and may be perturbed together.
+        """
+        count, order = len(self.dof), np.argsort(self.dof)
+        trees = np.zeros(count) if self.trees is None else self.trees[order]
+        before, after, along = np.full(count, count), np.full(count, count), trees[1:] == trees[:-1]
+        before[order[1:][along]], after[order[:-1][along]] = order[:-1][along], order[1:][along]
+        return before, after
 
     def step(self, model: mjx.Model, data: mjx.Data, memory: dict, values, x) -> tuple[mjx.Data, dict, dict]:
         """Simulates one step of the physics, from the controller's inputs to the robot's motion.
@@ -392,6 +410,8 @@ class Chain:
             rigid=none + 1.0,
             body_velocity=jnp.zeros((len(self.bodies), 3)),
             between=x["between"],
+            before=jnp.asarray(self.beside[0]),
+            after=jnp.asarray(self.beside[1]),
         )
 
 

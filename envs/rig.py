@@ -101,7 +101,7 @@ class Rig:
         self.places = {"joint": self.joints, "body": self.bodies, "foot": (), "robot": ("robot",)}
         self.effects = {row.name: row for row in EVERY.values() if self.places[row.on] and row.needs != "free"}
         rows, period_s = tuple(self.effects.values()), 1.0 / control_hz
-        self.chain = Chain(self.dt, rows, self.qpos, self.dof, self._bodies, period_s, 0.5 * self.dt)
+        self.chain = Chain(self.dt, rows, self.qpos, self.dof, self._bodies, period_s, 0.5 * self.dt, self.trees)
         self.axes = self._describe_axes()
         # The IMU is taken to sit on the first body, which carries the others.
         self._gravity = sensing.resting_gravity(model)
@@ -115,7 +115,7 @@ class Rig:
     @property
     def layout(self) -> tuple:
         """All that compiled programs depend on beside `system`: robots of equal layout can share them."""
-        addresses = (self.qpos.tobytes(), self.dof.tobytes(), self._bodies.tobytes())
+        addresses = (self.qpos.tobytes(), self.dof.tobytes(), self._bodies.tobytes(), self.trees.tobytes())
         frames = np.asarray(self._model.body_quat).tobytes()
         paces = self.dt, self.control_hz
         return self.joints, self.bodies, *paces, addresses, frames, jax.tree.structure(self.system)

@@ -40,6 +40,8 @@ def measure_scales(rig: Rig, runs: Sequence[Run]) -> dict[str, np.ndarray]:
         speed      rms(dq)                     rad/s
         slow       0.1 rms(dq)                 rad/s
         motor      largest limit / rms(dq)     Nm s/rad
+        of_before  torque / torque of the joint before, in the model's order
+        of_after   the same of the joint after
         angle      1 rad of a hinge; of a slide 0.05 m, which a pinion of that radius moves it by
 
     Hand the result to `Rig.scaled`.
@@ -70,6 +72,7 @@ def measure_scales(rig: Rig, runs: Sequence[Run]) -> dict[str, np.ndarray]:
     wound = _WOUND * angle
     pace = _rms(speed)
     drag, fast = _drag(rig, mean_pose, torque, pace)
+    before, after = rig.chain.beside
     return {
         "torque": torque,
         "damping": torque / pace,
@@ -84,6 +87,9 @@ def measure_scales(rig: Rig, runs: Sequence[Run]) -> dict[str, np.ndarray]:
         "slow": 0.1 * pace,
         "angle": angle,
         "motor": np.maximum(np.concatenate(limit).max(axis=0), 1e-6) / pace,
+        # Any number will do where there is none.
+        "of_before": torque / np.append(torque, 1.0)[before],
+        "of_after": torque / np.append(torque, 1.0)[after],
     }
 
 

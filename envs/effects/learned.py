@@ -1,5 +1,7 @@
 """A learned torque at every joint, for what no effect of the library explains.
 
+It depends on the joint, and on those before and after it in the model's order: tendons and belts couple neighbours.
+
 It is no hypothesis and names no cause. It bounds what effects of the joints could explain at all, and it is what a user
 gets where something is missing that has no name.
 """
@@ -16,8 +18,8 @@ _SIGN_RAD_S = 0.1  # speed over which friction turns round
 def _learned_torque(values, torque, now, memory):
     """torque' = torque + sum of gains times features of the joint and of its short history.
 
-    Features: 1, sin q, cos q, tanh(dq / 0.1), dq, dq |dq|, the torque itself, and how torque and speed differ from
-    their means over the last 30 ms.
+    Features: 1, sin q, cos q, tanh(dq / 0.1), dq, dq |dq|, the torque itself, how torque and speed differ from their
+    means over the last 30 ms, and torque and sin q of both neighbours.
     """
     past_torque, past_speed = memory
     seconds = jnp.full_like(torque, _HISTORY_S)
@@ -34,6 +36,10 @@ def _learned_torque(values, torque, now, memory):
         "late_share": torque - past_torque,
         "late_nm_s_per_rad": now.speed - past_speed,
     }
+    for name, beside in (("before", now.before), ("after", now.after)):
+        # Where there is none, index and signal are one longer.
+        features[f"sine_{name}_nm"] = jnp.append(jnp.sin(now.position), 0.0)[beside]
+        features[f"share_{name}"] = jnp.append(torque, 0.0)[beside]
     added = sum(values[name] * feature for name, feature in features.items())
     # A motor that is switched off cannot be the cause, but what acts on the joint may be; both are learned.
     return torque + added, jnp.stack([past_torque, past_speed])
@@ -53,13 +59,15 @@ LEARNED = Effect(
     parameters=(
         *(
             Parameter(name=f"{name}_nm", scale="torque", bounds=(-1.0, 1.0), prior=0.3)
-            for name in ("constant", "sine", "cosine", "direction")
+            for name in ("constant", "sine", "cosine", "direction", "sine_before", "sine_after")
         ),
         Parameter(name="speed_nm_s_per_rad", scale="damping", bounds=(-1.0, 1.0), prior=0.3),
         Parameter(name="square_nm_s2_per_rad2", scale="quadratic", bounds=(-1.0, 1.0), prior=0.3),
         Parameter(name="share", bounds=(-0.8, 0.8), prior=0.3),
         Parameter(name="late_share", bounds=(-0.8, 0.8), prior=0.3),
         Parameter(name="late_nm_s_per_rad", scale="damping", bounds=(-1.0, 1.0), prior=0.3),
+        Parameter(name="share_before", scale="of_before", bounds=(-1.0, 1.0), prior=0.3),
+        Parameter(name="share_after", scale="of_after", bounds=(-1.0, 1.0), prior=0.3),
     ),
     sizes=(0.05,),
     act=_learned_torque,

@@ -732,3 +732,16 @@ GRIPPER = """<mujoco><worldbody>
 def test_joints_that_something_couples_are_of_one_tree(coupling, trees):
     rig = Rig(mujoco.MjSpec.from_string(GRIPPER.format(coupling=coupling)), ("l", "r"), rigs.CONTROL_HZ)
     np.testing.assert_array_equal(rig.trees, trees)
+    # Joints of two trees are no neighbours.
+    assert list(rig.chain.beside[0]) == ([2, 0] if trees == [0, 0] else [2, 2])
+
+
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_neighbours_are_those_of_the_model_in_whatever_order_a_log_names_joints(order):
+    names = [rigs.ARM_JOINTS[index] for index in order]
+    rig = Rig(mujoco.MjSpec.from_string(rigs.ARM), names, rigs.CONTROL_HZ)
+    before, after = rig.chain.beside
+    # The shoulder has none before it, and the elbow none after it, which is an index past the last.
+    assert [before[names.index("shoulder")], after[names.index("elbow")]] == [2, 2]
+    assert names[before[names.index("elbow")]] == "shoulder"
+    assert names[after[names.index("shoulder")]] == "elbow"

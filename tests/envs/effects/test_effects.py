@@ -39,6 +39,8 @@ def now(speed=0.0, **fields):
         "rigid": joints,
         "body_velocity": np.zeros((JOINTS, 3), np.float32),
         "between": joints * 0.0,
+        "before": np.array([JOINTS, 0]),
+        "after": np.array([1, JOINTS]),
     }
     return Now(**(standard | {"speed": speed * joints} | fields))
 
@@ -596,7 +598,7 @@ def test_a_tilted_imu_reads_gravity_in_its_own_frame(axis):
 # From outside.
 
 
-def test_the_learned_torque_is_a_sum_of_features_of_the_joint_and_its_short_history():
+def test_the_learned_torque_is_a_sum_of_features_of_the_joint_its_neighbours_and_its_short_history():
     zero = {parameter.name: 0.0 for parameter in LEARNED.parameters}
     wanted = jnp.full(JOINTS, 0.5)
 
@@ -613,6 +615,11 @@ def test_the_learned_torque_is_a_sum_of_features_of_the_joint_and_its_short_hist
     np.testing.assert_allclose(torque(0.3, -2.0, speed_nm_s_per_rad=0.2), 0.1, rtol=1e-5)
     np.testing.assert_allclose(torque(0.3, -2.0, square_nm_s2_per_rad2=0.1), 0.1, rtol=1e-5)
     np.testing.assert_allclose(torque(0.3, 2.0, share=0.2), 0.6, rtol=1e-5)
+    # The first joint has none before it, and the last none after it.
+    np.testing.assert_allclose(torque(np.pi / 2, 2.0, sine_before_nm=0.2), [0.5, 0.7], rtol=1e-5)
+    np.testing.assert_allclose(torque(np.pi / 2, 2.0, sine_after_nm=0.2), [0.7, 0.5], rtol=1e-5)
+    np.testing.assert_allclose(torque(0.3, 2.0, share_before=0.2), [0.5, 0.6], rtol=1e-5)
+    np.testing.assert_allclose(torque(0.3, 2.0, share_after=0.2), [0.6, 0.5], rtol=1e-5)
     # A torque that was there all the time is not late; one that has just come is, but for the step that has passed.
     np.testing.assert_allclose(torque(0.3, 2.0, late_share=1.0), 0.5, rtol=1e-5)
     fresh = torque(0.3, 2.0, past=(0.0, 0.0), late_share=1.0) - 0.5
