@@ -14,6 +14,16 @@ from jaxtune.types import Effect, Parameter
 _HISTORY_S = 0.03  # over which torque and speed are remembered: longer than most lags of a motor
 _SIGN_RAD_S = 0.1  # speed over which friction turns round
 
+PARTS = {
+    **dict.fromkeys(("constant_nm", "sine_nm", "cosine_nm"), "position"),
+    **dict.fromkeys(("direction_nm", "speed_nm_s_per_rad", "square_nm_s2_per_rad2"), "speed"),
+    "share": "torque",
+    **dict.fromkeys(("late_share", "late_nm_s_per_rad"), "past"),
+    **dict.fromkeys(("sine_before_nm", "share_before"), "joint before"),
+    **dict.fromkeys(("sine_after_nm", "share_after"), "joint after"),
+}
+"""What each of its parameters depends on."""
+
 
 def _learned_torque(values, torque, now, memory):
     """torque' = torque + sum of gains times features of the joint and of its short history.

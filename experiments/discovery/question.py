@@ -11,6 +11,7 @@ import numpy as np
 from envs import readings, segments
 from envs.axes import SERVO_RATIOS
 from envs.effects import LEARNED, LIBRARY
+from envs.effects.learned import PARTS
 from envs.following import OF_SENSORS, followed, follower, tells
 from envs.logs import Log, Run, splits, with_splits
 from envs.null_logs import simulate_null_logs
@@ -134,6 +135,7 @@ def build_question(
         least_floor=_least_floor(unsealed[0], signals, bin_rows),
         push=pushes,
         residual=learned_torque(rig.axes, LEARNED),
+        residual_parts=tuple((a.place, PARTS[a.parameter]) for a in rig.axes if a.effect == LEARNED.name),
     )
     names = {split: tuple(run.name for run in runs) for split, runs in splits(log).items()}
     return Question(

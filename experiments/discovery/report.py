@@ -43,6 +43,16 @@ FAILED = {
 }
 """Why an effect was taken out of the model again, by the test of `jaxtune.discovery.evidence.passes` that it failed."""
 
+PARTS = {
+    "position": "position",
+    "speed": "speed",
+    "torque": "torque",
+    "past": "last 30 ms",
+    "joint before": "joint before it, in torque or position",
+    "joint after": "joint after it, in torque or position",
+}
+"""What parts of a learned torque depend on (`envs.effects.learned.PARTS`)."""
+
 _UNITS = {"q": ("rad", "m"), "tau": ("Nm", "N")}  # of hinges and slides
 _SHOWN = 4  # suspects on the console
 _MUCH = 5.0  # floor units; of 16 answers that left as much in the benchmarks, 7 were wrong or lacked an effect
@@ -72,6 +82,7 @@ def write(path: Path, log: Log, question: Question, result: Result, summary: dic
         robot=log.robot,
         runs=len(log.runs),
         meaning=VERDICTS[summary["verdict"]] + _doubt(summary),
+        clues=_clues(summary),
         advice=ADVICE[summary["verdict"]],
         summary=summary,
         brief=brief,
@@ -155,6 +166,8 @@ def show(console: Console, question: Question, summary: dict, free: dict) -> Non
             f"A learned torque at all joints explains {summary['explainable_share']:.0%} of what is left: the rest may "
             "differ from run to run. Record a motion several times, as one condition, to see whether it does."
         )
+    if clues := _clues(summary):
+        say(clues)
     if summary["withdrawn"]:
         say("the corrected model was withdrawn: on held-out runs it was worse than the one that is saved")
     if summary["not_testable"]:
@@ -163,6 +176,15 @@ def show(console: Console, question: Question, summary: dict, free: dict) -> Non
 
 def _whole_runs(free: dict) -> str:
     return f"whole runs, mean absolute error in {' or '.join(_UNITS[free['signal']])}"
+
+
+def _clues(summary: dict) -> str:
+    """What the learned torque depends on most, where it is what is saved; empty elsewhere."""
+    parts = summary["learned_parts"][:_SHOWN] if summary["model_is"] == "learned" else []
+    if not parts:
+        return ""
+    said = "; ".join(f"at {one['place']} the {PARTS[one['part']]} ({one['lost_without']:.0%})" for one in parts)
+    return f"What the learned torque depends on, with the share of what it explains that is lost without: {said}."
 
 
 def _doubt(summary: dict) -> str:

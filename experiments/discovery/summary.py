@@ -17,6 +17,7 @@ from jaxtune.discovery.problem import Hypothesis, acts_within
 from jaxtune.discovery.result import AcceptedTerm, Result
 
 _FAR_OFF = 6.0  # floor units; none of the 194 robots that lacked nothing in the benchmarks reached it (5.2)
+_PART = 0.1  # least share of what a learned torque explains at which a part of it is listed
 _SHOWN = 12  # places with the largest gap that the summary lists
 
 
@@ -87,6 +88,11 @@ def summarise(question: Question, log: Log, folder: Path, result: Result) -> dic
         "explained_share": result.explained_share,
         "explainable_share": result.explainable_share,
         "model_is": result.model_is,
+        "learned_parts": [
+            {"place": place, "part": part, "lost_without": share}
+            for (place, part), share in result.learned_parts.items()
+            if share >= _PART
+        ],
     }
 
 

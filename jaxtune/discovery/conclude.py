@@ -1,6 +1,6 @@
 """The verdict, from open segments: which effects stay, how far each is believed, and what they explain (step 9)."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -18,7 +18,7 @@ from jaxtune.discovery.problem import Hypothesis, Problem
 from jaxtune.discovery.resample import standard_errors
 from jaxtune.discovery.result import AcceptedTerm, DroppedTerm, Settings, Suspect
 from jaxtune.discovery.screen import Lead
-from jaxtune.discovery.shares import energy, enough, explained, explained_shares, open_gaps, speak
+from jaxtune.discovery.shares import energy, enough, explained, explained_shares, lost_without, open_gaps, speak
 from jaxtune.discovery.state import State
 
 _SUSPECTS = 8
@@ -41,6 +41,7 @@ class Conclusion:
     rivals: tuple[tuple[str, np.ndarray], ...]
     explained_share: float
     explainable_share: float
+    learned_parts: Mapping[Hashable, float]
     models: Mapping[str, np.ndarray]
     """Vectors [axes] that may become the corrected model, by what they are; the chosen one is first."""
     changed: Mapping[int, float]
@@ -98,6 +99,7 @@ def conclude(settings: Settings, problem: Problem, floor: NoiseFloor, state: Sta
         rivals=_rivals(candidates, probabilities),
         explained_share=share,
         explainable_share=explained(energy(usual[0]), energy(usual[2]), 0.0),
+        learned_parts=_parts(problem, learned),
         models=models if verdict == "unnamed" else {"effects" if terms else "null": best.fit.vector} | models,
         changed=changed,
         dropped=dropped,
@@ -204,6 +206,13 @@ def learn(settings: Settings, problem: Problem, at: Floor, best: Candidate) -> C
     (begun,) = begin(best.fit, [(problem.residual,)], [point], [best.fit.coordinates], evaluate)
     (fit,) = refine([begun], evaluate, 2 * settings.rounds)
     return Candidate(best.hypotheses, fit, at.residuals["select"](fit.vector[None])[0])
+
+
+def _parts(problem: Problem, learned: Candidate) -> dict[Hashable, float]:
+    """What is lost without each part of the learned torque; nothing where nobody says what its parts are."""
+    if problem.residual is None or not problem.residual_parts:
+        return {}
+    return lost_without(learned.fit, problem.residual, problem.residual_parts)
 
 
 def _proved(

@@ -4,7 +4,7 @@ Nothing here knows a robot. The simulator is a function of a vector of coordinat
 and of a segment of a log. A hypothesis is a handful of directions in the space of that vector.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -161,6 +161,8 @@ class Problem:
     """Forms that effects may have, at all places of `hypotheses`."""
     residual: Hypothesis | None = None
     """A learned torque at all joints that names nothing; it bounds what is explainable, and is the fallback."""
+    residual_parts: Sequence[Hashable] = ()
+    """[parameters of `residual`]: the part of it to which each belongs, such as what depends on one joint's speed."""
 
     @property
     def horizons(self) -> tuple[float, ...]:

@@ -62,6 +62,7 @@ def prove(problem: Problem, floor: NoiseFloor, state: State, conclusion: Conclus
         rivals=conclusion.rivals,
         explained_share=conclusion.explained_share,
         explainable_share=conclusion.explainable_share,
+        learned_parts=conclusion.learned_parts,
         withdrawn=withdrawn,
         where=state.where,
         needs_torque=state.needs_torque,

@@ -1,6 +1,6 @@
 """How much a discovery tries, and what it finds."""
 
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -148,6 +148,9 @@ class Result:
     explainable_share: float
     """Share of the null's gaps on `train` and `select` that the effects and a learned torque explain together. The rest
     is no torque of the joints' motion, or differs from run to run."""
+    learned_parts: Mapping[Hashable, float]
+    """The share of what the learned torque explains that is lost without each of its parts (`Problem.residual_parts`),
+    all else fitted anew; the largest first."""
     withdrawn: bool
     """True if `proposed` was worse on `sealed` than the better of the nominal model and the null; then `model` is that
     one."""

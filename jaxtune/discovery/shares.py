@@ -1,12 +1,13 @@
 """How much of what the nominal model leaves is explained: gaps above the floor, and which of them may speak."""
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 
 import numpy as np
 
 from jaxtune.discovery.candidate import Candidate, Measure, finite, squares
+from jaxtune.discovery.fit import Fit
 from jaxtune.discovery.noise_floor import Floor
-from jaxtune.discovery.problem import Problem
+from jaxtune.discovery.problem import Hypothesis, Problem
 from jaxtune.discovery.result import Settings
 
 _PERFECT = 1.0  # floor units
@@ -65,6 +66,36 @@ def enough(settings: Settings, left: float, share: float, whole: float) -> bool:
     """
     asked = settings.share_near if left <= settings.near else settings.share
     return left <= settings.at_floor or (share >= asked and whole >= settings.least)
+
+
+def lost_without(fit: Fit, hypothesis: Hypothesis, parts: Sequence[Hashable]) -> dict[Hashable, float]:
+    """How much of what a hypothesis explains is lost without each part of it, with all else fitted anew.
+
+    It is of the fit's linear model, so nothing is simulated. Parts that stand for each other lose little each.
+
+    Args:
+      fit: a model with the hypothesis.
+      hypothesis: one of it.
+      parts: [parameters] the part to which each of its parameters belongs.
+
+    Returns:
+      A share of 0 to 1 for each part, the largest first.
+    """
+    linear = fit.linear
+    value, slope = linear.rows()
+    normal, pull = slope.T @ slope, slope.T @ value
+    names, part = list(dict.fromkeys(parts)), np.full(len(linear.offset), -1)
+    for direction, name in zip(hypothesis.directions, parts, strict=True):
+        part[(fit.free.directions == direction).all(axis=1) & ~fit.free.nominal] = names.index(name)
+
+    def lost(out: np.ndarray) -> float:
+        move = np.where(out, -linear.offset, 0.0)
+        move[~out] = -np.linalg.solve(normal[~out][:, ~out], (pull + normal @ move)[~out])
+        return float(2.0 * pull @ move + move @ normal @ move)
+
+    whole = max(lost(part >= 0), 1e-6)
+    shares = {name: float(np.clip(lost(part == number) / whole, 0.0, 1.0)) for number, name in enumerate(names)}
+    return dict(sorted(shares.items(), key=lambda one: -one[1]))
 
 
 def energy(gaps: np.ndarray) -> float:

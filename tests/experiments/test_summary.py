@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from envs.effects import LIBRARY
+from envs.effects import LEARNED, LIBRARY
+from envs.effects.learned import PARTS
 from envs.logs import Controller
 from experiments.discovery import next_experiment, report
 from experiments.discovery.blind_cases import ARM
@@ -75,6 +76,7 @@ def found(question, **changes):
         rivals=(),
         explained_share=0.93,
         explainable_share=0.9,
+        learned_parts={("elbow", "joint before"): 0.62, ("shoulder", "speed"): 0.2, ("elbow", "past"): 0.05},
         withdrawn=False,
         where=(where | {"bins": 9},),
         needs_torque={},
@@ -187,6 +189,29 @@ def test_page_and_console_say_what_was_found(tmp_path, asked, withdrawn):
     assert f"taken out again: viscous at shoulder, since {why}" in said
     assert "coulomb at elbow 0.90; viscous at shoulder 0.70 (taken out again)" in said
     assert page.count(why) == 2
+
+
+def test_what_a_saved_learned_torque_depends_on_is_said(tmp_path, asked):
+    log, question = asked
+    result = replace(found(question), verdict="unnamed", model_is="learned")
+    summary, free = summarise(question, log, Path("logs"), result), free_runs(question, result)
+    # What hardly matters is left out.
+    assert [(one["place"], one["part"]) for one in summary["learned_parts"]] == [
+        ("elbow", "joint before"),
+        ("shoulder", "speed"),
+    ]
+    console = Console(record=True, width=400)
+    report.show(console, question, summary, free)
+    report.write(tmp_path / "page.html", log, question, result, summary, free)
+    for text in (console.export_text(), (tmp_path / "page.html").read_text()):
+        assert "at elbow the joint before it, in torque or position (62%); at shoulder the speed (20%)" in text
+    # Where effects are saved, what a learned torque would have done is of no use.
+    assert report._clues(summary | {"model_is": "effects"}) == ""
+
+
+def test_every_part_of_the_learned_torque_has_words():
+    assert set(PARTS) == {parameter.name for parameter in LEARNED.parameters}
+    assert set(PARTS.values()) == set(report.PARTS)
 
 
 def test_names_with_brackets_are_printed_as_they_are(asked):

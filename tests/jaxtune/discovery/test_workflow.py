@@ -221,6 +221,19 @@ def test_what_only_a_learned_torque_explains_is_unnamed_and_the_torque_is_saved(
     assert result.explainable_share > 0.8
 
 
+def test_what_is_lost_without_a_part_of_the_learned_torque_is_said():
+    rows = np.array([[float(axis == name) for axis in AXES] for name in ("push", "cubic")])
+    both = replace(EACH, name="learned", directions=rows, bounds=np.array([[-30.0, 30.0]] * 2))
+    asked = replace(problem({"cubic": 12.0}, residual=both), residual_parts=("constant", "position"))
+    result = workflow.discover(asked)
+    assert list(result.learned_parts) == ["position", "constant"]
+    # Nothing else explains it, and nothing is constant.
+    assert result.learned_parts["position"] > 0.9
+    assert result.learned_parts["constant"] < 0.05
+    # Of parts that nobody has told apart nothing is said.
+    assert discover({"cubic": 12.0}, residual=LEARNED).learned_parts == {}
+
+
 def test_a_model_that_sealed_runs_contradict_is_withdrawn_and_names_nothing():
     result = discover({"coulomb": 1.2}, sealed={})
     assert result.withdrawn
