@@ -279,21 +279,12 @@ def _at_bounds(problem: Problem, fit: Fit, price: float) -> dict[int, float]:
     """
     low, high = fit.free.bounds.T
     edge = np.minimum(fit.coordinates - low, high - fit.coordinates) < _BOUND * (high - low)
+    ends = np.flatnonzero(edge)
+    worth = fit.linear.without([np.arange(len(edge)) == number for number in ends], ~edge)
     found = {}
-    for number in np.flatnonzero(edge):
+    for number, more in zip(ends, worth, strict=True):
         row = fit.free.directions[number]
         for axis in np.flatnonzero(row):
-            if problem.prior[axis] > 0 and problem.prior[axis] == row[axis] and _worth(fit, number, edge) > price:
+            if problem.prior[axis] > 0 and problem.prior[axis] == row[axis] and more > price:
                 found[int(axis)] = float(fit.coordinates[number])
     return found
-
-
-def _worth(fit: Fit, number: int, edge: np.ndarray) -> float:
-    """What a model costs more, to first order, with a coordinate at zero; others answer unless they are at an edge."""
-    value, slope = fit.linear.rows()
-    free = ~edge
-    step = np.zeros(len(fit.coordinates))
-    step[number] = -fit.coordinates[number]
-    moved = value + slope @ step
-    step[free] = np.linalg.lstsq(slope[:, free], -moved, rcond=None)[0]
-    return float(((value + slope @ step) ** 2).sum() - (value**2).sum())

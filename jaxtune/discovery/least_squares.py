@@ -26,7 +26,7 @@ with the share a of rows that count as independent (`Counts`), and s' = s for a 
 after every step (iteratively reweighted least squares).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -143,6 +143,21 @@ class Linear:
         """
         value, slope = self.rows()
         return solve(slope.T @ slope, slope.T @ value, self.offset, damping, bounds)
+
+    def without(self, outs: Sequence[np.ndarray], free: np.ndarray) -> list[float]:
+        """Says how much the loss grows where some coordinates are taken back to zero, and others answer.
+
+        Args:
+          outs: [coordinates] masks of what is taken back, one after the other.
+          free: [coordinates] True for what may answer.
+        """
+        value, slope = (part.astype(float) for part in self.rows())
+        normal, pull, grown = slope.T @ slope, slope.T @ value, []
+        for out in outs:
+            move, answer = np.where(out, -self.offset, 0.0), free & ~out
+            move[answer] = solve(normal[np.ix_(answer, answer)], (pull + normal @ move)[answer], self.offset[answer])
+            grown.append(float(2.0 * pull @ move + move @ normal @ move))
+        return grown
 
 
 def solve(

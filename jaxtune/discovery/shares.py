@@ -81,20 +81,12 @@ def lost_without(fit: Fit, hypothesis: Hypothesis, parts: Sequence[Hashable]) ->
     Returns:
       A share of 0 to 1 for each part, the largest first.
     """
-    linear = fit.linear
-    value, slope = linear.rows()
-    normal, pull = slope.T @ slope, slope.T @ value
-    names, part = list(dict.fromkeys(parts)), np.full(len(linear.offset), -1)
+    names, part = list(dict.fromkeys(parts)), np.full(len(fit.coordinates), -1)
     for direction, name in zip(hypothesis.directions, parts, strict=True):
         part[(fit.free.directions == direction).all(axis=1) & ~fit.free.nominal] = names.index(name)
-
-    def lost(out: np.ndarray) -> float:
-        move = np.where(out, -linear.offset, 0.0)
-        move[~out] = -np.linalg.solve(normal[~out][:, ~out], (pull + normal @ move)[~out])
-        return float(2.0 * pull @ move + move @ normal @ move)
-
-    whole = max(lost(part >= 0), 1e-6)
-    shares = {name: float(np.clip(lost(part == number) / whole, 0.0, 1.0)) for number, name in enumerate(names)}
+    outs = [part >= 0, *(part == number for number in range(len(names)))]
+    whole, *lost = fit.linear.without(outs, np.ones(len(part), bool))
+    shares = {name: float(np.clip(one / max(whole, 1e-6), 0.0, 1.0)) for name, one in zip(names, lost, strict=True)}
     return dict(sorted(shares.items(), key=lambda one: -one[1]))
 
 

@@ -37,6 +37,25 @@ def test_no_other_step_within_bounds_is_better(seed):
     assert loss(found) <= min(map(loss, others)) + 1e-9
 
 
+def test_what_is_taken_back_costs_what_the_others_cannot_answer():
+    rng = np.random.default_rng(3)
+    slope, point = rng.normal(size=(40, 4)), np.array([0.5, -1.0, 2.0, 0.3])
+    # The third column is the sum of the first two, so those can stand in for it; and nobody can for the last.
+    slope[:, 2] = slope[:, 0] + slope[:, 1]
+    problem = linear(slope, rng.normal(size=40), offset=point)
+    best = problem.residual + slope @ np.linalg.lstsq(slope, -problem.residual, rcond=None)[0]
+    problem = linear(slope, best, offset=point)
+    third, last = (np.arange(4) == index for index in (2, 3))
+    lost = problem.without([third, last, ~last], np.ones(4, bool))
+    assert lost[0] == pytest.approx(0.0, abs=1e-6)
+    moved = best - 0.3 * slope[:, 3]
+    left = moved + slope[:, :2] @ np.linalg.lstsq(slope[:, :2], -moved, rcond=None)[0]
+    assert lost[1] == pytest.approx((left**2).sum() - (best**2).sum(), rel=1e-5)
+    # What may not answer stays where it is.
+    moved = best - slope[:, :3] @ point[:3]
+    assert problem.without([~last], np.zeros(4, bool))[0] == pytest.approx((moved**2).sum() - (best**2).sum(), rel=1e-5)
+
+
 COUNTS = Counts(components=2, bins=10, independent=0.5)
 
 
