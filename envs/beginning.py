@@ -69,8 +69,8 @@ def _followed(chain, model, data, values, history, first, memory) -> tuple[mjx.D
       model: of the robot.
       data: of the robot, in any state.
       values: of the effects.
-      history: measured motion without its sensors' errors, its accelerations, both from the first step on to the
-        segment's start or later; motors' torques and the controller's inputs, both [steps].
+      history: motion without the sensors' errors and its accelerations, [steps + 1, ...] or longer; torques of motors
+        and inputs of the controller, [steps, ...].
       first: the memories at its beginning.
       memory: the memories at its end, if nothing gives way.
     """

@@ -46,9 +46,7 @@ class Now:
     rigid: jax.Array  # [joints] share of dry friction that is not of bristles
     body_velocity: jax.Array  # [bodies, 3] m/s of the centres of mass
     between: jax.Array  # [joints] rad, how far targets are from the held ones if they move on between rows
-    before: (
-        jax.Array
-    )  # [joints] index of the joint before in the model's order; the number of joints where there is none
+    before: jax.Array  # [joints] index of the joint before in the model's order, past the last where there is none
     after: jax.Array  # [joints] the same of the joint after
 
 
