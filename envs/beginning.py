@@ -84,7 +84,7 @@ def _followed(chain, model, data, values, history, first, memory) -> tuple[mjx.D
 
     def at(index, data, memory, speeding):
         """The robot at a step of the history, with accelerations [joints]."""
-        state = truth[index] - chain.at_encoders(values, chain.ahead(memory))
+        state = truth[index] - chain.at_log(values, chain.ahead(memory))
         return data.replace(
             qpos=still.qpos.at[chain.qpos].set(state[0] + chain.lead_s * state[1]),
             qvel=still.qvel.at[chain.dof].set(state[1]),

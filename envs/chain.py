@@ -119,6 +119,7 @@ class Chain:
         """
         joint, within = self.joints(data), self._within(model, x)
         motor, running = self._seen(values, joint, memory, within)
+        unlogged = self._unlogged(values, memory)
         memory, torque, readings = self._control(values, memory | {"within": within}, motor, x)
         # The controller answers a motor that runs ahead only as far as it sees it.
         within = self.at_encoders(values, within)
@@ -126,7 +127,16 @@ class Chain:
         torque = torque - x["emf"] * joint[1]
         data, memory, torque = self._move(model, data, memory, values, torque, x | gains)
         torques, memory = self.stage("torque_reading", values, jnp.stack([torque, memory["held"]]), None, memory)
-        return data, memory, {"q": readings[0], "dq": readings[1] + running, "tau": torques[0], "command": torques[1]}
+        return (
+            data,
+            memory,
+            {
+                "q": readings[0] - unlogged[0],
+                "dq": readings[1] + running - unlogged[1],
+                "tau": torques[0],
+                "command": torques[1],
+            },
+        )
 
     def remember(self, values, memory: dict, motor: jax.Array, x) -> tuple[dict, jax.Array]:
         """Fills the memories of sensors, controller and friction by a step of measured motion.
@@ -167,13 +177,21 @@ class Chain:
           The robot and the memories after the step.
         """
         joint, within = self.joints(data), self._within(model, x)
-        far, fast = self.at_encoders(values, self.ahead(memory))
-        seen = motor.at[1].add(-within * fast)
+        far, fast = self.at_log(values, self.ahead(memory))
+        unlogged = self._unlogged(values, memory)
+        # What the log has not seen, the controller has; it acts within the step, as rotors may be light.
+        torque = torque - x["stiffness"] * unlogged[0]
+        seen = (motor + unlogged).at[1].add(-within * (fast + unlogged[1]))
         _, memory = self.stage("sensor", values, seen, self._now(x, seen), memory | {"within": within})
         rotor, inertia = model.dof_armature[self.dof], 1.0 / model.dof_invweight0[self.dof]
-        at_motor = self.at_encoders(values, jnp.ones_like(torque))
+        at_motor = self.at_log(values, jnp.ones_like(torque))
         held = at_motor * jnp.maximum(rotor, _LIGHT * inertia)
-        hold = {"stiffness": held * _HOLD_RAD_S**2, "damping": 2.0 * held * _HOLD_RAD_S, "emf": jnp.zeros_like(torque)}
+        acts = self.at_encoders(values, jnp.ones_like(torque)) - at_motor
+        hold = {
+            "stiffness": held * _HOLD_RAD_S**2 + acts * x["stiffness"],
+            "damping": 2.0 * held * _HOLD_RAD_S + acts * x["damping"],
+            "emf": jnp.zeros_like(torque),
+        }
         # How fast a rotor runs ahead acts within the step (`envs.effects.transmission`).
         position, speed = motor - joint.at[0].add(far)
         pull = _HOLD_RAD_S**2 * position + 2.0 * _HOLD_RAD_S * speed
@@ -192,6 +210,15 @@ class Chain:
     def at_encoders(self, values, ahead: jax.Array) -> jax.Array:
         """What encoders see of how motors run ahead [..., joints]: all of it where they sit on the motors."""
         return self.stage("encoder", values, ahead, None, {})[0]
+
+    def at_log(self, values, ahead: jax.Array) -> jax.Array:
+        """What the log sees of how motors run ahead [..., joints]: as the controller does, or less (`JOINT_LOG`)."""
+        return self.stage("log", values, self.at_encoders(values, ahead), None, {})[0]
+
+    def _unlogged(self, values, memory) -> jax.Array:
+        """What the controller sees of how motors run ahead and the log does not, [2, joints] rad and rad/s."""
+        ahead = self.ahead(memory)
+        return self.at_encoders(values, ahead) - self.at_log(values, ahead)
 
     def _seen(self, values, joint, memory, within) -> tuple[jax.Array, jax.Array]:
         """What encoders and controller see of the motors.

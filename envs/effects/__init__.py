@@ -26,7 +26,7 @@ name, or in units of its `scale` where it has one; logarithms for ratios, recipr
 from envs.effects import actuator, contact, external, inertia, joint_friction, nominal, sensing, transmission
 from envs.effects.learned import LEARNED
 from envs.effects.presliding import PRESLIDING
-from envs.effects.transmission import JOINT_ENCODER
+from envs.effects.transmission import JOINT_ENCODER, JOINT_LOG
 
 LIBRARY = {
     row.name: row
@@ -38,5 +38,5 @@ LIBRARY = {
 NOMINAL = {row.name: row for row in nominal.ROWS}
 """Rows that are fitted under every hypothesis and cannot be named as missing, by name."""
 
-EVERY = {**NOMINAL, **LIBRARY, **{row.name: row for row in (PRESLIDING, JOINT_ENCODER, LEARNED)}}
+EVERY = {**NOMINAL, **LIBRARY, **{row.name: row for row in (PRESLIDING, JOINT_ENCODER, JOINT_LOG, LEARNED)}}
 """All rows, in the order in which they act."""

@@ -1,9 +1,10 @@
 """Effects between the motor and the joint: backlash, compliance, and the rotor's inertia.
 
 Backlash and compliance let the motor run ahead of its joint by an offset o. Encoders sit on the motor, or on the joint
-(`JOINT_ENCODER`), where they and the controller see nothing of o: then kp and kd below are zero. Only the joint is a
-body of the model; the rotor's inertia J is part of its armature. The offset follows from the balance of
-torques on the rotor over one step of length dt. If o changes by d within the step, then
+(`JOINT_ENCODER`), where they and the controller see nothing of o: then kp and kd below are zero. A robot with both may
+control by the one and log the other (`JOINT_LOG`). Only the joint is a body of the model; the rotor's inertia J is part
+of its armature. The offset follows from the balance of torques on the rotor over one step of length dt. If o changes by
+d within the step, then
 
 - a controller that acts within the step gives kp d + kd d / dt less torque (stiffness kp, damping kd);
 - the rotor takes J (d / dt - rate) / dt to change the rate of its offset.
@@ -165,6 +166,18 @@ JOINT_ENCODER = Effect(
 )
 """A form of backlash, and no effect of its own."""
 
+JOINT_LOG = Effect(
+    name="joint_log",
+    enters="log",
+    parameters=(Parameter(name="at_joint", bounds=(0.0, 1.0), prior=0.5),),
+    sizes=(0.9,),
+    act=_joint_encoder,
+    sentence="The log has an encoder behind the gears, and the controller one on the motor.",
+    excited_by="slow triangular reversals, and postures of high gravity torque",
+    **_TRANSMISSION,
+)
+"""A form of backlash and of compliance, and no effect of its own."""
+
 ROWS = (
     Effect(
         name="backlash",
@@ -178,6 +191,7 @@ ROWS = (
             Form("motor_friction", "backlash", ("at_motor",)),
             # All that shows then is that the joint is not driven for a moment.
             Form("joint_encoder", "joint_encoder", ("at_joint",), screened=True),
+            Form("joint_log", "joint_log", ("at_joint",), screened=True),
         ),
         sentence="The gears have backlash: the motor turns a little before the joint does.",
         excited_by="slow triangular reversals through the posture without gravity torque",
@@ -199,6 +213,7 @@ ROWS = (
             Form("hardening", "compliance", ("hardening_per_rad2",)),
             Form("damped", "compliance", ("nm_s_per_rad",)),
             Form("motor_friction", "compliance", ("at_motor",)),
+            Form("joint_log", "joint_log", ("at_joint",), screened=True),
         ),
         sentence="A spring sits between motor and joint.",
         excited_by="a chirp through its resonance, and postures of high gravity torque",

@@ -282,6 +282,38 @@ def test_a_segment_begins_where_its_encoders_saw_nothing_of_the_play(rotor):
     assert without > 2.0 * error
 
 
+@pytest.mark.parametrize("rotor", [0.0001, 0.02])
+@pytest.mark.parametrize(
+    ("gears", "most"), [({"backlash": {"rad": 0.04}}, 2e-3), ({"compliance": {"nm_per_rad": 60.0}}, 3e-3)]
+)
+def test_a_segment_begins_where_the_log_and_not_the_controller_sees_the_joint(rotor, gears, most):
+    arm = rigs.Player(Rig(with_rotor(rotor, damping=0.5), rigs.ARM_JOINTS, rigs.CONTROL_HZ))
+    ((name, value),) = gears.items()
+    effect = {name: {"elbow": value}, "joint_log": {"elbow": {"at_joint": 1.0}}}
+    cut = recut(arm, np.repeat(SWING[::5], 5, axis=0), **effect)
+    error, without, blind = (
+        np.sqrt((one**2).mean())
+        for one in (errors(arm, cut, **effect), errors(arm, cut), errors(arm, cut, **{name: {"elbow": value}}))
+    )
+    assert error < most
+    assert min(without, blind) > 2.0 * error
+
+
+@pytest.mark.parametrize("gears", [{"backlash": {"rad": 0.04}}, {"compliance": {"nm_per_rad": 60.0}}])
+def test_a_log_of_the_joint_has_the_joint_and_changes_no_motion(gears):
+    arm = rigs.Player(Rig(with_rotor(0.02, damping=0.5), rigs.ARM_JOINTS, rigs.CONTROL_HZ))
+    segment = rigs.segment(arm.rig, START, steps_of(START), kp=[12.0, 8.0], kd=[0.4, 0.2], limit=[5.0, 5.0])
+    elbow = {name: {"elbow": value} for name, value in gears.items()}
+    at_motor, at_joint = (
+        arm.run(read_and_true, arm.vector(**elbow, **log), segment)
+        for log in ({}, {"joint_log": {"elbow": {"at_joint": 1.0}}})
+    )
+    count = len(rigs.ARM_JOINTS)
+    np.testing.assert_allclose(at_joint[:, count:], at_motor[:, count:], atol=1e-5)
+    np.testing.assert_allclose(at_joint[:, :count], at_joint[:, count:], atol=1e-5)
+    assert np.abs(at_motor[:, :count] - at_motor[:, count:]).max() > 5e-3
+
+
 GEARS = {"backlash": {"rad": 0.04}, "compliance": {"nm_per_rad": 60.0}}
 
 
