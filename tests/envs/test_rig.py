@@ -299,21 +299,6 @@ def test_a_segment_begins_where_the_log_and_not_the_controller_sees_the_joint(ro
     assert min(without, blind) > 2.0 * error
 
 
-@pytest.mark.parametrize("gears", [{"backlash": {"rad": 0.04}}, {"compliance": {"nm_per_rad": 60.0}}])
-def test_a_log_of_the_joint_has_the_joint_and_changes_no_motion(gears):
-    arm = rigs.Player(Rig(with_rotor(0.02, damping=0.5), rigs.ARM_JOINTS, rigs.CONTROL_HZ))
-    segment = rigs.segment(arm.rig, START, steps_of(START), kp=[12.0, 8.0], kd=[0.4, 0.2], limit=[5.0, 5.0])
-    elbow = {name: {"elbow": value} for name, value in gears.items()}
-    at_motor, at_joint = (
-        arm.run(read_and_true, arm.vector(**elbow, **log), segment)
-        for log in ({}, {"joint_log": {"elbow": {"at_joint": 1.0}}})
-    )
-    count = len(rigs.ARM_JOINTS)
-    np.testing.assert_allclose(at_joint[:, count:], at_motor[:, count:], atol=1e-5)
-    np.testing.assert_allclose(at_joint[:, :count], at_joint[:, count:], atol=1e-5)
-    assert np.abs(at_motor[:, :count] - at_motor[:, count:]).max() > 5e-3
-
-
 GEARS = {"backlash": {"rad": 0.04}, "compliance": {"nm_per_rad": 60.0}}
 
 
@@ -429,6 +414,21 @@ def test_an_encoder_at_the_joint_sees_nothing_of_the_gears(rotor, damping, perio
         assert wrong[:2].max() > 10 * right.max()
 
 
+@pytest.mark.parametrize("rotor", [0.02, 0.2])
+def test_a_log_of_the_joint_beside_a_controller_of_the_motor(rotor):
+    arm = rigs.Player(Rig(with_rotor(rotor), rigs.ARM_JOINTS, 200.0))
+    for effect in GEARS:
+        expected, segment = pushed(arm, of_two_bodies(effect, with_rotor(rotor), 0.0), effect, 5e-3, log_at_joint=True)
+        links = np.hstack([expected[:, 2:], expected[:, 2:]])
+        gears = {effect: {"elbow": GEARS[effect]}}
+        right, wrong = (
+            np.abs(arm.run(read_and_true, arm.vector(**gears, **log), segment) - links).max()
+            for log in ({"joint_log": {"elbow": {"at_joint": 1.0}}}, {})
+        )
+        assert right < 9e-3
+        assert wrong > 2 * right
+
+
 def bristles(bound, travel):
     """Torque of bristles in Nm, step by step of 0.1 ms, of a speed in rad/s."""
     wound = 0.0
@@ -441,7 +441,7 @@ def bristles(bound, travel):
     return torque
 
 
-def pushed(arm, model, effect, period, rub=lambda speed: 0.0, at_joint=False):
+def pushed(arm, model, effect, period, rub=lambda speed: 0.0, at_joint=False, log_at_joint=False):
     """Sends the forearm there and back.
 
     Args:
@@ -451,6 +451,7 @@ def pushed(arm, model, effect, period, rub=lambda speed: 0.0, at_joint=False):
       period: of the controller in s.
       rub: torque on the link in Nm at its speed in rad/s, beside the friction of the model.
       at_joint: whether the encoder is at the link, not on the motor.
+      log_at_joint: whether that of the log alone is.
 
     Returns:
       Encoders and links [steps, joints] in MuJoCo C, and the segment for the rig.
@@ -478,7 +479,7 @@ def pushed(arm, model, effect, period, rub=lambda speed: 0.0, at_joint=False):
             torque = kp * (target[step // 10] - read(data.qpos)) - kd * read(data.qvel)
         data.qfrc_applied[:] = np.array([*torque, 0.0]) + rub(data.qvel[1] + data.qvel[2]) * np.array([0.0, 1.0, 1.0])
         mujoco.mj_step(model, data)
-    return np.array(expected), rigs.segment(arm.rig, motor, target, kp, kd)
+    return np.array(expected), rigs.segment(arm.rig, start if log_at_joint else motor, target, kp, kd)
 
 
 def test_rotors_without_inertia_and_motors_that_are_off_stay_with_their_links():
