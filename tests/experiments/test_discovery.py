@@ -419,7 +419,7 @@ def test_logs_that_cannot_be_simulated_are_refused_with_the_run_named(spec, plai
     for log, message in [
         (changed(plain, controller=slow), "run_003: controller.rate_hz: got 500, expected 1000"),
         (changed(plain, controller=servo), "run_003: column 'volts' is missing"),
-        (changed(plain, **short), "run_003: got 0.078 s, expected 0.11 s or more"),
+        (changed(plain, **short), "run_003: got 0.078 s, expected 0.17 s or more"),
         (replace(plain, joints=("elbow",)), "joints: got a log without shoulder, expected all joints that may move"),
     ]:
         with pytest.raises(ValueError, match=message):
