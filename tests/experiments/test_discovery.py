@@ -424,6 +424,6 @@ def test_logs_that_cannot_be_simulated_are_refused_with_the_run_named(spec, plai
     ]:
         with pytest.raises(ValueError, match=message):
             build_question(log, spec, null_logs=0)
-    # One run of a second has two segments of 0.45 s, less what comes before the first.
-    with pytest.raises(ValueError, match=r"'select' has 2 segment\(s\) of 0.45 s, expected 3 or more"):
+    # A run of a second has one segment of 0.45 s, beside what comes before it.
+    with pytest.raises(ValueError, match=r"'train' has 2 segment\(s\) of 0.45 s, expected 3 or more"):
         build_question(plain, spec, null_logs=0)
