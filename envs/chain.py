@@ -127,16 +127,8 @@ class Chain:
         torque = torque - x["emf"] * joint[1]
         data, memory, torque = self._move(model, data, memory, values, torque, x | gains)
         torques, memory = self.stage("torque_reading", values, jnp.stack([torque, memory["held"]]), None, memory)
-        return (
-            data,
-            memory,
-            {
-                "q": readings[0] - unlogged[0],
-                "dq": readings[1] + running - unlogged[1],
-                "tau": torques[0],
-                "command": torques[1],
-            },
-        )
+        position, velocity = readings - unlogged
+        return data, memory, {"q": position, "dq": velocity + running, "tau": torques[0], "command": torques[1]}
 
     def remember(self, values, memory: dict, motor: jax.Array, x) -> tuple[dict, jax.Array]:
         """Fills the memories of sensors, controller and friction by a step of measured motion.
@@ -162,7 +154,7 @@ class Chain:
         Each rotor is held to its measured motion by a controller of its own, in addition to the motor's torque. It is
         no stiffer than the rotor is heavy, or a twentieth of the joint where it is lighter, so where the rotor meets
         its link again, both feel it. Sensors remember the motors as the controller would have seen them (`_within`).
-        Where the encoder is at the joint, its link is held so instead, and the rotor follows the motor's torque.
+        Where the log has an encoder at the joint, its link is held so instead, and the rotor follows the motor's torque.
 
         Args:
           model: of the robot, effects on its fields included.

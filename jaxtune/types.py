@@ -259,6 +259,7 @@ class Effect:
         "torque",
         "transmission",
         "encoder",
+        "log",
         "friction",
         "bristle",
         "wrench",
