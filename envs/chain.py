@@ -154,7 +154,7 @@ class Chain:
         Each rotor is held to its measured motion by a controller of its own, in addition to the motor's torque. It is
         no stiffer than the rotor is heavy, or a twentieth of the joint where it is lighter, so where the rotor meets
         its link again, both feel it. Sensors remember the motors as the controller would have seen them (`_within`).
-        Where the log has an encoder at the joint, its link is held so instead, and the rotor follows the motor's torque.
+        Where the log has an encoder at the joint, its link is held instead, and the rotor follows the motor's torque.
 
         Args:
           model: of the robot, effects on its fields included.
