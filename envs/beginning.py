@@ -41,13 +41,11 @@ def begin(
     drive = {name: getattr(segment, name) for name in _INPUTS}
     drive["emf"], _ = chain.stage("back_emf", values, segment.emf, None, {})
     past, future = _part(drive, 0, before), _part(drive, before, None)
-    # The readings as they would have been without this hypothesis' sensor errors.
-    truth = segment.measured
-    for row in chain.entering("sensor"):
-        if row.undo is not None:
-            truth = row.undo(values[row.name], truth, chain.dt)
+    truth = _undone(chain, values, segment.measured)
     acceleration = jnp.gradient(truth[:, 1], chain.dt, axis=0)
-    first = chain.start(values, truth[0], jax.tree.map(lambda x: x[0], drive), segment.past, segment.past_target)
+    inputs = jax.tree.map(lambda x: x[0], drive)
+    first = chain.start(values, truth[0], inputs, segment.past_target)
+    first |= _wound(chain, model, data, values, segment, inputs)
 
     def remember(memory, inputs):
         return chain.remember(values, memory, *inputs)
@@ -59,6 +57,28 @@ def begin(
     steps = before - early
     memory, torque = jax.lax.scan(remember, first, (truth[:steps], past))
     return *_followed(chain, model, data, values, (truth, acceleration, torque, past), first, memory), future
+
+
+def _undone(chain, values, readings):
+    """The motion [steps, 2, joints] that was read, without this hypothesis' errors of sensors."""
+    for row in chain.entering("sensor"):
+        if row.undo is not None:
+            readings = row.undo(values[row.name], readings, chain.dt)
+    return readings
+
+
+def _wound(chain, model, data, values, segment, inputs) -> dict:
+    """Bristles as the past has wound them. When it began, they carried a robot at rest.
+
+    A robot that did not rest then has moved through their travel since, and forgotten it.
+    """
+    inputs = inputs | {"target": segment.past_target[0]}
+    position = segment.past[0]
+    # Slopes need some rows.
+    rest = _undone(chain, values, jnp.tile(jnp.stack([position, jnp.zeros_like(position)]), (3, 1, 1)))[0]
+    memory, torque = chain.remember(values, chain.start(values, rest, inputs), rest, inputs)
+    there = data.replace(qpos=data.qpos.at[chain.qpos].set(rest[0]))
+    return chain.wound(model, there, values, memory, torque, inputs, segment.past)
 
 
 def _followed(chain, model, data, values, history, first, memory) -> tuple[mjx.Data, dict]:

@@ -338,7 +338,7 @@ class Chain:
                 memory[row.name] = kept
         return signal, memory
 
-    def start(self, values, state, x, past=None, past_target=None) -> dict:
+    def start(self, values, state, x, past_target=None) -> dict:
         """Makes the memories in steady state: of a robot that has been in one state, with one target, for a long time.
 
         Use it before the first step. A segment of a log then replays its history to get the real ones (`envs.rig`).
@@ -347,14 +347,13 @@ class Chain:
           values: of the effects.
           state: positions and velocities, [2, joints].
           x: the controller's inputs.
-          past: positions [past, joints] rad that led to the state, which bristles remember; None where it never moved.
           past_target: targets [past targets, joints] rad that led to the first one, which a slew limit may still be
             behind; None where they never moved. For the time between two, see `envs.effects.memory`.
         """
         torque = self._law(x, x["target"] - state[0], state[1])
         # What reaches each of these stages in steady state, other effects left aside.
         signals = {"sensor": state, "torque": torque, "transmission": torque[None]}
-        signals["bristle"] = state[:1] if past is None else past
+        signals["bristle"] = torque * 0.0, state[:1]
         signals["command"] = x["target"][None] if past_target is None else past_target
         memory = {"held": torque, "passed": torque, "within": jnp.zeros_like(torque)}
         for stage, signal in signals.items():
@@ -362,6 +361,26 @@ class Chain:
                 if row.start is not None:
                     memory[row.name] = row.start(values[row.name], signal, self.dt)
         return memory
+
+    def wound(self, model, data, values, memory, torque, x, past) -> dict:
+        """Makes the memories of bristles from past positions.
+
+        Args:
+          model: of the robot, effects on its fields included.
+          data: the robot at the first of these positions. Bristles carry what motors and gravity leave of it at rest.
+          values: of the effects.
+          memory: of the robot there.
+          torque: of the motors there, [joints] Nm.
+          x: the controller's inputs there.
+          past: positions [past, joints] rad.
+        """
+        position = data.qpos[self.qpos]
+        now = self._now(x, jnp.stack([position, jnp.zeros_like(position)])).replace(load=jnp.abs(torque))
+        still = Wrench(torque=torque, force=now.body_velocity)
+        pulled = self.stage("wrench", values, still, now, memory)[0].torque + stepping.at_rest(model, data)[self.dof]
+        friction, _ = self.stage("friction", values, model.dof_frictionloss[self.dof], now, memory)
+        carried = jnp.clip(pulled / jnp.maximum(friction, MIN_FRICTION_NM), -1.0, 1.0)
+        return {row.name: row.start(values[row.name], (carried, past), self.dt) for row in self.entering("bristle")}
 
     def pressed(self, values, torque: jax.Array) -> dict:
         """Makes the memories of the transmission from torques [steps, joints] Nm on the gears, one step after another.

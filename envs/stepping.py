@@ -107,6 +107,14 @@ def stopped(model: mjx.Model, data: mjx.Data) -> jax.Array:
 
 
 @devices.precisely
+def at_rest(model: mjx.Model, data: mjx.Data) -> jax.Array:
+    """Torques of gravity and springs on a robot that rests where it is, [dofs] Nm."""
+    for part in (mjx.fwd_position, mjx.fwd_velocity):
+        data = part(model, data.replace(qvel=jnp.zeros_like(data.qvel)))
+    return data.qfrc_passive - data.qfrc_bias
+
+
+@devices.precisely
 def dry_friction(data: mjx.Data) -> jax.Array:
     """Torques of dry friction in a step that `step` has taken, [dofs] Nm."""
     rows = data._impl

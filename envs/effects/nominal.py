@@ -3,8 +3,9 @@
 A controller's damping gain is rarely known to a percent, the constants of a servo's motor are those of a data sheet,
 and the inertia of a link is known no better than its mass. Few logs say how their targets went on between two rows, and
 a torque that was computed from a motor's current is as good as its constant. The engine's dry friction lets a joint
-creep under a load, which that of gears does not. Discovery fits these under every hypothesis, or it would call them a
-delay, friction, a load or a weak motor.
+creep under a load, which that of gears does not. Logs of most simulators have positions of half a step later than
+velocities and torques. Discovery fits these under every hypothesis, or it would call them a delay, friction, a load or
+a weak motor.
 """
 
 import jax.numpy as jnp
@@ -29,6 +30,18 @@ def _holding(values, model: mjx.Model, dof: np.ndarray) -> mjx.Model:
     stiff = jnp.where(values["share"] > 0, 1.0 / (1.0 + creep), least)
     solimp = model.dof_solimp.at[dof, 0].set(stiff).at[dof, 1].set(jnp.maximum(stiff, most))
     return model.replace(dof_solimp=solimp)
+
+
+def _position_lead(values, readings, now, memory):
+    """q'(t) = q(t + seconds): positions of semi-implicit Euler, to first order; velocities are as they were."""
+    del now
+    return readings.at[0].add(values["seconds"] * readings[1]), memory
+
+
+def _undo_lead(values, readings, dt):
+    """q(t) = q'(t - seconds), to first order."""
+    del dt
+    return readings.at[:, 0].add(-values["seconds"] * readings[:, 1])
 
 
 ROWS = (
@@ -85,6 +98,18 @@ ROWS = (
         act=_target_between_rows,
         sentence="Targets move on between two rows of the log.",
         excited_by="a log at a higher rate",
+    ),
+    Effect(
+        name="position_lead",
+        family="sensing",
+        on="robot",
+        enters="sensor",
+        parameters=(Parameter(name="seconds", bounds=(0.0, 0.005), prior=0.001),),
+        sizes=(0.001,),
+        act=_position_lead,
+        undo=_undo_lead,
+        sentence="Positions are those of a moment after velocities and torques, as in a simulator's half step.",
+        excited_by="fast swings at two controller gains",
     ),
     Effect(
         name="torque_reading",

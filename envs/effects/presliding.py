@@ -22,14 +22,15 @@ def _presliding(values, friction, now, memory):
     return jnp.stack([jnp.where(there, 0.0, bound), torque - jnp.where(there, bound * wound, 0.0)]), wound
 
 
-def _wound(values, positions, dt):
-    """Starts with bristles as past positions [past, joints] have wound them, upright before the first of these."""
+def _wound(values, past, dt):
+    """Starts with bristles as past positions [past, joints] have wound them, from those before the first of these."""
     del dt
+    before, positions = past
 
     def wind(wound, moved):
         return jnp.clip(wound + moved / jnp.maximum(values["travel_rad"], 1e-9), -1.0, 1.0), None
 
-    return jax.lax.scan(wind, jnp.zeros_like(positions[0]), jnp.diff(positions, axis=0))[0]
+    return jax.lax.scan(wind, before, jnp.diff(positions, axis=0))[0]
 
 
 PRESLIDING = Effect(

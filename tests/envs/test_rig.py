@@ -38,6 +38,12 @@ def pendulum():
     return Rig(models.spec("pendulum"), ("hinge",), rigs.CONTROL_HZ)
 
 
+RUBBING = {
+    "coulomb": {name: {"torque_nm": 0.5} for name in rigs.ARM_JOINTS},
+    "presliding": {name: {"travel_rad": 0.004} for name in rigs.ARM_JOINTS},
+}
+
+
 def steps_of(target):
     """Every 30 steps another target, the same for the first joint the other way round."""
     levels = np.repeat([0.0, 0.4, -0.3, 0.5, 0.1], rigs.STEPS // 5)[:, None]
@@ -45,6 +51,21 @@ def steps_of(target):
 
 
 # Against MuJoCo C.
+
+
+def test_positions_that_a_simulator_has_half_a_step_ahead_are_read_ahead(arm, plain):
+    segment = rigs.segment(arm.rig, START, steps_of(START), kp=[60.0, 30.0], kd=[0.8, 0.4], speed=1.5)
+    half = 0.5 * arm.rig.dt
+    # What MuJoCo calls positions, in the controller and in the log.
+    as_they_are = rigs.in_mujoco(
+        arm.rig,
+        plain,
+        segment,
+        sense=lambda seen: np.stack([seen[0] + half * seen[1], seen[1]]),
+        start=np.stack([START - half * 1.5, np.full(2, 1.5)]),
+    )
+    agrees(arm.play(segment, position_lead={"robot": {"seconds": half}}), as_they_are)
+    assert np.abs(arm.play(segment)["q"] - as_they_are[:, 0]).max() > 1e-3
 
 
 def test_an_arm_without_effects_moves_as_in_mujoco(arm, plain):
@@ -212,15 +233,26 @@ def test_bristles_of_a_segment_are_where_its_motion_has_wound_them(arm):
     # Up and down again by 60 mrad, in 2 s each: after the reversal bristles of 4 mrad need longer than the 0.12 s
     # before a segment to be wound the other way.
     target = START + np.concatenate([np.linspace(0.0, 0.06, 2000), np.linspace(0.06, 0.0, 2000)])[:, None]
-    rubbing = {
-        "coulomb": {name: {"torque_nm": 0.5} for name in rigs.ARM_JOINTS},
-        "presliding": {name: {"travel_rad": 0.004} for name in rigs.ARM_JOINTS},
-    }
-    cut = recut(arm, target, **rubbing)
+    cut = recut(arm, target, **RUBBING)
     unwound = replace(cut, segments=cut.segments.replace(past=np.zeros_like(cut.segments.past)))
     assert np.ptp(cut.signals["q"], axis=(0, 1)).min() > 0.03
-    error, without = (np.sqrt((errors(arm, one, **rubbing) ** 2).mean()) for one in (cut, unwound))
+    error, without = (np.sqrt((errors(arm, one, **RUBBING) ** 2).mean()) for one in (cut, unwound))
     assert error < 0.2 * without
+
+
+def test_a_robot_that_rests_on_its_friction_stays_there(arm, plain):
+    # Gravity and a target that it does not reach leave 0.3 Nm to friction of 0.5 Nm at each joint.
+    data = mujoco.MjData(plain)
+    data.qpos[arm.rig.qpos] = START
+    mujoco.mj_forward(plain, data)
+    carried, kp = np.array([0.3, -0.3]), np.array([12.0, 8.0])
+    target = START + (data.qfrc_bias[arm.rig.dof] + carried) / kp
+    segment = rigs.segment(arm.rig, START, target, kp=kp, kd=[0.4, 0.2])
+    np.testing.assert_allclose(arm.play(segment, **RUBBING)["q"], np.tile(START, (rigs.STEPS, 1)), atol=2e-6)
+    # Here it has just come, through some of its bristles' travel, so they do not balance it.
+    came = segment.past + np.array([[-1e-3, 1e-3], [0.0, 0.0]], np.float32)
+    moved = arm.play(segment.replace(past=came, past_target=segment.past_target + came[0] - START), **RUBBING)
+    assert np.ptp(moved["q"], axis=0).min() > 1e-4
 
 
 TIME = 0.001 * np.arange(4000)[:, None]

@@ -84,7 +84,7 @@ def series(name, signals, at=None, start=None, **physical):
         signal, memory = row.act(values, signal, at, memory)
         return memory, signal
 
-    start = signals[0] if start is None else jnp.asarray(start, jnp.float32)
+    start = signals[0] if start is None else jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), start)
     return np.asarray(jax.lax.scan(step, row.start(values, start, DT), signals)[1])
 
 
@@ -307,15 +307,19 @@ def test_bristles_give_way_and_then_slide():
     # 0.1 rad/s for 20 ms is 2 mrad: bristles of 1 mrad slide after half of that; without travel nothing changes.
     friction = np.tile([[[0.4, 0.4], [0.1, 0.1]]], (21, 1, 1))
     still = np.zeros((2, JOINTS))
-    got = series("presliding", friction, at=now(speed=0.1), start=still, travel_rad=[0.001, 0.0])
+    upright = np.zeros(JOINTS)
+    got = series("presliding", friction, at=now(speed=0.1), start=(upright, still), travel_rad=[0.001, 0.0])
     wound = np.minimum(0.1 * DT * np.arange(1, 22) / 0.001, 1.0)
     np.testing.assert_allclose(got[:, 0, 0], 0.0)
     np.testing.assert_allclose(got[:, 1, 0], 0.1 - 0.4 * wound, atol=1e-6)
     np.testing.assert_allclose(got[:, :, 1], friction[:, :, 1], atol=1e-7)
     # Having come 3 mrad from below and gone back by 0.3, they are wound by 1 - 0.3 at first.
     past = np.array([[0.0], [0.001], [0.003], [0.0027]]) * np.ones(JOINTS)
-    (got,) = series("presliding", friction[:1], at=now(speed=0.0), start=past, travel_rad=[0.001, 0.0])
+    (got,) = series("presliding", friction[:1], at=now(speed=0.0), start=(upright, past), travel_rad=[0.001, 0.0])
     np.testing.assert_allclose(got[1], [0.1 - 0.4 * 0.7, 0.1], atol=1e-6)
+    # What they carried before is kept, as far as the motion leaves it.
+    (got,) = series("presliding", friction[:1], at=now(speed=0.0), start=(upright - 0.6, still), travel_rad=0.001)
+    np.testing.assert_allclose(got[1], 0.1 + 0.4 * 0.6, atol=1e-6)
 
 
 def test_a_motor_gives_less_the_faster_it_turns():
