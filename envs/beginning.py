@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from mujoco import mjx
 
+from envs import history
 from envs.chain import Chain
 from envs.effects.memory import LONGEST_S
 from envs.segments import Segment
@@ -48,7 +49,7 @@ def begin(
     first |= _wound(chain, model, data, values, segment, inputs)
 
     def remember(memory, inputs):
-        return chain.remember(values, memory, *inputs)
+        return history.remember(chain, values, memory, *inputs)
 
     # Delays need the whole history, and gears the end of it: to simulate them takes longer than to remember.
     early = before - round(_GEARS_S / chain.dt)
@@ -76,12 +77,12 @@ def _wound(chain, model, data, values, segment, inputs) -> dict:
     position = segment.past[0]
     # Slopes need some rows.
     rest = _undone(chain, values, jnp.tile(jnp.stack([position, jnp.zeros_like(position)]), (3, 1, 1)))[0]
-    memory, torque = chain.remember(values, chain.start(values, rest, inputs), rest, inputs)
+    memory, torque = history.remember(chain, values, chain.start(values, rest, inputs), rest, inputs)
     there = data.replace(qpos=data.qpos.at[chain.qpos].set(rest[0]))
-    return chain.wound(model, there, values, memory, torque, inputs, segment.past)
+    return history.wound(chain, model, there, values, memory, torque, inputs, segment.past)
 
 
-def _followed(chain, model, data, values, history, first, memory) -> tuple[mjx.Data, dict]:
+def _followed(chain, model, data, values, motion, first, memory) -> tuple[mjx.Data, dict]:
     """The robot and its memories at the end of a history in which links followed their motors.
 
     Args:
@@ -89,21 +90,21 @@ def _followed(chain, model, data, values, history, first, memory) -> tuple[mjx.D
       model: of the robot.
       data: of the robot, in any state.
       values: of the effects.
-      history: motion without the sensors' errors and its accelerations, [steps + 1, ...] or longer; torques of motors
-        and inputs of the controller, [steps, ...].
+      motion: what was measured without the sensors' errors, and its accelerations, [steps + 1, ...] or longer; torques
+        of motors and inputs of the controller, [steps, ...].
       first: the memories at its beginning.
       memory: the memories at its end, if nothing gives way.
     """
-    truth, acceleration, torque, past = history
+    truth, acceleration, torque, past = motion
     steps, still = len(torque), data
     # Where joints are behind their motors was not measured. It matters, and takes time, only if gears give way.
     gears = {row.name: row.parameters[0].name for row in chain.entering("transmission")}
     gives = jnp.stack([values[name][size] != 0 for name, size in gears.items()]).any(axis=0)
     pressing = torque - model.dof_armature[chain.dof] * acceleration[:steps]
-    first = first | chain.pressed(values, pressing[: round(_PRESSED_S / chain.dt)])
+    first = first | history.pressed(chain, values, pressing[: round(_PRESSED_S / chain.dt)])
 
     def at(index, data, memory, speeding):
-        """The robot at a step of the history, with accelerations [joints]."""
+        """The robot at a step of the motion, with accelerations [joints]."""
         state = truth[index] - chain.at_log(values, chain.ahead(memory))
         return data.replace(
             qpos=still.qpos.at[chain.qpos].set(state[0] + chain.lead_s * state[1]),
@@ -116,7 +117,7 @@ def _followed(chain, model, data, values, history, first, memory) -> tuple[mjx.D
     def follow(index, carry):
         data, memory, rates = carry
         inputs = jax.tree.map(lambda x: x[index], past)
-        data, memory = chain.follow(model, data, memory, values, truth[index], torque[index], inputs)
+        data, memory = history.follow(chain, model, data, memory, values, truth[index], torque[index], inputs)
         # A light rotor's speed within its gears jumps from step to step.
         rates = {name: rate + chain.dt / _RATE_S * (memory[name][1] - rate) for name, rate in rates.items()}
         return data, memory, rates
@@ -126,7 +127,7 @@ def _followed(chain, model, data, values, history, first, memory) -> tuple[mjx.D
     rows = (row.name for row in chain.rows if row.enters in _FOLLOWED and row.start is not None)
     memory = memory | {name: jnp.where(gives, followed[name], memory[name]) for name in ("passed", "within", *rows)}
     for name in gears:
-        memory[name] = memory[name].at[1].add(chain.light(model) * (rates[name] - memory[name][1]))
+        memory[name] = memory[name].at[1].add(history.light(chain, model) * (rates[name] - memory[name][1]))
     return at(steps, data, memory, jnp.where(gives, data.qacc[chain.dof], acceleration[steps])), memory
 
 

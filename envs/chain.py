@@ -22,9 +22,8 @@ MIN_FRICTION_NM = 1e-6
 MJX solves for friction only in joints that had some when the model was put on the device, and brakes a joint whose
 bound is exactly zero."""
 
-_LIGHT = 0.05  # share of a joint's inertia under which its rotor is a light one
-_LIGHTEST = 0.01  # least share of a joint's inertia that its link has; the rest is the rotor's
-_HOLD_RAD_S = 200.0  # pace of the controller that holds rotors to their measured motion: 5 ms, some steps
+LIGHTEST = 0.01
+"""Least share of a joint's inertia that its link has; the rest is the rotor's."""
 
 
 @chex.dataclass(frozen=True)
@@ -67,7 +66,8 @@ class Chain:
     - `values` holds [places] by effect and parameter, in the form that effects read. Zero means no effect.
     - `memory` is a dictionary: what each effect remembers, by its name, `held`, the controller's last torque, `passed`,
       the torque of motors and of dry friction on the joints in the last step, less what bristles rub at links (after
-      `remember`: the motors' torque), and `within`, the share of its gains with which the controller acted within it.
+      `envs.history.remember`: the motors' torque), and `within`, the share of its gains with which the controller acted
+      within it.
     - `x` holds the controller's inputs of one step, [joints] each: `target` rad, `feed` Nm (torque sent directly),
       `stiffness` Nm/rad, `damping` Nm s/rad, `limit` Nm, `emf` Nm s/rad (back electromotive force, not limited), and
       `sample`, a scalar that is true where the controller reads the joint anew.
@@ -117,80 +117,20 @@ class Chain:
           The robot and the memories after the step, and what was read before it, [joints] each: `q`, `dq`, `tau`, the
           torque of the motors, and `command`, that which the controller asked for.
         """
-        joint, within = self.joints(data), self._within(model, x)
+        joint, within = self.joints(data), self.within(model, x)
         motor, running = self._seen(values, joint, memory, within)
-        unlogged = self._unlogged(values, memory)
-        memory, torque, readings = self._control(values, memory | {"within": within}, motor, x)
+        unlogged = self.unlogged(values, memory)
+        memory, torque, readings = self.control(values, memory | {"within": within}, motor, x)
         # The controller answers a motor that runs ahead only as far as it sees it.
         within = self.at_encoders(values, within)
         gains = {name: within * x[name] for name in ("stiffness", "damping")}
         torque = torque - x["emf"] * joint[1]
-        data, memory, torque = self._move(model, data, memory, values, torque, x | gains)
+        data, memory, torque = self.move(model, data, memory, values, torque, x | gains)
         torques, memory = self.stage("torque_reading", values, jnp.stack([torque, memory["held"]]), None, memory)
         position, velocity = readings - unlogged
         return data, memory, {"q": position, "dq": velocity + running, "tau": torques[0], "command": torques[1]}
 
-    def remember(self, values, memory: dict, motor: jax.Array, x) -> tuple[dict, jax.Array]:
-        """Fills the memories of sensors, controller and friction by a step of measured motion.
-
-        Args:
-          values: of the effects.
-          memory: before the step.
-          motor: true positions and velocities of the motors, seen at the joints, [2, joints].
-          x: the controller's inputs.
-
-        Returns:
-          The memories after the step, those of the transmission unchanged, and the motors' torques, [joints] Nm.
-        """
-        memory, torque, _ = self._control(values, memory, motor, x)
-        torque = torque - x["emf"] * motor[1]
-        # Measured motion winds up the bristles as simulated motion does.
-        _, memory = self.stage("bristle", values, jnp.zeros_like(motor), self._now(x, motor), memory)
-        return memory | {"passed": torque}, torque
-
-    def follow(self, model: mjx.Model, data: mjx.Data, memory: dict, values, motor, torque, x) -> tuple[mjx.Data, dict]:
-        """Simulates one step of links whose motors moved as measured: what gears that give way make of that motion.
-
-        Each rotor is held to its measured motion by a controller of its own, in addition to the motor's torque. It is
-        no stiffer than the rotor is heavy, or a twentieth of the joint where it is lighter, so where the rotor meets
-        its link again, both feel it. Sensors remember the motors as the controller would have seen them (`_within`).
-        Where the log has an encoder at the joint, its link is held instead, and the rotor follows the motor's torque.
-
-        Args:
-          model: of the robot, effects on its fields included.
-          data: the robot before the step.
-          memory: before the step.
-          values: of the effects.
-          motor: measured positions and velocities where the encoders are, sensors' errors undone, [2, joints].
-          torque: of the motors, as `remember` returns it, [joints] Nm.
-          x: the controller's inputs.
-
-        Returns:
-          The robot and the memories after the step.
-        """
-        joint, within = self.joints(data), self._within(model, x)
-        far, fast = self.at_log(values, self.ahead(memory))
-        unlogged = self._unlogged(values, memory)
-        # What the log has not seen, the controller has; it acts within the step, as rotors may be light.
-        torque = torque - x["stiffness"] * unlogged[0]
-        seen = (motor + unlogged).at[1].add(-within * (fast + unlogged[1]))
-        _, memory = self.stage("sensor", values, seen, self._now(x, seen), memory | {"within": within})
-        rotor, inertia = model.dof_armature[self.dof], 1.0 / model.dof_invweight0[self.dof]
-        at_motor = self.at_log(values, jnp.ones_like(torque))
-        held = at_motor * jnp.maximum(rotor, _LIGHT * inertia)
-        acts = self.at_encoders(values, jnp.ones_like(torque)) - at_motor
-        hold = {
-            "stiffness": held * _HOLD_RAD_S**2 + acts * x["stiffness"],
-            "damping": 2.0 * held * _HOLD_RAD_S + acts * x["damping"],
-            "emf": jnp.zeros_like(torque),
-        }
-        # How fast a rotor runs ahead acts within the step (`envs.effects.transmission`).
-        position, speed = motor - joint.at[0].add(far)
-        pull = _HOLD_RAD_S**2 * position + 2.0 * _HOLD_RAD_S * speed
-        on_links = (1.0 - at_motor) * jnp.maximum(inertia - rotor, _LIGHTEST * inertia) * pull
-        return self._move(model, data, memory, values, torque + held * pull, x | hold, on_links)[:2]
-
-    def _within(self, model, x) -> jax.Array:
+    def within(self, model, x) -> jax.Array:
         """Share of the controller's gains that acts within the step, [joints].
 
         A controller acts on what it saw at the beginning of its period. A rotor that is too light for that, or has no
@@ -207,7 +147,7 @@ class Chain:
         """What the log sees of how motors run ahead [..., joints]: as the controller does, or less (`JOINT_LOG`)."""
         return self.stage("log", values, self.at_encoders(values, ahead), None, {})[0]
 
-    def _unlogged(self, values, memory) -> jax.Array:
+    def unlogged(self, values, memory) -> jax.Array:
         """What the controller sees of how motors run ahead and the log does not, [2, joints] rad and rad/s."""
         ahead = self.ahead(memory)
         return self.at_encoders(values, ahead) - self.at_log(values, ahead)
@@ -228,14 +168,14 @@ class Chain:
         far, fast = self.at_encoders(values, self.ahead(memory))
         return joint + jnp.stack([far, (1.0 - within) * fast]), within * fast
 
-    def _move(self, model, data, memory, values, torque, x, on_links=0.0) -> tuple[mjx.Data, dict, jax.Array]:
+    def move(self, model, data, memory, values, torque, x, on_links=0.0) -> tuple[mjx.Data, dict, jax.Array]:
         """Moves the robot by the torques of its motors and others on its links, [joints] Nm each.
 
         The third value is what the motors gave in the step.
         """
         joint, (before, fast) = self.joints(data), self.ahead(memory)
         given = torque - (x["damping"] + x["emf"]) * fast
-        now = self._now(x, joint).replace(
+        now = self.now_of(x, joint).replace(
             load=jnp.maximum(jnp.abs(given), jnp.abs(data.qfrc_bias[self.dof])),
             body_velocity=_velocity(model, data)[self.bodies],
             **self._rotors_and_links(model, data, memory),
@@ -272,7 +212,7 @@ class Chain:
     def _rotors_and_links(self, model, data, memory) -> dict:
         """What `Now` says of rotors and their links before a step."""
         rotor, mobility, acceleration = model.dof_armature[self.dof], model.dof_invweight0, data.qacc[self.dof]
-        link = jnp.clip(1.0 - rotor * mobility[self.dof], _LIGHTEST, 1.0)
+        link = jnp.clip(1.0 - rotor * mobility[self.dof], LIGHTEST, 1.0)
         mobility = mobility[self.dof] / link
         # Less what gears and friction gave in the step before. Else a rotor would expect the blow of the moment in
         # which it met its link to go on, and leave it again; and a link that its friction has just stopped to turn
@@ -299,7 +239,7 @@ class Chain:
           Read positions and velocities, [2, joints].
         """
         motor, running = self._seen(values, joint, memory, memory["within"])
-        return self.stage("sensor", values, motor, self._now(x, motor), memory)[0].at[1].add(running)
+        return self.stage("sensor", values, motor, self.now_of(x, motor), memory)[0].at[1].add(running)
 
     def joints(self, data: mjx.Data) -> jax.Array:
         """Takes positions and velocities of the joints from MJX's data, [2, joints] rad and rad/s.
@@ -308,10 +248,6 @@ class Chain:
         """
         speed = data.qvel[self.dof]
         return jnp.stack([data.qpos[self.qpos] - self.lead_s * speed, speed])
-
-    def light(self, model: mjx.Model) -> jax.Array:
-        """Says how light rotors are: 1 without inertia, 0 from a twentieth of the joint's on, [joints]."""
-        return jnp.clip(1.0 - model.dof_armature[self.dof] * model.dof_invweight0[self.dof] / _LIGHT, 0.0, 1.0)
 
     def entering(self, stage: str) -> list[Effect]:
         """Lists the effects that enter a stage (`jaxtune.types.Effect.enters`), in the order in which they act."""
@@ -362,40 +298,13 @@ class Chain:
                     memory[row.name] = row.start(values[row.name], signal, self.dt)
         return memory
 
-    def wound(self, model, data, values, memory, torque, x, past) -> dict:
-        """Makes the memories of bristles from past positions.
-
-        Args:
-          model: of the robot, effects on its fields included.
-          data: the robot at the first of these positions. Bristles carry what motors and gravity leave of it at rest.
-          values: of the effects.
-          memory: of the robot there.
-          torque: of the motors there, [joints] Nm.
-          x: the controller's inputs there.
-          past: positions [past, joints] rad.
-        """
-        position = data.qpos[self.qpos]
-        now = self._now(x, jnp.stack([position, jnp.zeros_like(position)])).replace(load=jnp.abs(torque))
-        still = Wrench(torque=torque, force=now.body_velocity)
-        pulled = self.stage("wrench", values, still, now, memory)[0].torque + stepping.at_rest(model, data)[self.dof]
-        friction, _ = self.stage("friction", values, model.dof_frictionloss[self.dof], now, memory)
-        carried = jnp.clip(pulled / jnp.maximum(friction, MIN_FRICTION_NM), -1.0, 1.0)
-        return {row.name: row.start(values[row.name], (carried, past), self.dt) for row in self.entering("bristle")}
-
-    def pressed(self, values, torque: jax.Array) -> dict:
-        """Makes the memories of the transmission from torques [steps, joints] Nm on the gears, one step after another.
-
-        A rotor's own acceleration takes a part of the motor's torque, which does not press on the gears.
-        """
-        return {row.name: row.start(values[row.name], torque, self.dt) for row in self.entering("transmission")}
-
     @staticmethod
     def _law(x, error, speed) -> jax.Array:
         """`envs.logs.Impedance.torque` in JAX, of an error that effects may have changed."""
         torque = x["stiffness"] * error - x["damping"] * speed
         return jnp.clip(torque, -x["limit"], x["limit"]) + x["feed"]
 
-    def _control(self, values, memory, motor, x):
+    def control(self, values, memory, motor, x):
         """Computes the motors' torques, from their state through sensors and controller.
 
         Args:
@@ -408,7 +317,7 @@ class Chain:
           The memories after the step, the torques of the motors [joints] Nm without back electromotive force, which
           acts continuously, and positions and velocities as read.
         """
-        now = self._now(x, motor)
+        now = self.now_of(x, motor)
         readings, memory = self.stage("sensor", values, motor, now, memory)
         target, memory = self.stage("command", values, x["target"], now, memory)
         error, memory = self.stage("error", values, target - readings[0], now, memory)
@@ -427,7 +336,7 @@ class Chain:
         rows = self.entering("transmission")
         return sum((memory[row.name] for row in rows), start=jnp.zeros((2, len(self.dof))))
 
-    def _now(self, x, state) -> Now:
+    def now_of(self, x, state) -> Now:
         """`Now` of a robot whose forces, rotors and links do not matter."""
         none = jnp.zeros_like(state[1])
         return Now(
