@@ -11,7 +11,7 @@ from jaxtune.discovery.candidate import Candidate, cost, key_of, measures, squar
 from jaxtune.discovery.evaluate import is_worse, position_gap, rms
 from jaxtune.discovery.evidence import Thresholds, ablate, passes, weigh_evidence
 from jaxtune.discovery.fit import Fit, begin, polish, refine
-from jaxtune.discovery.leads import beside, fit_leads, taken_for
+from jaxtune.discovery.leads import at_some_places, beside, fit_leads, taken_for
 from jaxtune.discovery.naming import at_fewest_places, clear_places, moved_forms, renamed, with_refinements
 from jaxtune.discovery.noise_floor import Floor, NoiseFloor, Say
 from jaxtune.discovery.problem import Hypothesis, Problem
@@ -163,22 +163,29 @@ def _where_it_shows(problem: Problem, at: Floor, state: State) -> State:
 def _with_what_passes(settings: Settings, problem: Problem, at: Floor, state: State) -> State:
     """Adds models in which something else is in the place of an effect of the best one that may pass for it.
 
-    The search may have come to that model by taking effects away, and never have looked there, or from too far off.
+    That is another effect, or the same one at some of its places. The search may have come to that model by taking
+    effects away, and never have looked there, or from too far off.
     """
-    found = []
+    found, known = [], {one.key for one in state.candidates}
     for effect in state.best.effects:
-        mine = {one.key for one in (effect, *state.best.forms_of(effect))}
-        others = [one for one in state.best.hypotheses if one.key not in mine]
-        point = state.best.fit.coordinates[state.best.fit.along(effect)]
-        lead = Lead((effect,), point, state.null.fit.coordinates, state.null.fit.cost)
-        leads = taken_for(lead, beside(problem.forms, others), beside(problem.hypotheses, others))
+        mine = effect, *state.best.forms_of(effect)
+        others = [one for one in state.best.hypotheses if one.key not in {part.key for part in mine}]
+        forms, free = (beside(some, others) for some in (problem.forms, problem.hypotheses))
+        coordinates = state.best.fit.coordinates
+        points = [coordinates[state.best.fit.along(one)] for one in mine]
+        alone, whole = (
+            Lead(mine[:count], np.concatenate(points[:count]), state.null.fit.coordinates, state.null.fit.cost)
+            for count in (1, len(mine))
+        )
+        leads = taken_for(alone, forms, free)
+        leads += [one for one in at_some_places(whole, forms, free) if key_of((*others, *one.hypotheses)) not in known]
         if leads:
             base = ablate(at, state.best, effect)
             (fit,) = polish([base.fit], at.residuals["train"], 0)
             leads = [replace(one, start=fit.coordinates) for one in leads]
             found += fit_leads(settings, at, fit, base.hypotheses, leads, state.price)
     cheapest = min((state.best, *found), key=lambda one: total_cost(at, one, state.price))
-    return replace(state.with_candidates(found), best=cheapest)
+    return _where_it_shows(problem, at, replace(state.with_candidates(found), best=cheapest))
 
 
 def _compared(problem: Problem, at: Floor, state: State) -> tuple[list[Candidate], np.ndarray]:

@@ -98,6 +98,29 @@ def taken_for(lead: Lead, forms: Sequence[Hypothesis], free: Sequence[Hypothesis
     return found
 
 
+def at_some_places(lead: Lead, forms: Sequence[Hypothesis], free: Sequence[Hypothesis]) -> list[Lead]:
+    """Lists the effect of a lead, with its forms, at some of its places, each way in which that is a hypothesis.
+
+    Args:
+      lead: with one effect and its forms.
+      forms: of all effects.
+      free: effects that may join the model.
+    """
+    effect, *shapes = lead.hypotheses
+    vector, found = lead.point @ np.concatenate([one.directions for one in lead.hypotheses]), []
+    if effect.each:
+        return []
+    for one in (h for h in free if h.name == effect.name and not h.each and set(h.places) < set(effect.places)):
+        names = {form.form: form for form in forms if form.shapes(one)}
+        if all(shape.form in names for shape in shapes):
+            parts = (one, *(names[shape.form] for shape in shapes))
+            rows = np.concatenate([part.directions for part in parts])
+            # Each row has its own axes; a size is that of the first place.
+            axes = (rows != 0).argmax(axis=1)
+            found.append(Lead(parts, vector[axes] / rows[np.arange(len(rows)), axes], lead.start, lead.cost))
+    return found
+
+
 def _start(form: Hypothesis) -> np.ndarray:
     """The point at which the fit of a form begins, [parameters]."""
     if np.count_nonzero((form.probes != 0).any(axis=0)) > 1:

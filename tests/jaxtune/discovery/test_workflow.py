@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from slider import AXES, BOTH, DIRECTION, EACH, HYPOTHESES, LEARNED, ONE_SIZE, WARPED, WILD, problem
+from slider import AXES, BOTH, DIRECTION, EACH, HYPOTHESES, LEARNED, ONE_SIZE, ROWS, WARPED, WILD, problem
 
 from jaxtune.discovery import leads, noise_floor, state, step, workflow
 from jaxtune.discovery.candidate import Candidate
@@ -494,6 +494,40 @@ def test_what_may_pass_for_a_named_effect_is_fitted_in_its_place():
     (other,) = leads.fit_leads(Settings(), at, null, (), [replace(lead, hypotheses=(mass,))], 0.0)
     ended = replace(begun, best=other)
     assert _with_what_passes(Settings(), asked, at, ended).best is other
+
+
+def test_an_effect_at_several_places_is_fitted_at_some_of_them():
+    at_one, at_two = (
+        replace(ONE_SIZE, places=(place,), directions=rows[None])
+        for place, rows in zip(ONE_SIZE.places, ROWS, strict=True)
+    )
+    asked = problem({"coulomb": 0.8}, hypotheses=(*HYPOTHESES[:2], at_two, ONE_SIZE, at_one), forms=())
+    floor, begun = state.begin(asked, measured_floor(asked))
+    at, null = floor[asked.main_horizon], begun.null.fit
+    # Somehow the search has never looked at one place alone.
+    lead = Lead((ONE_SIZE,), np.array([0.5]), null.coordinates, null.cost)
+    (wide,) = leads.fit_leads(Settings(), at, null, (), [lead], 0.0)
+    found = _with_what_passes(Settings(), asked, at, replace(begun, best=wide, candidates=(wide,)))
+    assert found.best.key == at_one.key
+    assert {one.key for one in found.candidates} == {wide.key, at_one.key, at_two.key}
+    # What was fitted is not fitted again.
+    again = _with_what_passes(Settings(), asked, at, replace(found, best=wide))
+    assert again.candidates == found.candidates
+
+
+def test_forms_go_with_an_effect_to_some_of_its_places():
+    # A size is that of the first place; in units of the second it is twice as large, and a distance half as large.
+    wide = replace(ONE_SIZE, name="load", directions=np.array([[1.0, 2.0, 0.0, 0.0]]))
+    shape = replace(wide, form="far", directions=np.array([[0.0, 0.0, 1.0, 0.5]]))
+    alone = replace(wide, places=("two",), directions=np.array([[0.0, 1.0, 0.0, 0.0]]))
+    far = replace(shape, places=("two",), directions=np.array([[0.0, 0.0, 0.0, 1.0]]))
+    lead = Lead((wide, shape), np.array([0.3, 0.2]), np.zeros(2), 1.0)
+    (found,) = leads.at_some_places(lead, [shape, far], [wide, alone, replace(alone, name="other")])
+    assert [h.key for h in found.hypotheses] == [alone.key, far.key]
+    np.testing.assert_allclose(found.point, [0.6, 0.1])
+    # Nothing where a form is at all places alone, or each place has its own size.
+    assert leads.at_some_places(lead, [shape], [alone]) == []
+    assert leads.at_some_places(replace(lead, hypotheses=(replace(wide, each=True), shape)), [far], [alone]) == []
 
 
 def test_a_nominal_parameter_that_moved_is_no_form_of_an_effect():
