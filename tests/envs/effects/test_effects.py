@@ -62,8 +62,9 @@ def values_of(row, **physical):
     """What `act` is given for physical values, each for all places or one per place."""
     values = {}
     for parameter in row.parameters:
-        # What only a form has is zero where nothing is said of it.
-        each = np.broadcast_to(physical.get(parameter.name, 0.0), JOINTS)
+        # What only a form has is absent where nothing is said of it.
+        absent = np.inf if parameter.form == "reciprocal" else 0.0
+        each = np.broadcast_to(physical.get(parameter.name, absent), JOINTS)
         inner = [parameter.inner(parameter.coordinate(float(value), 1.0), 1.0) for value in each]
         values[parameter.name] = jnp.asarray(inner, jnp.float32)
     return values
@@ -334,6 +335,16 @@ def test_a_motor_gives_less_the_faster_it_turns():
     np.testing.assert_allclose(most(4.0, 0.0), 4.0, rtol=1e-6)
     # From 25 rad/s on nothing is left, and it does not turn round.
     np.testing.assert_allclose([most(4.0, 40.0), most(-4.0, -40.0)], [[0.0, 4.0], [0.0, -4.0]], atol=1e-6)
+
+
+def test_a_motor_at_a_low_voltage_stalls_below_its_controllers_limit():
+    def most(torque, speed):
+        return act("torque_speed", torque, at=now(speed), nm_s_per_rad=0.2, stall_nm=[3.0, 8.0])
+
+    # 3 Nm, less 0.2 x 5. A stall above the controller's 5 Nm changes nothing.
+    np.testing.assert_allclose(most(4.9, 5.0), [2.0, 4.0], rtol=1e-6)
+    np.testing.assert_allclose(most(-4.9, 0.0), [-3.0, -4.9], rtol=1e-6)
+    np.testing.assert_allclose(most(2.9, 0.0), 2.9, rtol=1e-6)
 
 
 def test_a_motor_that_is_off_gives_no_torque_at_any_speed():
