@@ -6,12 +6,11 @@ import jax
 import jax.numpy as jnp
 from mujoco import mjx
 
-from envs import history
+from envs import history, stepping
 from envs.chain import Chain
 from envs.effects.memory import LONGEST_S
-from envs.segments import Segment
+from envs.segments import INPUTS, Segment
 
-_INPUTS = ("target", "between", "feed", "stiffness", "damping", "limit", "emf", "sample")
 # Stages whose memories depend on where links are, not on measured motors alone.
 _FOLLOWED = ("transmission", "bristle", "sensor")
 _RATE_S = 0.012  # over which a light rotor's speed within its gears is taken
@@ -39,14 +38,14 @@ def begin(
     """
     # Measured states go on for `LONGEST_S` after the start, because undoing a delay needs later readings.
     before = len(segment.measured) - 1 - round(LONGEST_S / chain.dt)
-    drive = {name: getattr(segment, name) for name in _INPUTS}
+    drive = {name: getattr(segment, name) for name in INPUTS}
     drive["emf"], _ = chain.stage("back_emf", values, segment.emf, None, {})
     past, future = _part(drive, 0, before), _part(drive, before, None)
     truth = _undone(chain, values, segment.measured)
     acceleration = jnp.gradient(truth[:, 1], chain.dt, axis=0)
     inputs = jax.tree.map(lambda x: x[0], drive)
     first = chain.start(values, truth[0], inputs, segment.past_target)
-    first |= _wound(chain, model, data, values, segment, inputs)
+    first |= _bristles(chain, model, data, values, segment, inputs)
 
     def remember(memory, inputs):
         return history.remember(chain, values, memory, *inputs)
@@ -68,18 +67,20 @@ def _undone(chain, values, readings):
     return readings
 
 
-def _wound(chain, model, data, values, segment, inputs) -> dict:
-    """Bristles as the past has wound them. When it began, they carried a robot at rest.
+def _bristles(chain, model, data, values, segment, inputs) -> dict:
+    """Bristles as the past has wound them.
 
-    A robot that did not rest then has moved through their travel since, and forgotten it.
+    It is assumed that the robot rested at the first past position, where bristles balanced all torques. If it moved
+    then, later motion has wound them anew.
     """
-    inputs = inputs | {"target": segment.past_target[0]}
     position = segment.past[0]
-    # Slopes need some rows.
-    rest = _undone(chain, values, jnp.tile(jnp.stack([position, jnp.zeros_like(position)]), (3, 1, 1)))[0]
+    # Gains and limits are those of the history; rows before it do not matter else.
+    inputs = inputs | {"target": segment.past_target[0], "between": 0.0 * position, "feed": segment.past_feed}
+    # Undoing a lag takes a slope, so it needs more rows than one.
+    rest = _undone(chain, values, jnp.tile(jnp.stack([position, 0.0 * position]), (3, 1, 1)))[0]
     memory, torque = history.remember(chain, values, chain.start(values, rest, inputs), rest, inputs)
     there = data.replace(qpos=data.qpos.at[chain.qpos].set(rest[0]))
-    return history.wound(chain, model, there, values, memory, torque, inputs, segment.past)
+    return history.bristles(chain, model, there, values, memory, torque, inputs, segment.past)
 
 
 def _followed(chain, model, data, values, motion, first, memory) -> tuple[mjx.Data, dict]:
@@ -128,7 +129,9 @@ def _followed(chain, model, data, values, motion, first, memory) -> tuple[mjx.Da
     memory = memory | {name: jnp.where(gives, followed[name], memory[name]) for name in ("passed", "within", *rows)}
     for name in gears:
         memory[name] = memory[name].at[1].add(history.light(chain, model) * (rates[name] - memory[name][1]))
-    return at(steps, data, memory, jnp.where(gives, data.qacc[chain.dof], acceleration[steps])), memory
+    data = at(steps, data, memory, jnp.where(gives, data.qacc[chain.dof], acceleration[steps]))
+    # What effects read of the last step is that of the first one.
+    return stepping.placed(model, data), memory
 
 
 def _part(inputs, begin: int, end: int | None):

@@ -1,7 +1,8 @@
 """Simulates one step of a robot with effects between its targets and its readings, on the test rig and in a walk.
 
-The effects are rows of `envs.effects`, which draws the stages that they act at; this is the only place that applies
-them. `envs.rig` uses it for a robot whose base is fixed, `envs.corrected` for a BITeno that walks.
+The effects are rows of `envs.effects`, which draws the stages that they act at. All that simulates a robot applies
+them through this chain: `envs.rig` one whose base is fixed, `envs.corrected` a BITeno that walks, and `envs.history`
+measured motion that they remember.
 """
 
 from collections.abc import Sequence
@@ -135,6 +136,10 @@ class Chain:
 
         A controller acts on what it saw at the beginning of its period. A rotor that is too light for that, or has no
         inertia in the model, would be thrown about, so its controller acts within every step.
+
+        Args:
+          model: of the robot; its armatures [dofs] kg m^2 count.
+          x: the controller's inputs.
         """
         gain = (x["stiffness"] * self.period_s + x["damping"]) * self.period_s
         return jnp.clip(gain / jnp.maximum(model.dof_armature[self.dof], 1e-9) - 1.0, 0.0, 1.0)
@@ -169,9 +174,19 @@ class Chain:
         return joint + jnp.stack([far, (1.0 - within) * fast]), within * fast
 
     def move(self, model, data, memory, values, torque, x, on_links=0.0) -> tuple[mjx.Data, dict, jax.Array]:
-        """Moves the robot by the torques of its motors and others on its links, [joints] Nm each.
+        """Moves the robot by a step, without its controller.
 
-        The third value is what the motors gave in the step.
+        Args:
+          model: of the robot, effects on its fields included.
+          data: the robot before the step.
+          memory: before the step.
+          values: of the effects.
+          torque: of the motors, [joints] Nm.
+          x: the controller's inputs, of which damping and back electromotive force act within the step.
+          on_links: torques from outside, [joints] Nm.
+
+        Returns:
+          The robot and the memories after the step, and what the motors gave in it, [joints] Nm.
         """
         joint, (before, fast) = self.joints(data), self.ahead(memory)
         given = torque - (x["damping"] + x["emf"]) * fast
@@ -289,7 +304,8 @@ class Chain:
         torque = self._law(x, x["target"] - state[0], state[1])
         # What reaches each of these stages in steady state, other effects left aside.
         signals = {"sensor": state, "torque": torque, "transmission": torque[None]}
-        signals["bristle"] = torque * 0.0, state[:1]
+        # A robot that walks begins with bristles without a load; those of a segment carry it (`envs.history`).
+        signals["bristle"] = jnp.zeros_like(torque), state[:1]
         signals["command"] = x["target"][None] if past_target is None else past_target
         memory = {"held": torque, "passed": torque, "within": jnp.zeros_like(torque)}
         for stage, signal in signals.items():
@@ -337,7 +353,12 @@ class Chain:
         return sum((memory[row.name] for row in rows), start=jnp.zeros((2, len(self.dof))))
 
     def now_of(self, x, state) -> Now:
-        """`Now` of a robot whose forces, rotors and links do not matter."""
+        """`Now` of a robot whose forces, rotors and links do not matter.
+
+        Args:
+          x: the controller's inputs.
+          state: positions and velocities of the joints, [2, joints] rad and rad/s.
+        """
         none = jnp.zeros_like(state[1])
         return Now(
             dt=self.dt,

@@ -77,23 +77,29 @@ def follow(
     return chain.move(model, data, memory, values, torque + held * pull, x | hold, on_links)[:2]
 
 
-def wound(chain: Chain, model, data, values, memory, torque, x, past) -> dict:
+def bristles(chain: Chain, model: mjx.Model, data: mjx.Data, values, memory: dict, torque, x, past) -> dict:
     """Makes the memories of bristles from past positions.
 
     Args:
       chain: of the robot, with all effects.
       model: of the robot, effects on its fields included.
-      data: the robot at the first of these positions. Bristles carry what motors and gravity leave of it at rest.
+      data: the robot at the first of these positions. It rests there: bristles balance motors, gravity and outside
+        torques.
       values: of the effects.
       memory: of the robot there.
       torque: of the motors there, [joints] Nm.
       x: the controller's inputs there.
       past: positions [past, joints] rad.
+
+    Returns:
+      By effect, how far its bristles are wound: [joints] from -1 to 1, where they slide.
     """
-    position = data.qpos[chain.qpos]
-    now = chain.now_of(x, jnp.stack([position, jnp.zeros_like(position)])).replace(load=jnp.abs(torque))
-    still = Wrench(torque=torque, force=jnp.zeros_like(now.body_velocity))
-    pulled = chain.stage("wrench", values, still, now, memory)[0].torque + stepping.at_rest(model, data)[chain.dof]
+    still = stepping.placed(model, data.replace(qvel=jnp.zeros_like(data.qvel)))
+    gravity, position = still.qfrc_bias[chain.dof], still.qpos[chain.qpos]
+    load = jnp.maximum(jnp.abs(torque), jnp.abs(gravity))
+    now = chain.now_of(x, jnp.stack([position, jnp.zeros_like(position)])).replace(load=load)
+    calm = Wrench(torque=torque, force=jnp.zeros_like(now.body_velocity))
+    pulled = chain.stage("wrench", values, calm, now, memory)[0].torque + still.qfrc_passive[chain.dof] - gravity
     friction, _ = chain.stage("friction", values, model.dof_frictionloss[chain.dof], now, memory)
     carried = jnp.clip(pulled / jnp.maximum(friction, MIN_FRICTION_NM), -1.0, 1.0)
     return {row.name: row.start(values[row.name], (carried, past), chain.dt) for row in chain.entering("bristle")}

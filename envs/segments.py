@@ -20,6 +20,7 @@ from envs.smoothing import lateness, smoothed
 
 __all__ = [
     "HISTORY_S",
+    "INPUTS",
     "Cut",
     "Segment",
     "cut",
@@ -33,6 +34,9 @@ __all__ = [
 
 COMPARED = ("q", "dq", "tau", "abs_tau", "gravity")
 """Signals that may be compared with a simulation."""
+
+INPUTS = ("target", "between", "feed", "stiffness", "damping", "limit", "emf", "sample")
+"""Fields of `Segment` with what the controller is told at every step."""
 
 HISTORY_S = LONGEST_S + 0.02
 """Length of the history before a segment, in s: the longest delay and some time for lags to settle."""
@@ -61,10 +65,12 @@ class Segment:
     # `ahead` of it are what undoing a sensor's delay needs.
     measured: jax.Array
     # [past, joints] rad, smoothed positions every 10 ms in the 2 s that lead to the first of `measured`. They wind up
-    # the bristles of dry friction; in slow motion the history alone is too short for that.
+    # the bristles of dry friction; in slow motion the history alone is too short for that. At the first of them
+    # bristles carry what motors and gravity leave.
     past: jax.Array
     # [past targets, joints] rad, every 2 ms in the same time. A limit of their slew may still be far behind them.
     past_target: jax.Array
+    past_feed: jax.Array  # [joints] Nm, torque that was sent directly at the first of `past`
     row_step: jax.Array  # [rows] the last step at or before each row; 0 is the segment's start
     row_share: jax.Array  # [rows] share of a step between that step and the row
 
@@ -242,7 +248,7 @@ def _of_run(run: Run, states: np.ndarray, start: np.ndarray, rows: np.ndarray, a
     # delay of whole rows would then seem likelier than any other.
     acceleration = np.gradient(velocity, run.time, axis=0)
     between_rows = [hermite(run.time, *pair, fine)[0] for pair in ((position, velocity), (velocity, acceleration))]
-    past, past_target = (
+    past, told_before = (
         first[start][:, None] - HISTORY_S + step_s * np.arange(-round(_PAST_S / step_s), 1)
         for first, step_s in ((run.time, PAST_STEP_S), (clock.rows, PAST_TARGET_STEP_S))
     )
@@ -254,7 +260,8 @@ def _of_run(run: Run, states: np.ndarray, start: np.ndarray, rows: np.ndarray, a
         sample=np.diff(ticks, axis=1, prepend=-np.inf) > 0,
         measured=np.stack(between_rows, axis=2).astype(np.float32),
         past=hermite(run.time, position, velocity, past)[0].astype(np.float32),
-        past_target=_between_rows(run, run.signals.get("target"), clock, past_target)[0],
+        past_target=_between_rows(run, run.signals.get("target"), clock, told_before)[0],
+        past_feed=_between_rows(run, run.sent_torque(), clock, told_before[:, 0])[0],
         row_step=step,
         row_share=np.clip(at - step, 0.0, 1.0).astype(np.float32),
     )

@@ -107,11 +107,13 @@ def stopped(model: mjx.Model, data: mjx.Data) -> jax.Array:
 
 
 @devices.precisely
-def at_rest(model: mjx.Model, data: mjx.Data) -> jax.Array:
-    """Torques of gravity and springs on a robot that rests where it is, [dofs] Nm."""
-    for part in (mjx.fwd_position, mjx.fwd_velocity):
-        data = part(model, data.replace(qvel=jnp.zeros_like(data.qvel)))
-    return data.qfrc_passive - data.qfrc_bias
+def placed(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """A robot with what follows from its positions and velocities: where its links are and how fast, and the torques
+    of gravity and Coriolis forces (`qfrc_bias`) and of springs (`qfrc_passive`).
+
+    Those of limits and equalities are not computed.
+    """
+    return mjx.fwd_velocity(model, mjx.fwd_position(model, data))
 
 
 @devices.precisely

@@ -112,6 +112,7 @@ def segment(rig, start, target, kp=0.0, kd=0.0, limit=np.inf, feed=0.0, emf=0.0,
         measured=measured.astype(np.float32),
         past=measured[:1, 0].astype(np.float32),
         past_target=target[:1].astype(np.float32),
+        past_feed=np.broadcast_to(feed, joints).astype(np.float32),
         row_step=np.arange(steps, dtype=np.int32),
         row_share=np.zeros(steps, np.float32),
     )

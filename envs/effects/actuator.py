@@ -39,12 +39,12 @@ def _torque_limit(values, torque, now, memory):
 def _torque_speed(values, torque, now, memory):
     """torque' = clip(torque, min(-limit - c speed, 0), max(limit - c speed, 0)), a DC motor's torque-speed line.
 
-    The limit is the controller's, or what the motor gives where it stalls; c is what the back electromotive force takes
-    from it. Beyond the speed at which nothing is left the motor gives no torque; it does not brake on its own.
-    `values` hold 1 / the torque at the stall.
+    The limit is the controller's, less the share of it that the motor lacks at the stall; c is what the back
+    electromotive force takes from it. Beyond the speed at which nothing is left the motor gives no torque; it does not
+    brake on its own.
     """
     drop = values["nm_s_per_rad"] * now.speed
-    limit = 1.0 / jnp.maximum(1.0 / jnp.maximum(now.limit, 1e-9), values["stall_nm"])
+    limit = now.limit * (1.0 - values["stall_loss"])
     low, high = jnp.minimum(-limit - drop, 0.0), jnp.maximum(limit - drop, 0.0)
     # A motor that is off has a limit of zero. The line alone would then brake or drive the joint.
     there = (values["nm_s_per_rad"] > 0) & (now.limit > 0)
@@ -150,10 +150,10 @@ ROWS = (
         enters="torque",
         parameters=(
             Parameter(name="nm_s_per_rad", scale="motor", bounds=(0.0, 1.0), prior=0.2),
-            Parameter(name="stall_nm", form="reciprocal", scale="torque", bounds=(0.0, 3.0), prior=0.3),
+            Parameter(name="stall_loss", bounds=(0.0, 0.95), prior=0.3),
         ),
         sizes=(0.1, 0.3, 0.5),
-        forms=(Form("low_stall", "torque_speed", ("stall_nm",)),),
+        forms=(Form("low_stall", "torque_speed", ("stall_loss",)),),
         act=_torque_speed,
         sentence="The faster the motor turns, the less torque it can give.",
         excited_by="saturating steps",

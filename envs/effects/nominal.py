@@ -33,15 +33,19 @@ def _holding(values, model: mjx.Model, dof: np.ndarray) -> mjx.Model:
 
 
 def _position_lead(values, readings, now, memory):
-    """q'(t) = q(t + seconds): positions of semi-implicit Euler, to first order; velocities are as they were."""
+    """q'(t) = q(t + seconds): positions of semi-implicit Euler, to first order; velocities are as they were.
+
+    What velocities were taken from such positions, where none were recorded, leads by `velocity_seconds`.
+    """
     del now
     return readings.at[0].add(values["seconds"] * readings[1]), memory
 
 
 def _undo_lead(values, readings, dt):
-    """q(t) = q'(t - seconds), to first order."""
-    del dt
-    return readings.at[:, 0].add(-values["seconds"] * readings[:, 1])
+    """q(t) = q'(t - seconds) and v(t) = v'(t - velocity_seconds), to first order."""
+    position, velocity = readings[:, 0], readings[:, 1]
+    later = values["velocity_seconds"] * jnp.gradient(velocity, dt, axis=0)
+    return jnp.stack([position - values["seconds"] * velocity, velocity - later], axis=1)
 
 
 ROWS = (
@@ -104,7 +108,9 @@ ROWS = (
         family="sensing",
         on="robot",
         enters="sensor",
-        parameters=(Parameter(name="seconds", bounds=(0.0, 0.005), prior=0.001),),
+        parameters=tuple(
+            Parameter(name=name, bounds=(0.0, 0.005), prior=0.001) for name in ("seconds", "velocity_seconds")
+        ),
         sizes=(0.001,),
         act=_position_lead,
         undo=_undo_lead,

@@ -23,7 +23,10 @@ def _presliding(values, friction, now, memory):
 
 
 def _wound(values, past, dt):
-    """Starts with bristles as past positions [past, joints] have wound them, from those before the first of these."""
+    """Starts with bristles as past positions have wound them.
+
+    `past` is a pair: bristles at the first of these positions, [joints] as the memory, and positions [past, joints].
+    """
     del dt
     before, positions = past
 

@@ -15,7 +15,7 @@ _LARGE = 0.7  # of the bounds: the largest size that is screened
 _TRAVEL_RAD, _MOST_TRAVELS = 0.002, 5.0  # over which dry friction sets in, and how many of these at most
 _TORQUE_SHARE, _MOST_SHARES = 0.2, 3.0  # by which recorded torques are off, and how many of these at most
 _HOLDING = 0.5  # standard deviation of the share of the engine's creep that a robot's dry friction lacks
-_LONGEST_STEP_S = 0.002  # of a simulator from which a log may be
+_LONGEST_SIMULATED_S = 0.005  # step of a simulator from which a log may be
 _OFFSET = 0.2  # typical offset of a torque sensor, as a share of the rms torque
 _BENT, _STRAIGHT = 6, 3  # sizes of an effect without a slope at zero, and of one with
 
@@ -114,13 +114,14 @@ def unknown_directions(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Returns directions in the rig's coordinates along what neither log nor model says, and their bounds.
 
-    They are a delay of all readings, of all targets, and of velocities beside positions, a lead of positions before all
-    else, the share in which targets move on between two rows, how much less than the engine's the robot's dry friction
-    lets joints creep, the travel over which the dry friction of the nominal model sets in, and the scale of recorded
-    torques, with their offset where they are all that says how the robot was driven. A log does not say when within its
-    period the controller read and acted, and no model says what friction does at rest or at a reversal. So discovery
-    leaves these free under every hypothesis; otherwise a delay, a friction or a weak motor would be named for a robot
-    that has none.
+    They are a delay of all readings, of all targets, and of velocities beside positions, how far positions lead
+    velocities and torques, the share in which targets move on between two rows, how much less than the engine's the
+    robot's dry friction lets joints creep, the travel over which the dry friction of the nominal model sets in, and the
+    scale of recorded torques, with their offset where they are all that says how the robot was driven.
+
+    A log does not say when within its period the controller read and acted, and no model says what friction does at
+    rest or at a reversal. So discovery leaves these free under every hypothesis; otherwise a delay, a friction or a
+    weak motor would be named for a robot that has none.
 
     Args:
       axes: coordinates of the rig.
@@ -131,18 +132,21 @@ def unknown_directions(
       centres: by how much links' centres of mass may be off (`envs.rig.Rig.loose_centres`).
 
     Returns:
-      [unknowns, axes] of the size of half a period or a quarter, of half of the way between rows or to no creep, of a
-      typical travel, or of a typical error of a motor's constant or of a sensor's offset; and [unknowns, 2] least and
-      largest coordinate.
+      [unknowns, axes] of the size of half a period, of a quarter of a simulator's step, of half of the way between rows
+      or to no creep, of a typical travel, or of a typical error of a motor's constant or of a sensor's offset; and
+      [unknowns, 2] least and largest coordinate.
     """
     # Nothing acts before it is time, and nothing is later than a whole period.
     common = {"sensor_delay": 0.5 / control_hz, "holding": _HOLDING}
     common |= {} if follows else {"command_delay": 0.5 / control_hz, "target_between_rows": 0.5}
     # Velocities of positions that were read before and now are those of half of the time in between.
     common |= {"velocity_lag": 0.5 / control_hz} if "dq" in signals else {}
-    # Semi-implicit Euler has positions of half a step after its velocities, and no step is longer than a period.
-    common |= {"position_lead": 0.25 * min(1.0 / control_hz, _LONGEST_STEP_S)}
     found = [([size * (axis.effect == effect) for axis in axes], (0.0, 2.0)) for effect, size in common.items()]
+    # Semi-implicit Euler has positions of half a step after its velocities, and no step is longer than a period.
+    lead = 0.25 * min(1.0 / control_hz, _LONGEST_SIMULATED_S)
+    leading = {"seconds"} if "dq" in signals else {"seconds", "velocity_seconds"}
+    leads = [lead * (axis.effect == "position_lead" and axis.parameter in leading) for axis in axes]
+    found.append((leads, (0.0, 2.0)))
     rubbing = {axis.place for axis in axes if axis.effect == "coulomb" and axis.prior_sd > 0}
     recorded = {axis.place for axis in axes if {"tau", "abs_tau"} & set(signals)}
     for effect, size, bounds, places in (

@@ -1,7 +1,6 @@
 """Simulates whole runs from their first state to their end, without a correction by measured states in between."""
 
 from collections.abc import Sequence
-from dataclasses import fields
 from functools import partial
 
 import jax
@@ -72,11 +71,9 @@ def _padded(cut: segments.Segment, before: int) -> segments.Segment:
     def longer(leaf: np.ndarray) -> np.ndarray:
         return np.pad(leaf, [(0, 0), (0, wanted - length), *[(0, 0)] * (leaf.ndim - 2)], mode="edge")
 
-    # The measured history has the same length in all runs, and rows have many numbers.
-    names = [one.name for one in fields(cut) if one.name not in ("measured", "row_step", "row_share")]
     every = np.tile(np.arange(wanted - before, dtype=np.int32), (len(cut.sample), 1))
     return cut.replace(
-        **{name: longer(getattr(cut, name)) for name in names},
+        **{name: longer(getattr(cut, name)) for name in segments.INPUTS},
         row_step=every,
         row_share=np.zeros(every.shape, np.float32),
     )

@@ -161,22 +161,20 @@ def _where_it_shows(problem: Problem, at: Floor, state: State) -> State:
 
 
 def _with_what_passes(settings: Settings, problem: Problem, at: Floor, state: State) -> State:
-    """Adds models in which something else is in the place of an effect of the best one that may pass for it.
+    """Adds models that have, instead of an effect of the best one, a similar effect or the same one at fewer places.
 
-    That is another effect, or the same one at some of its places. The search may have come to that model by taking
-    effects away, and never have looked there, or from too far off.
+    The search may have come to the best model by taking effects away, and never have looked there, or from too far
+    off. Of the same effect at more places or fewer, `_where_it_shows` chooses last.
     """
     found, known = [], {one.key for one in state.candidates}
     for effect in state.best.effects:
         mine = effect, *state.best.forms_of(effect)
-        others = [one for one in state.best.hypotheses if one.key not in {part.key for part in mine}]
+        keys = {part.key for part in mine}
+        others = [one for one in state.best.hypotheses if one.key not in keys]
         forms, free = (beside(some, others) for some in (problem.forms, problem.hypotheses))
-        coordinates = state.best.fit.coordinates
-        points = [coordinates[state.best.fit.along(one)] for one in mine]
-        alone, whole = (
-            Lead(mine[:count], np.concatenate(points[:count]), state.null.fit.coordinates, state.null.fit.cost)
-            for count in (1, len(mine))
-        )
+        points = [state.best.fit.coordinates[state.best.fit.along(one)] for one in mine]
+        alone = Lead((effect,), points[0], state.null.fit.coordinates, state.null.fit.cost)
+        whole = replace(alone, hypotheses=mine, point=np.concatenate(points))
         leads = taken_for(alone, forms, free)
         leads += [one for one in at_some_places(whole, forms, free) if key_of((*others, *one.hypotheses)) not in known]
         if leads:

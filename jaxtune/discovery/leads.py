@@ -99,7 +99,7 @@ def taken_for(lead: Lead, forms: Sequence[Hypothesis], free: Sequence[Hypothesis
 
 
 def at_some_places(lead: Lead, forms: Sequence[Hypothesis], free: Sequence[Hypothesis]) -> list[Lead]:
-    """Lists the effect of a lead, with its forms, at some of its places, each way in which that is a hypothesis.
+    """Lists the effect of a lead, with its forms, at every smaller set of its places that is a hypothesis.
 
     Args:
       lead: with one effect and its forms.

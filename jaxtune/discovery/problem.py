@@ -130,8 +130,9 @@ class Problem:
     """[axes]: standard deviation of the nominal parameters, which are free under every hypothesis; zero elsewhere."""
     unknowns: np.ndarray
     """[directions, axes]: one standard deviation along other unknowns that are free from the start: the delay with
-    which the controller reads its sensors and applies its commands, how targets go on between rows, where centres of
-    mass are, how far dry friction creeps, the travel over which it sets in, and the scale of recorded torques."""
+    which the controller reads its sensors and applies its commands, that of velocities beside positions, how far
+    positions lead both and torques, how targets go on between rows, where centres of mass are, how far dry friction
+    creeps, the travel over which it sets in, and the scale of recorded torques."""
     unknown_bounds: np.ndarray
     """[directions, 2]: least and largest coordinate along each."""
     data: Mapping[str, Mapping[float, Segments]]

@@ -234,25 +234,64 @@ def test_bristles_of_a_segment_are_where_its_motion_has_wound_them(arm):
     # before a segment to be wound the other way.
     target = START + np.concatenate([np.linspace(0.0, 0.06, 2000), np.linspace(0.06, 0.0, 2000)])[:, None]
     cut = recut(arm, target, **RUBBING)
-    unwound = replace(cut, segments=cut.segments.replace(past=np.zeros_like(cut.segments.past)))
+    # As if each segment's history began with a robot that had always been there.
+    stayed = {
+        name: np.repeat(values[:, -1:], values.shape[1], axis=1)
+        for name, values in (("past", cut.segments.past), ("past_target", cut.segments.past_target))
+    }
+    unwound = replace(cut, segments=cut.segments.replace(**stayed))
     assert np.ptp(cut.signals["q"], axis=(0, 1)).min() > 0.03
     error, without = (np.sqrt((errors(arm, one, **RUBBING) ** 2).mean()) for one in (cut, unwound))
     assert error < 0.2 * without
 
 
-def test_a_robot_that_rests_on_its_friction_stays_there(arm, plain):
-    # Gravity and a target that it does not reach leave 0.3 Nm to friction of 0.5 Nm at each joint.
+def weight(arm, plain):
+    """Torques of gravity at `START`, [joints] Nm."""
     data = mujoco.MjData(plain)
     data.qpos[arm.rig.qpos] = START
     mujoco.mj_forward(plain, data)
-    carried, kp = np.array([0.3, -0.3]), np.array([12.0, 8.0])
-    target = START + (data.qfrc_bias[arm.rig.dof] + carried) / kp
-    segment = rigs.segment(arm.rig, START, target, kp=kp, kd=[0.4, 0.2])
-    np.testing.assert_allclose(arm.play(segment, **RUBBING)["q"], np.tile(START, (rigs.STEPS, 1)), atol=2e-6)
-    # Here it has just come, through some of its bristles' travel, so they do not balance it.
+    return data.qfrc_bias[arm.rig.dof]
+
+
+KP = np.array([12.0, 8.0])
+CARRIED = np.array([0.3, -0.3])
+
+
+@pytest.mark.parametrize(
+    ("driven", "effects"),
+    [
+        (lambda gravity: {"target": START + (gravity + CARRIED) / KP, "kp": KP, "kd": [0.4, 0.2]}, {}),
+        (lambda gravity: {"target": START, "feed": gravity + CARRIED}, {}),
+        (
+            lambda gravity: {"target": START + (gravity + CARRIED) / KP, "kp": KP, "kd": [0.4, 0.2]},
+            {"constant_push": {name: {"nm": 0.1} for name in rigs.ARM_JOINTS}},
+        ),
+        (
+            lambda gravity: {"target": START + 0.05 + (gravity + CARRIED) / KP, "kp": KP, "kd": [0.4, 0.2]},
+            {"encoder_bias": {name: {"rad": 0.05} for name in rigs.ARM_JOINTS}},
+        ),
+        # With its motors off, and friction of what hangs on it.
+        (lambda gravity: {"target": START}, {"load_friction": {name: {"ratio": 1.2} for name in rigs.ARM_JOINTS}}),
+    ],
+    ids=["driven", "fed", "pushed", "biased", "hanging"],
+)
+def test_a_robot_that_rests_on_its_friction_stays_there(arm, plain, driven, effects):
+    # What gravity and motors leave to friction of 0.5 Nm is 0.3 Nm at each joint.
+    segment = rigs.segment(arm.rig, START, **driven(weight(arm, plain)))
+    if "encoder_bias" in effects:
+        read = segment.measured + np.float32([[0.05], [0.0]])
+        segment = segment.replace(measured=read, past=segment.past + np.float32(0.05))
+    read = arm.play(segment, **RUBBING, **effects)["q"]
+    np.testing.assert_allclose(read, np.tile(read[0], (rigs.STEPS, 1)), atol=2e-6)
+
+
+def test_a_robot_that_has_just_come_to_rest_is_not_balanced(arm, plain):
+    target = START + (weight(arm, plain) + CARRIED) / KP
+    segment = rigs.segment(arm.rig, START, target, kp=KP, kd=[0.4, 0.2])
+    # Through some of its bristles' travel, from where it was.
     came = segment.past + np.array([[-1e-3, 1e-3], [0.0, 0.0]], np.float32)
-    moved = arm.play(segment.replace(past=came, past_target=segment.past_target + came[0] - START), **RUBBING)
-    assert np.ptp(moved["q"], axis=0).min() > 1e-4
+    read = arm.play(segment.replace(past=came, past_target=segment.past_target + came[0] - START), **RUBBING)
+    assert np.ptp(read["q"], axis=0).min() > 1e-4
 
 
 TIME = 0.001 * np.arange(4000)[:, None]

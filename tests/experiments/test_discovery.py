@@ -267,8 +267,8 @@ def test_the_travel_of_friction_is_unknown_where_the_model_has_friction(spec):
     spec.joint("elbow").frictionloss = 0.1
     rig = Rig(spec, JOINTS, 1000.0)
     directions, bounds = unknown_directions(rig.axes, 1000.0)
-    assert directions.shape == (5, len(rig.axes)) and bounds.shape == (5, 2)
-    (number,) = np.flatnonzero(directions[4])
+    assert directions.shape == (6, len(rig.axes)) and bounds.shape == (6, 2)
+    (number,) = np.flatnonzero(directions[5])
     assert (rig.axes[number].effect, rig.axes[number].place) == ("presliding", "elbow")
     assert (bounds[:, 0] == 0).all()
     # When velocities were read is, by one period for all joints, and what lags more is an effect.
@@ -278,9 +278,23 @@ def test_the_travel_of_friction_is_unknown_where_the_model_has_friction(spec):
     np.testing.assert_allclose(lag[4][lag[4] != 0] * most[4, 1], 1.0 / 500.0)
     # The scale of torques is unknown where they are compared.
     more, _ = unknown_directions(rig.axes, 1000.0, ("abs_tau", "q"))
-    np.testing.assert_array_equal(more[:5], directions)
-    places = [rig.axes[number] for row in more[5:] for number in np.flatnonzero(row)]
+    np.testing.assert_array_equal(more[:6], directions)
+    places = [rig.axes[number] for row in more[6:] for number in np.flatnonzero(row)]
     assert [(axis.effect, axis.place) for axis in places] == [("torque_reading", joint) for joint in JOINTS]
+
+
+@pytest.mark.parametrize(("control_hz", "most"), [(1000.0, 0.5e-3), (500.0, 1e-3), (100.0, 2.5e-3)])
+def test_positions_may_lead_by_half_a_step_of_a_simulator(spec, control_hz, most):
+    from envs.rig import Rig
+
+    axes = Rig(spec, JOINTS, control_hz).axes
+    for signals, names in ((("dq", "q"), ["seconds"]), (("q",), ["seconds", "velocity_seconds"])):
+        directions, bounds = unknown_directions(axes, control_hz, signals)
+        mine = [row for row in np.arange(len(axes)) if axes[row].effect == "position_lead"]
+        (row,) = np.flatnonzero(directions[:, mine].any(axis=1))
+        # Velocities that were taken from positions lead as these do.
+        assert [axes[number].parameter for number in np.flatnonzero(directions[row])] == names
+        np.testing.assert_allclose(directions[row][directions[row] != 0] * bounds[row, 1], most)
 
 
 def test_centres_of_mass_are_loose_across_their_hinges(spec):

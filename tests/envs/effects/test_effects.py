@@ -63,7 +63,7 @@ def values_of(row, **physical):
     values = {}
     for parameter in row.parameters:
         # What only a form has is absent where nothing is said of it.
-        absent = np.inf if parameter.form == "reciprocal" else 0.0
+        absent = {"added": 0.0, "ratio": 1.0, "reciprocal": np.inf}[parameter.form]
         each = np.broadcast_to(physical.get(parameter.name, absent), JOINTS)
         inner = [parameter.inner(parameter.coordinate(float(value), 1.0), 1.0) for value in each]
         values[parameter.name] = jnp.asarray(inner, jnp.float32)
@@ -156,7 +156,7 @@ def test_what_is_not_there_changes_nothing(row):
         body_velocity=rng.uniform(-9, 9, (JOINTS, 3)),
     )
     first = signal_of(row, rng)
-    before = first[:1] if row.enters == "transmission" else first
+    before = (first[0], first) if row.enters == "bristle" else first[:1] if row.enters == "transmission" else first
     memory = None if row.start is None else row.start(values, before, DT)
     for _ in range(3):
         signal = signal_of(row, rng)
@@ -339,12 +339,17 @@ def test_a_motor_gives_less_the_faster_it_turns():
 
 def test_a_motor_at_a_low_voltage_stalls_below_its_controllers_limit():
     def most(torque, speed):
-        return act("torque_speed", torque, at=now(speed), nm_s_per_rad=0.2, stall_nm=[3.0, 8.0])
+        return act("torque_speed", torque, at=now(speed), nm_s_per_rad=0.2, stall_loss=[0.4, 0.0])
 
-    # 3 Nm, less 0.2 x 5. A stall above the controller's 5 Nm changes nothing.
+    # 0.6 of 5 Nm, less 0.2 x 5.
     np.testing.assert_allclose(most(4.9, 5.0), [2.0, 4.0], rtol=1e-6)
     np.testing.assert_allclose(most(-4.9, 0.0), [-3.0, -4.9], rtol=1e-6)
     np.testing.assert_allclose(most(2.9, 0.0), 2.9, rtol=1e-6)
+
+
+def test_a_motor_without_a_limit_has_no_speed_line():
+    at = now(10.0, limit=np.full(JOINTS, np.inf, np.float32))
+    np.testing.assert_array_equal(act("torque_speed", [9.0, -9.0], at=at, nm_s_per_rad=0.2), [9.0, -9.0])
 
 
 def test_a_motor_that_is_off_gives_no_torque_at_any_speed():
