@@ -206,7 +206,7 @@ ROWS = (
             Parameter(name="nm_s_per_rad", scale="damping", bounds=(0.0, 5.0), prior=0.3),
             _AT_MOTOR,
         ),
-        sizes=(0.2, 2.0),
+        sizes=(0.05, 2.0),
         act=_compliance,
         start=_wound_up,
         forms=(

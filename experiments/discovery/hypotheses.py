@@ -17,7 +17,7 @@ _TORQUE_SHARE, _MOST_SHARES = 0.2, 3.0  # by which recorded torques are off, and
 _HOLDING = 0.5  # standard deviation of the share of the engine's creep that a robot's dry friction lacks
 _LONGEST_SIMULATED_S = 0.005  # step of a simulator from which a log may be
 _OFFSET = 0.2  # typical offset of a torque sensor, as a share of the rms torque
-_BENT, _STRAIGHT = 6, 3  # sizes of an effect without a slope at zero, and of one with
+_BENT, _STRAIGHT = 7, 3  # sizes of an effect without a slope at zero, and of one with
 
 
 def hypotheses(
