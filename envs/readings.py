@@ -24,7 +24,8 @@ def noise(values: np.ndarray) -> np.ndarray:
         1.4826 median |difference of order n| / sqrt(2n over n)
 
     Smooth motion drops out of them, in slow rows only out of the sixth; so the smaller estimate counts. It is never
-    below the noise of the column's rounding, quantum / sqrt(12), and never zero.
+    below the noise of the column's rounding, quantum / sqrt(12), and never zero. Differences of rounded values are
+    multiples of the quantum, so the median is that of grouped data: each multiple stands for all within half a quantum.
 
     Args:
       values: [rows, columns] or [rows].
@@ -32,13 +33,31 @@ def noise(values: np.ndarray) -> np.ndarray:
     Returns:
       [columns], or one number.
     """
-    found = [
-        1.4826 * np.median(np.abs(np.diff(values, n=order, axis=0)), axis=0) / comb(2 * order, order) ** 0.5
-        for order in (3, 6)
-        if len(values) > order
-    ]
-    white = np.min(found, axis=0) if found else np.zeros(values.shape[1:])
-    return np.maximum(np.maximum(white, quantum_of(values) / np.sqrt(12.0)), _LEAST_NOISE)
+    quanta = quantum_of(values)
+    columns = zip(values.reshape(len(values), -1).T, quanta.ravel(), strict=True)
+    white = np.reshape([_white(column, quantum) for column, quantum in columns], quanta.shape)
+    return np.maximum(np.maximum(white, quanta / np.sqrt(12.0)), _LEAST_NOISE)
+
+
+def _white(column: np.ndarray, quantum: float) -> float:
+    """The smaller estimate for a column [rows]; zero if there are too few rows."""
+    return min(
+        (
+            1.4826 * _median(np.abs(np.diff(column, n=order)), quantum) / comb(2 * order, order) ** 0.5
+            for order in (3, 6)
+            if len(column) > order
+        ),
+        default=0.0,
+    )
+
+
+def _median(sizes: np.ndarray, quantum: float) -> float:
+    """The median of sizes [n], which are multiples of a quantum unless that is zero."""
+    if quantum == 0.0:
+        return float(np.median(sizes))
+    times, count = np.unique(np.round(sizes / quantum), return_counts=True)
+    ends = np.append(max(times[0] - 0.5, 0.0), times + 0.5)
+    return quantum * float(np.interp(0.5 * count.sum(), np.append(0, np.cumsum(count)), ends))
 
 
 def quantum_of(values: np.ndarray) -> np.ndarray:

@@ -5,6 +5,7 @@ from dataclasses import replace
 from math import factorial
 
 import numpy as np
+from scipy.stats import chi2
 
 from envs.logs import Run
 from envs.readings import aligned, fresh, noise_of
@@ -15,7 +16,7 @@ _MIN_HALF_ROWS = 2  # a parabola needs three rows
 _CLEARER = 0.9  # share of a misfit that is left by a lag that is there
 _TELLS = 3.0  # how much worse the worst shift is than the best, of a joint that moves enough to tell
 _SAME_RATE = 0.02
-_AGREES = 2.0  # chi squared per degree of freedom below which a polynomial agrees with readings
+_CHANCE = 0.01  # share of windows in which noise alone misses a polynomial by so much that it seems not to agree
 
 
 def smoothed(run: Run) -> np.ndarray:
@@ -55,15 +56,15 @@ def _fit(time: np.ndarray, parts: Sequence[tuple[np.ndarray, np.ndarray, float]]
     least = min(1 if len(parts) > 1 else _MIN_HALF_ROWS, widest)
     found = None
     for half in sorted({least, max(least, widest // 2), widest}):
-        fit, misfit = _fit_window(time, parts, half, order, half * period)
-        found = fit if found is None else np.where((misfit < _AGREES)[:, None], fit, found)
+        fit, agrees = _fit_window(time, parts, half, order, half * period)
+        found = fit if found is None else np.where(agrees[:, None], fit, found)
     return found
 
 
 def _fit_window(
     time: np.ndarray, parts: Sequence[tuple[np.ndarray, np.ndarray, float]], half: int, order: int, width: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Fits polynomials in windows of one width: states [rows, 2], and chi squared per degree of freedom [rows]."""
+    """Fits polynomials in windows of one width: states [rows, 2], and whether they agree with the readings [rows]."""
     designs, values = [], []
     for derivative, (at, read, sd) in enumerate(parts):
         near = _nearest(at, time, half)
@@ -81,8 +82,8 @@ def _fit_window(
     across = np.swapaxes(design, 1, 2)
     fit = np.linalg.solve(across @ design + 1e-9 * np.eye(order + 1), across @ value[..., None])
     left = value - (design @ fit)[..., 0]
-    misfit = (left**2).sum(axis=1) / max(value.shape[1] - order - 1, 1)
-    return np.concatenate([fit[:, 0], fit[:, 1] / width], axis=1), misfit
+    agrees = (left**2).sum(axis=1) < chi2.isf(_CHANCE, max(value.shape[1] - order - 1, 1))
+    return np.concatenate([fit[:, 0], fit[:, 1] / width], axis=1), agrees
 
 
 def _window(time: np.ndarray) -> tuple[int, int, float]:

@@ -79,6 +79,14 @@ def test_a_good_velocity_counts_for_more_than_positions():
     np.testing.assert_allclose((got[:, 1] - velocity[10:-10]).std(), 0.01 / 5**0.5, rtol=0.1)
 
 
+def test_a_joint_at_rest_has_little_speed_whatever_its_noise():
+    # Of 13 readings with a slope: 0.5 mrad / sqrt(sum of squared times), 0.0185 rad/s. Windows that are narrower by
+    # chance have up to four times as much, so they must be few.
+    rng, time = np.random.default_rng(8), times(10.0, 500.0)
+    rest = segments.smoothed(run(time, q=5e-4 * rng.standard_normal((len(time), 4))))[10:-10, 1]
+    assert rest.std() < 1.2 * 5e-4 / (0.002 * 182**0.5)
+
+
 @pytest.mark.parametrize("rate_hz", [50.0, 100.0])
 def test_slow_rows_are_smoothed_without_a_bias_larger_than_the_noise(rate_hz):
     rng = np.random.default_rng(5)
@@ -120,6 +128,15 @@ def test_a_quantum_is_found(quantum):
     np.testing.assert_allclose(segments.quantum_of(rounded), quantum, rtol=1e-5)
     # At least the noise of rounding, a uniform distribution's.
     assert (segments.noise(rounded) >= quantum / 12**0.5 * (1 - 1e-5)).all()
+
+
+@pytest.mark.parametrize("share", [0.2, 0.3, 0.5, 1.0])
+def test_noise_is_found_where_rounding_is_as_coarse(share):
+    # Noise of a share of a 12-bit encoder's count. Third differences are one or two counts then.
+    rng, quantum, time = np.random.default_rng(7), 2 * np.pi / 4096, times(3.0, 500.0)
+    exact = 0.3 * np.sin(8.0 * time[:, None] + np.arange(20))
+    rounded = np.round(exact / quantum + share * rng.standard_normal(exact.shape)) * quantum
+    np.testing.assert_allclose(segments.noise(rounded).mean(), quantum * np.hypot(share, 12**-0.5), rtol=0.1)
 
 
 def test_what_was_not_rounded_has_no_quantum():
