@@ -74,10 +74,11 @@ def _bristles(chain, model, data, values, segment, inputs) -> dict:
     then, later motion has wound them anew.
     """
     position = segment.past[0]
-    # Gains and limits are those of the history; rows before it do not matter else.
-    inputs = inputs | {"target": segment.past_target[0], "between": 0.0 * position, "feed": segment.past_feed}
+    # Other inputs, as gains and limits, are those of the history's first step.
+    still = jnp.zeros_like(position)
+    inputs = inputs | {"target": segment.past_target[0], "between": still, "feed": segment.past_feed}
     # Undoing a lag takes a slope, so it needs more rows than one.
-    rest = _undone(chain, values, jnp.tile(jnp.stack([position, 0.0 * position]), (3, 1, 1)))[0]
+    rest = _undone(chain, values, jnp.tile(jnp.stack([position, still]), (3, 1, 1)))[0]
     memory, torque = history.remember(chain, values, chain.start(values, rest, inputs), rest, inputs)
     there = data.replace(qpos=data.qpos.at[chain.qpos].set(rest[0]))
     return history.bristles(chain, model, there, values, memory, torque, inputs, segment.past)

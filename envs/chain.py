@@ -1,8 +1,8 @@
 """Simulates one step of a robot with effects between its targets and its readings, on the test rig and in a walk.
 
-The effects are rows of `envs.effects`, which draws the stages that they act at. All that simulates a robot applies
-them through this chain: `envs.rig` one whose base is fixed, `envs.corrected` a BITeno that walks, and `envs.history`
-measured motion that they remember.
+The effects are rows of `envs.effects`, which draws the stages that they act at. This chain alone applies them.
+`envs.rig` uses it for a robot whose base is fixed, and `envs.corrected` for a BITeno that walks. `envs.history` uses it
+for measured motion, which they remember.
 """
 
 from collections.abc import Sequence
@@ -182,7 +182,7 @@ class Chain:
           memory: before the step.
           values: of the effects.
           torque: of the motors, [joints] Nm.
-          x: the controller's inputs, of which damping and back electromotive force act within the step.
+          x: the controller's inputs, whose gains act within the step where motors run ahead of their joints.
           on_links: torques from outside, [joints] Nm.
 
         Returns:

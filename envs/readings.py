@@ -9,10 +9,13 @@ from dataclasses import replace
 from math import comb
 
 import numpy as np
+from scipy.stats import norm, truncnorm
 
 from envs.logs import Run
 
 _LEAST_NOISE = 1e-6
+_KEPT = 0.75  # share of squared differences that tell of noise, the smallest ones
+_OF_KEPT = float(truncnorm.var(*norm.interval(_KEPT)))  # their mean square where the variance is one
 _STALE = 3.0  # a repetition is stale where the joint moved by more than this many quanta meanwhile
 _HELD = 0.25  # share of the rows of a fast joint that repeat another, from which on a bit does not count
 _STEADY = 0.6  # least ratio of the speeds of a joint that moves on
@@ -21,11 +24,11 @@ _STEADY = 0.6  # least ratio of the speeds of a joint that moves on
 def noise(values: np.ndarray) -> np.ndarray:
     """Estimates the standard deviation of white noise in every column, from differences of the third and sixth order.
 
-        1.4826 median |difference of order n| / sqrt(2n over n)
+        sqrt(mean square of the smallest three quarters / their share of a normal variance / (2n over n))
 
-    Smooth motion drops out of them, in slow rows only out of the sixth; so the smaller estimate counts. It is never
-    below the noise of the column's rounding, quantum / sqrt(12), and never zero. Differences of rounded values are
-    multiples of the quantum, so the median is that of grouped data: each multiple stands for all within half a quantum.
+    Smooth motion drops out of them, in slow rows only out of the sixth; so the smaller estimate counts. Steps and
+    outliers are in the last quarter. A median would be a whole count where rounding is as coarse as the noise. The
+    estimate is never below the noise of the column's rounding, quantum / sqrt(12), and never zero.
 
     Args:
       values: [rows, columns] or [rows].
@@ -33,31 +36,13 @@ def noise(values: np.ndarray) -> np.ndarray:
     Returns:
       [columns], or one number.
     """
-    quanta = quantum_of(values)
-    columns = zip(values.reshape(len(values), -1).T, quanta.ravel(), strict=True)
-    white = np.reshape([_white(column, quantum) for column, quantum in columns], quanta.shape)
-    return np.maximum(np.maximum(white, quanta / np.sqrt(12.0)), _LEAST_NOISE)
-
-
-def _white(column: np.ndarray, quantum: float) -> float:
-    """The smaller estimate for a column [rows]; zero if there are too few rows."""
-    return min(
-        (
-            1.4826 * _median(np.abs(np.diff(column, n=order)), quantum) / comb(2 * order, order) ** 0.5
-            for order in (3, 6)
-            if len(column) > order
-        ),
-        default=0.0,
-    )
-
-
-def _median(sizes: np.ndarray, quantum: float) -> float:
-    """The median of sizes [n], which are multiples of a quantum unless that is zero."""
-    if quantum == 0.0:
-        return float(np.median(sizes))
-    times, count = np.unique(np.round(sizes / quantum), return_counts=True)
-    ends = np.append(max(times[0] - 0.5, 0.0), times + 0.5)
-    return quantum * float(np.interp(0.5 * count.sum(), np.append(0, np.cumsum(count)), ends))
+    found = []
+    for order in (order for order in (3, 6) if len(values) > order):
+        squares = np.sort(np.diff(values, n=order, axis=0) ** 2, axis=0)
+        kept = squares[: max(1, int(_KEPT * len(squares)))].mean(axis=0)
+        found.append(np.sqrt(kept / _OF_KEPT / comb(2 * order, order)))
+    white = np.min(found, axis=0) if found else np.zeros(values.shape[1:])
+    return np.maximum(np.maximum(white, quantum_of(values) / np.sqrt(12.0)), _LEAST_NOISE)
 
 
 def quantum_of(values: np.ndarray) -> np.ndarray:

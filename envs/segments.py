@@ -66,7 +66,7 @@ class Segment:
     measured: jax.Array
     # [past, joints] rad, smoothed positions every 10 ms in the 2 s that lead to the first of `measured`. They wind up
     # the bristles of dry friction; in slow motion the history alone is too short for that. At the first of them
-    # bristles carry what motors and gravity leave.
+    # bristles balance all other torques.
     past: jax.Array
     # [past targets, joints] rad, every 2 ms in the same time. A limit of their slew may still be far behind them.
     past_target: jax.Array

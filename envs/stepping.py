@@ -109,7 +109,7 @@ def stopped(model: mjx.Model, data: mjx.Data) -> jax.Array:
 @devices.precisely
 def placed(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """A robot with what follows from its positions and velocities: where its links are and how fast, and the torques
-    of gravity and Coriolis forces (`qfrc_bias`) and of springs (`qfrc_passive`).
+    of gravity and Coriolis forces (`qfrc_bias`), and of springs and dampers (`qfrc_passive`).
 
     Those of limits and equalities are not computed.
     """

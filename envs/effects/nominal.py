@@ -35,7 +35,8 @@ def _holding(values, model: mjx.Model, dof: np.ndarray) -> mjx.Model:
 def _position_lead(values, readings, now, memory):
     """q'(t) = q(t + seconds): positions of semi-implicit Euler, to first order; velocities are as they were.
 
-    What velocities were taken from such positions, where none were recorded, leads by `velocity_seconds`.
+    Where none were recorded, velocities were estimated from such positions, and lead by `velocity_seconds`; only
+    `undo` uses it.
     """
     del now
     return readings.at[0].add(values["seconds"] * readings[1]), memory

@@ -254,7 +254,7 @@ def weight(arm, plain):
 
 
 KP = np.array([12.0, 8.0])
-CARRIED = np.array([0.3, -0.3])
+CARRIED = np.array([0.3, -0.3])  # Nm, what gravity and motors leave to a friction of 0.5 Nm
 
 
 @pytest.mark.parametrize(
@@ -276,7 +276,6 @@ CARRIED = np.array([0.3, -0.3])
     ids=["driven", "fed", "pushed", "biased", "hanging"],
 )
 def test_a_robot_that_rests_on_its_friction_stays_there(arm, plain, driven, effects):
-    # What gravity and motors leave to friction of 0.5 Nm is 0.3 Nm at each joint.
     segment = rigs.segment(arm.rig, START, **driven(weight(arm, plain)))
     if "encoder_bias" in effects:
         read = segment.measured + np.float32([[0.05], [0.0]])

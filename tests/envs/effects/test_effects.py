@@ -603,6 +603,20 @@ def test_what_a_sensor_did_is_undone(name, physical):
     assert np.abs(readings[inner, 0] - truth[inner, 0]).max() > 0.02
 
 
+def test_a_lead_of_positions_and_of_what_was_taken_from_them_is_undone():
+    lead = np.array([0.001, 0.002], np.float32)
+    values = values_of(NOMINAL["position_lead"], seconds=lead, velocity_seconds=lead)
+    time, pace = DT * np.arange(400)[:, None], 20.0
+    truth, ahead = (
+        np.stack([0.3 * np.sin(pace * at), 0.3 * pace * np.cos(pace * at)], axis=1) for at in (time, time + lead)
+    )
+    got = np.asarray(NOMINAL["position_lead"].undo(values, jnp.asarray(ahead, jnp.float32), DT))
+    # To first order: half the square of a lead's share of the motion is left.
+    for kind, most in enumerate((0.3, 0.3 * pace)):
+        assert np.abs(got[1:-1, kind] - truth[1:-1, kind]).max() < 0.6 * (pace * lead.max()) ** 2 * most
+        assert np.abs(ahead[:, kind] - truth[:, kind]).max() > 0.03 * most
+
+
 @pytest.mark.parametrize("axis", ["roll", "pitch"])
 def test_a_tilted_imu_reads_gravity_in_its_own_frame(axis):
     angle, upright = 0.02, np.array([0.28, -0.6, -0.75], np.float32)
