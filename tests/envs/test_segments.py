@@ -81,8 +81,8 @@ def test_a_good_velocity_counts_for_more_than_positions():
 
 @pytest.mark.parametrize("counts", [0.5, 1.0, np.inf])
 def test_a_joint_at_rest_has_little_speed(counts):
-    # Of 13 readings with a slope: 0.5 mrad / sqrt(sum of squared times), 0.0185 rad/s. Windows that are narrower by
-    # chance have up to four times as much, so they must be few.
+    # Of 13 readings with a slope: noise / sqrt(sum of squared times). Windows that are narrower by chance have up to
+    # four times as much, so they must be few.
     rng, time = np.random.default_rng(8), times(10.0, 500.0)
     exact = 1e-3 * rng.uniform(size=20)
     read = exact + 5e-4 * rng.standard_normal((len(time), 20))
@@ -407,7 +407,7 @@ def test_targets_of_two_seconds_lead_to_a_segment():
     np.testing.assert_array_equal(past[..., 0], np.maximum(rows, 0.0))
 
 
-def test_a_segment_knows_the_torque_that_was_sent_where_its_past_begins(moving):
+def test_a_segment_knows_the_torque_that_was_sent_where_its_past_begins():
     time = times(4.0)
     sent = np.arange(len(time), dtype=float)[:, None] * [1.0, -1.0]
     cut = segments.cut([run(time, target=None, tau=sent)], 0.15, DT)
