@@ -124,12 +124,13 @@ def _followed(chain, model, data, values, motion, first, memory) -> tuple[mjx.Da
         rates = {name: rate + chain.dt / _RATE_S * (memory[name][1] - rate) for name, rate in rates.items()}
         return data, memory, rates
 
-    begun = at(0, data, first, acceleration[0]), first, {name: first[name][1] for name in gears}
+    start = stepping.placed(model, at(0, data, first, acceleration[0]))
+    begun = start, first, {name: first[name][1] for name in gears}
     data, followed, rates = jax.lax.fori_loop(jnp.where(gives.any(), 0, steps), steps, follow, begun)
     rows = (row.name for row in chain.rows if row.enters in _FOLLOWED and row.start is not None)
     memory = memory | {name: jnp.where(gives, followed[name], memory[name]) for name in ("passed", "within", *rows)}
     for name in gears:
-        memory[name] = memory[name].at[1].add(history.light(chain, model) * (rates[name] - memory[name][1]))
+        memory[name] = memory[name].at[1].add(history.light(chain, model, data) * (rates[name] - memory[name][1]))
     data = at(steps, data, memory, jnp.where(gives, data.qacc[chain.dof], acceleration[steps]))
     # What effects read of the last step is that of the first one.
     return stepping.placed(model, data), memory

@@ -226,9 +226,10 @@ class Chain:
 
     def _rotors_and_links(self, model, data, memory) -> dict:
         """What `Now` says of rotors and their links before a step."""
-        rotor, mobility, acceleration = model.dof_armature[self.dof], model.dof_invweight0, data.qacc[self.dof]
-        link = jnp.clip(1.0 - rotor * mobility[self.dof], LIGHTEST, 1.0)
-        mobility = mobility[self.dof] / link
+        rotor, acceleration = model.dof_armature[self.dof], data.qacc[self.dof]
+        mobility = stepping.mobility(model, data)[self.dof]
+        link = jnp.clip(1.0 - rotor * mobility, LIGHTEST, 1.0)
+        mobility = mobility / link
         # Less what gears and friction gave in the step before. Else a rotor would expect the blow of the moment in
         # which it met its link to go on, and leave it again; and a link that its friction has just stopped to turn
         # back.

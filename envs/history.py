@@ -61,7 +61,7 @@ def follow(
     torque = torque - x["stiffness"] * unlogged[0]
     seen = (motor + unlogged).at[1].add(-within * (fast + unlogged[1]))
     _, memory = chain.stage("sensor", values, seen, chain.now_of(x, seen), memory | {"within": within})
-    rotor, inertia = model.dof_armature[chain.dof], 1.0 / model.dof_invweight0[chain.dof]
+    rotor, inertia = model.dof_armature[chain.dof], 1.0 / stepping.mobility(model, data)[chain.dof]
     at_motor = chain.at_log(values, jnp.ones_like(torque))
     held = at_motor * jnp.maximum(rotor, _LIGHT * inertia)
     acts = chain.at_encoders(values, jnp.ones_like(torque)) - at_motor
@@ -113,6 +113,7 @@ def pressed(chain: Chain, values, torque: jax.Array) -> dict:
     return {row.name: row.start(values[row.name], torque, chain.dt) for row in chain.entering("transmission")}
 
 
-def light(chain: Chain, model: mjx.Model) -> jax.Array:
+def light(chain: Chain, model: mjx.Model, data: mjx.Data) -> jax.Array:
     """Says how light rotors are: 1 without inertia, 0 from a twentieth of the joint's on, [joints]."""
-    return jnp.clip(1.0 - model.dof_armature[chain.dof] * model.dof_invweight0[chain.dof] / _LIGHT, 0.0, 1.0)
+    share = model.dof_armature[chain.dof] * stepping.mobility(model, data)[chain.dof]
+    return jnp.clip(1.0 - share / _LIGHT, 0.0, 1.0)

@@ -70,7 +70,7 @@ def solve(model: mjx.Model, data: mjx.Data) -> mjx.Data:
         force, pulled = pressed(found), inertia @ (found - free)
         inside = stiffness * ((low < force) & (force < high))
         hessian = inertia + (inside @ squares).reshape(inertia.shape)
-        search = -_solved(hessian, pulled + jacobian.T @ jnp.clip(force, low, high))
+        search = -_solved(hessian, (pulled + jacobian.T @ jnp.clip(force, low, high))[:, None])[:, 0]
         along, curvature = jacobian @ search, search @ inertia @ search
         change = stiffness * along
 
@@ -124,10 +124,25 @@ def dry_friction(data: mjx.Data) -> jax.Array:
     return rows.efc_J[rubs].T @ rows.efc_force[rubs] if rows.nf else jnp.zeros_like(data.qvel)
 
 
-def _solved(matrix: jax.Array, vector: jax.Array) -> jax.Array:
-    """Solves a small positive definite system by elimination without pivots, which is fastest for many side by side."""
-    both = jnp.concatenate([matrix, vector[:, None]], axis=1)
-    for k in range(len(vector)):
+@devices.precisely
+def mobility(model: mjx.Model, data: mjx.Data) -> jax.Array:
+    """How easily each joint moves where the robot is: the diagonal of the inverse of its mass matrix, [dofs].
+
+    `model.dof_invweight0` is that in the model's first pose.
+    """
+    inertia = mjx.full_m(model, data)
+    return jnp.diagonal(_solved(inertia, jnp.eye(len(inertia), dtype=inertia.dtype)))
+
+
+def _solved(matrix: jax.Array, right: jax.Array) -> jax.Array:
+    """Solves a small positive definite system by elimination without pivots, which is fastest for many side by side.
+
+    Args:
+      matrix: [n, n]
+      right: [n, m]
+    """
+    both = jnp.concatenate([matrix, right], axis=1)
+    for k in range(len(matrix)):
         row = both[k] / both[k, k]
         both = (both - both[:, k, None] * row).at[k].set(row)
-    return both[:, -1]
+    return both[:, len(matrix) :]

@@ -75,7 +75,9 @@ def _torque_speed(setting: Setting):
     def act(torque: np.ndarray, now: Now) -> np.ndarray:
         left = setting.limit - setting.size * now.v * np.sign(torque)
         most = knee * np.logaddexp(0.0, left / knee)
-        return np.sign(torque) * (-knee * np.logaddexp(-np.abs(torque) / knee, -most / knee))
+        # A smooth minimum that is zero at zero: a motor has no torque that nobody commands.
+        over = np.log(np.maximum(np.abs(torque), 1e-12)) - np.log(most)
+        return torque * np.exp(-0.1 * np.logaddexp(0.0, 10.0 * over))
 
     return act
 
