@@ -9,6 +9,7 @@ import resource
 import tempfile
 import time
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -26,9 +27,10 @@ from envs.logs import Controller, Log, Run, read, write
 from envs.logs.tables import WRITERS
 from envs.rig import Rig
 from experiments.common import checkpoint, compiler, files
-from experiments.common.cli import console, run
+from experiments.common.cli import bars, console, run
 from experiments.common.config import Preset, preset
 from experiments.walking import costs, foreign, memory
+from experiments.walking.costs import Track
 from experiments.walking.learner import Learner
 from experiments.walking.policies import starting_policy
 from experiments.walking.robots import BITENO
@@ -72,7 +74,7 @@ class Args:
     """Factor of the uniform noise of biteno's simulated sensors in estimates; sim2real has 0.2."""
 
 
-def speed(args: Args) -> dict:
+def speed(args: Args, track: Track) -> dict:
     """Measures environment steps per second of whole PPO updates (rollout and learning).
 
     The first call compiles and is listed separately. The speed is that of the fastest of three further calls, because
@@ -82,7 +84,7 @@ def speed(args: Args) -> dict:
       `first_call_s` and `steps_per_second` by physics and number of environments.
     """
     rows, sizes = {}, preset(args.preset)
-    for physics, envs in itertools.product(args.physics, args.envs or (sizes.ppo.num_envs,)):
+    for physics, envs in track(list(itertools.product(args.physics, args.envs or (sizes.ppo.num_envs,)))):
         sizes = dataclasses.replace(
             sizes,
             task=dataclasses.replace(sizes.task, physics=physics),
@@ -110,7 +112,7 @@ def speed(args: Args) -> dict:
     return rows
 
 
-def targets(args: Args) -> dict:
+def targets(args: Args, track: Track) -> dict:
     """Measures steps per second of whole episodes in every engine that is installed, at sub-steps of 1 ms.
 
     It plays a policy that walks, because a robot that falls at once makes an engine look fast.
@@ -123,7 +125,7 @@ def targets(args: Args) -> dict:
     learner = Learner(sizes, BITENO.chosen("foot_friction"))
     policy = starting_policy(args.policy, learner)
     rows = {}
-    for name, make in TARGETS.items():
+    for name, make in track(TARGETS.items()):
         try:
             play = learner.play(make(learner.robot, parameters.nominal(learner.entries)))
         except ValueError as error:
@@ -140,7 +142,7 @@ def targets(args: Args) -> dict:
     return rows
 
 
-def rig(args: Args) -> dict:
+def rig(args: Args, track: Track) -> dict:
     """Measures simulation steps per second of suspended robots: 64 of each side by side, on one core.
 
     Returns:
@@ -153,7 +155,7 @@ def rig(args: Args) -> dict:
         "biteno": (models.spec("biteno"), constants.JOINTS),
     }
     rows = {}
-    for name, (spec, joints) in robots.items():
+    for name, (spec, joints) in track(robots.items()):
         model, start, _ = jax.device_put(Rig(spec, joints, control_hz=200.0).system)
         model = model.tree_replace({"opt.ls_iterations": _LINE_SEARCHES})
         poses = start.qpos + np.random.default_rng(0).normal(scale=0.1, size=(_SIDE_BY_SIDE, model.nq))
@@ -174,7 +176,7 @@ def rig(args: Args) -> dict:
     return rows
 
 
-def logs(args: Args) -> dict:
+def logs(args: Args, track: Track) -> dict:
     """Measures how long it takes to read a log of ten minutes, 40 columns and 1 kHz (a hundredth of it with `smoke`).
 
     Returns:
@@ -195,7 +197,7 @@ def logs(args: Args) -> dict:
     )
     log = Log(robot="biteno", base="fixed", rate_hz=1000.0, joints=joints, policy=None, runs=(run,))
     found = {}
-    for suffix in WRITERS:
+    for suffix in track(WRITERS):
         with tempfile.TemporaryDirectory() as folder:
             write(log, Path(folder) / "log", suffix)
             begin = time.monotonic()
@@ -208,7 +210,7 @@ def _noisy(sizes: Preset, args: Args) -> Preset:
     return dataclasses.replace(sizes, task=dataclasses.replace(sizes.task, noise=args.noise))
 
 
-def tuner_programs(args: Args) -> dict:
+def tuner_programs(args: Args, track: Track) -> dict:
     """Measures compiling and running of `Tuner.tune`, and of `Tuner.run` vmapped over four seeds.
 
     The robot is `CheetahRun` with four parameters and a delay, and a policy that stays as it is. A tuning has the
@@ -237,7 +239,7 @@ def tuner_programs(args: Args) -> dict:
         "run, four seeds": (jax.jit(runs), (jax.random.split(jax.random.key(0), 4),)),
     }
     rows = {}
-    for name, (program, inputs) in programs.items():
+    for name, (program, inputs) in track(programs.items()):
         moments = [time.monotonic()]
         lowered = program.lower(*inputs)
         moments.append(time.monotonic())
@@ -252,10 +254,12 @@ def tuner_programs(args: Args) -> dict:
 
 MEASURES = {
     "speed": speed,
-    "devices": lambda args: costs.on_devices(preset(args.preset), args.policy),
-    "profile": lambda args: costs.profile(preset(args.preset), args.policy),
-    "estimates": lambda args: costs.estimates(_noisy(preset(args.preset), args), args.policy, args.radius, args.seeds),
-    "memory": lambda args: costs.memory(preset(args.preset), args.policy),
+    "devices": lambda args, track: costs.on_devices(preset(args.preset), args.policy, track),
+    "profile": lambda args, track: costs.profile(preset(args.preset), args.policy, track),
+    "estimates": lambda args, track: costs.estimates(
+        _noisy(preset(args.preset), args), args.policy, args.radius, args.seeds, track
+    ),
+    "memory": lambda args, track: costs.memory(preset(args.preset), args.policy, track=track),
     "targets": targets,
     "rig": rig,
     "logs": logs,
@@ -271,7 +275,8 @@ def main(args: Args) -> None:
         compiler.set_up(preset(args.preset).xla_flags)
     checkpoint.check_writable(args.out)
     begin = time.monotonic()
-    rows = MEASURES[args.what](args)
+    with bars() as progress:
+        rows = MEASURES[args.what](args, partial(progress.track, description=args.what))
     table = Table(title=args.what)
     for column in ("", *next(iter(rows.values()))):
         table.add_column(column)

@@ -7,7 +7,7 @@ import dataclasses
 import gc
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -36,13 +36,17 @@ _MODELS = 5  # search-parameter models whose mean is compared with one
 _TIMES = 3  # runs of a program, of which the fastest counts
 _ROLLOUTS, _UPDATES = "policy: rollouts", "policy: whole updates"
 
+Track = Callable[[Sequence], Iterable]
+"""Goes through what is to be measured, and shows how far it is; `iter` shows nothing."""
 
-def profile(sizes: Preset, policy: str) -> dict[str, dict]:
+
+def profile(sizes: Preset, policy: str, track: Track = iter) -> dict[str, dict]:
     """Times every part of a tuning of BITeno by itself, as one program each, on all devices.
 
     Args:
       sizes: of everything.
       policy: what walks, as `experiments.walking.policies.starting_policy` takes it.
+      track: shows which part is timed.
 
     Returns:
       By part: `calls` in a tuning whose set is accepted at once, `compile_s` of its program where none is kept on disk,
@@ -55,7 +59,7 @@ def profile(sizes: Preset, policy: str) -> dict[str, dict]:
     start = starting_policy(policy, learner)
     rate, most = _physics_rate(learner, start), peaks()
     rows = {}
-    for name, part in _parts(learner, start).items():
+    for name, part in track(_parts(learner, start).items()):
         compile_s, run_s = _seconds(part.program, part.inputs)
         limit = np.nan if part.simulates is None else part.simulates / rate
         least = work(part.program, *part.inputs)
@@ -127,7 +131,7 @@ def _parts(learner: Learner, start: Policy) -> dict[str, _Part]:
     }
 
 
-def on_devices(sizes: Preset, policy: str) -> dict[str, dict]:
+def on_devices(sizes: Preset, policy: str, track: Track = iter) -> dict[str, dict]:
     """Measures steps per second of episodes and of training on one device, two, four and so on, up to all.
 
     Numbers of devices take turns, and the fastest of three calls counts.
@@ -135,6 +139,7 @@ def on_devices(sizes: Preset, policy: str) -> dict[str, dict]:
     Args:
       sizes: of everything.
       policy: what walks, as `experiments.walking.policies.starting_policy` takes it.
+      track: shows which round it is.
 
     Returns:
       By number of devices: steps per second of both, and how many times as many as on one device.
@@ -150,7 +155,7 @@ def on_devices(sizes: Preset, policy: str) -> dict[str, dict]:
     start, seconds = starting_policy(policy, learner), {}
     for count in (2**n for n in range(len(jax.devices()).bit_length())):
         seconds[count] = {name: [] for name in programs}
-    for _ in range(4):
+    for _ in track(range(4)):
         for count, found in seconds.items():
             for name, program in programs.items():
                 with jax.set_mesh(devices.mesh(count)):
@@ -169,7 +174,7 @@ def on_devices(sizes: Preset, policy: str) -> dict[str, dict]:
     return rows
 
 
-def estimates(sizes: Preset, policy: str, radius: float, seeds: Sequence[int]) -> dict[str, dict]:
+def estimates(sizes: Preset, policy: str, radius: float, seeds: Sequence[int], track: Track = iter) -> dict[str, dict]:
     """Compares estimates of the coordinates of simulated robots, on the same episodes.
 
     Args:
@@ -177,6 +182,7 @@ def estimates(sizes: Preset, policy: str, radius: float, seeds: Sequence[int]) -
       policy: what walks.
       radius: of the distribution.
       seeds: every seed has episodes and models of its own.
+      track: shows which seed it is.
 
     Returns:
       By method: mean and 0.9-quantile of |estimate - truth| in radii, over all robots, coordinates and seeds, and the
@@ -208,7 +214,7 @@ def estimates(sizes: Preset, policy: str, radius: float, seeds: Sequence[int]) -
     }
     collect = _compiled(lambda key: machine.collect(key, start, dist))
     found, truths = {name: ([], []) for name in methods}, []
-    for seed in seeds:
+    for seed in track(seeds):
         key_collect, key_fit = jax.random.split(jax.random.PRNGKey(seed))
         data = collect(key_collect)
         truths.append(np.asarray(dists.normalise(dist, data.held_out_coords)))
@@ -247,13 +253,14 @@ def _mass(learner: Learner, dist: ParamDist, radii: np.ndarray) -> np.ndarray:
     return model.body_mass.sum() + np.sum(added, axis=0)
 
 
-def memory(sizes: Preset, policy: str, tunings: int = 50) -> dict[str, dict]:
+def memory(sizes: Preset, policy: str, tunings: int = 50, track: Track = iter) -> dict[str, dict]:
     """Measures the resident memory of this process over many tunings, each with its training.
 
     Args:
       sizes: of everything.
       policy: what walks first.
       tunings: number of them.
+      track: shows which tuning it is.
 
     Returns:
       By number of the tuning, from 1: `resident_mib`, and `growth`, that since the fifth tuning as a share of it. By
@@ -265,7 +272,7 @@ def memory(sizes: Preset, policy: str, tunings: int = 50) -> dict[str, dict]:
     step = learner.step(machine, play)
     dist = learner.dist(parameters.nominal(learner.entries), 0.2)
     state, resident = machine.init(starting_policy(policy, learner), dist, tuner.knobs()), []
-    for number in range(tunings):
+    for number in track(range(tunings)):
         state, _ = step(jax.random.PRNGKey(number), state)
         jax.block_until_ready(state)
         gc.collect()
