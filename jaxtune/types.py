@@ -223,6 +223,8 @@ class Form:
     """Empty for all parameters of that row."""
     screened: bool = False
     """True where the effect may show in this form alone: it is screened with the form's smallest size too."""
+    beside: str = ""
+    """Another form of the effect, beside which alone this one may show: both are screened together too."""
     like: str = ""
     """Row, of as many parameters, that a small effect in this form is taken for: where that one leads, this is fitted
     too."""

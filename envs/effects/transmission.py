@@ -164,7 +164,7 @@ JOINT_ENCODER = Effect(
     excited_by="slow triangular reversals",
     **_TRANSMISSION,
 )
-"""A form of backlash, and no effect of its own."""
+"""A form of backlash and of compliance, and no effect of its own."""
 
 JOINT_LOG = Effect(
     name="joint_log",
@@ -190,7 +190,8 @@ ROWS = (
             Form("compliant", "compliance", ("nm_per_rad",)),
             Form("motor_friction", "backlash", ("at_motor",)),
             # All that shows then is that the joint is not driven for a moment.
-            Form("joint_encoder", "joint_encoder", ("at_joint",), screened=True),
+            # Friction at the motor holds it where it is, and its controller sees nothing of that.
+            Form("joint_encoder", "joint_encoder", ("at_joint",), screened=True, beside="motor_friction"),
             Form("joint_log", "joint_log", ("at_joint",), screened=True),
         ),
         sentence="The gears have backlash: the motor turns a little before the joint does.",
@@ -213,6 +214,8 @@ ROWS = (
             Form("hardening", "compliance", ("hardening_per_rad2",)),
             Form("damped", "compliance", ("nm_s_per_rad",)),
             Form("motor_friction", "compliance", ("at_motor",)),
+            # Without a damper, a motor swings on and on that its controller does not see.
+            Form("joint_encoder", "joint_encoder", ("at_joint",), beside="damped"),
             Form("joint_log", "joint_log", ("at_joint",), screened=True),
         ),
         sentence="A spring sits between motor and joint.",

@@ -63,7 +63,7 @@ def forms(axes: Sequence[Axis], rows: Mapping[str, Effect], every: Sequence[Hypo
 
 
 def _as_form(shape: Hypothesis, effect: Hypothesis, form: Form) -> Hypothesis:
-    said = {"form": form.name, "screened": form.screened, "like": form.like}
+    said = {"form": form.name, "screened": form.screened, "beside": form.beside, "like": form.like}
     return replace(shape, name=effect.name, family=effect.family, **said)
 
 

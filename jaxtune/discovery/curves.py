@@ -19,11 +19,11 @@ from jaxtune.discovery.profile import Changes
 _SEGMENTS = 40  # that are simulated: half of them spread over all, half with the largest residuals
 
 Group = tuple[Hypothesis, ...]
-"""What is screened as one: a hypothesis, alone or with one of its forms at the form's smallest size."""
+"""What is screened as one: a hypothesis, alone or with forms of it, each at its smallest size."""
 
 
 _Key = tuple[int, ...]
-"""An axis, alone or with the axis of a form at the same place."""
+"""An axis, alone or with the axes of forms at the same place."""
 
 
 @dataclass(frozen=True)
@@ -70,8 +70,17 @@ class Library:
 
 def groups_of(hypotheses: Sequence[Hypothesis], forms: Sequence[Hypothesis]) -> list[Group]:
     """Lists what is screened: every hypothesis alone, and with each of its forms that asks for that."""
-    shaped = [(one, form) for one in hypotheses for form in forms if form.screened and form.shapes(one)]
-    return [*((one,) for one in hypotheses), *shaped]
+    found: list[Group] = [(one,) for one in hypotheses]
+    for one in hypotheses:
+        own = {form.form: form for form in forms if form.shapes(one)}
+        found += [(one, form) for form in own.values() if form.screened]
+        # The other form is no small one then, but as large as may be expected.
+        found += [
+            (one, form, replace(own[form.beside], probes=own[form.beside].prior[None]))
+            for form in own.values()
+            if form.beside in own
+        ]
+    return found
 
 
 def simulate_library(at: Floor, nominal: Fit, groups: Sequence[Group], say: Say) -> Library:

@@ -51,6 +51,8 @@ class Hypothesis:
     frees further parameters, is tried only beside the effect, and is no name of its own."""
     screened: bool = False
     """True for a form without which its effect may not be seen: the screen tries both together as well."""
+    beside: str = ""
+    """Of a form: another form of the effect, which the screen tries together with both as well."""
     like: str = ""
     """Of a form: name of the effect that a small one in this form is taken for."""
     each: bool = False

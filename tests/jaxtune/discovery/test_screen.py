@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from slider import AXES, EACH, HELD, HYPOTHESES, ONE_SIZE, problem
+from slider import AXES, EACH, HELD, HYPOTHESES, ONE_SIZE, WARPED, problem
 
 from jaxtune.discovery import fit, noise_floor, state
 from jaxtune.discovery.curves import groups_of, simulate_library
@@ -43,6 +43,17 @@ def test_an_effect_that_shows_in_one_form_alone_is_screened_in_that_form():
     assert unseen.leads[0].cost > lead.cost + 50.0
     # In its first form it is a lead without the other one.
     assert len(screened({"coulomb": 0.6}, forms=(HELD,)).leads[0].hypotheses) == 1
+
+
+def test_a_form_that_shows_beside_another_alone_is_screened_beside_it():
+    truth, held = {"coulomb": 0.6, "held": 0.5, "cubic": 3.0}, replace(HELD, screened=False)
+    found = screened(truth, forms=(held, replace(WARPED, beside="held")))
+    lead = found.leads[0]
+    assert [one.key for one in lead.hypotheses] == ["coulomb@slider", "coulomb(warped)@slider", "coulomb(held)@slider"]
+    # The form has its smallest size, and the other one that which may be expected.
+    np.testing.assert_allclose(lead.point, [0.6, WARPED.probes[0, 0], held.prior[0]], rtol=0.4)
+    unseen = screened(truth, forms=(held, WARPED))
+    assert unseen.leads[0].cost > lead.cost + 50.0
 
 
 def test_sizes_of_their_own_are_screened_in_a_form_too():
