@@ -19,7 +19,7 @@ from jaxtune.discovery.profile import Changes
 _SEGMENTS = 40  # that are simulated: half of them spread over all, half with the largest residuals
 
 Group = tuple[Hypothesis, ...]
-"""What is screened as one: a hypothesis, alone or with forms of it, each at its smallest size."""
+"""What is screened as one: a hypothesis, alone or with forms of it, each at its first size."""
 
 
 _Key = tuple[int, ...]
@@ -97,7 +97,7 @@ def simulate_library(at: Floor, nominal: Fit, groups: Sequence[Group], say: Say)
 
 
 def probes_of(group: Group) -> np.ndarray:
-    """Points [probes, parameters] of the hypothesis of a group, with the smallest size of its form."""
+    """Points [probes, parameters] of the hypothesis of a group, with the first size of each of its forms."""
     hypothesis, *forms = group
     return np.concatenate(
         [hypothesis.probes, *(np.tile(form.probes[0], (len(hypothesis.probes), 1)) for form in forms)], axis=1
@@ -135,8 +135,8 @@ def simulate_curves(at: Floor, some: Fit, chosen: np.ndarray, groups: Sequence[G
     """
     nodes = {key: np.array(sorted([0.0, *values])) for key, values in _sizes(groups).items()}
     keys = [(key, size) for key, values in nodes.items() for size in values]
-    # Of a form every node has the smallest size.
-    smallest = {
+    # Of a form every node has the first size.
+    first = {
         axis: form.probes[0, 0] * form.directions[0, axis]
         for _, *forms in groups
         for form in forms
@@ -144,7 +144,7 @@ def simulate_curves(at: Floor, some: Fit, chosen: np.ndarray, groups: Sequence[G
     }
     moves = np.zeros((len(keys), len(some.vector)))
     for move, ((axis, *of_form), size) in zip(moves, keys, strict=True):
-        move[axis], move[of_form] = size, [smallest[one] for one in of_form]
+        move[axis], move[of_form] = size, [first[one] for one in of_form]
     # Curves of one form begin alike, and others where nothing moves.
     moves, which = np.unique(moves, axis=0, return_inverse=True)
     moved, changes = (moves != 0).any(axis=1), np.zeros((len(moves), len(some.residual)), np.float32)
