@@ -109,7 +109,7 @@ class Chain:
 
         Args:
           model: of the robot, effects on its fields included.
-          data: the robot before the step.
+          data: the robot before the step, as the last one or `stepping.placed` has left it.
           memory: of the effects before the step.
           values: of the effects.
           x: the controller's inputs.
@@ -178,7 +178,7 @@ class Chain:
 
         Args:
           model: of the robot, effects on its fields included.
-          data: the robot before the step.
+          data: the robot before the step, as the last one or `stepping.placed` has left it.
           memory: before the step.
           values: of the effects.
           torque: of the motors, [joints] Nm.

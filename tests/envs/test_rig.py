@@ -11,7 +11,7 @@ import pytest
 import reference
 import rigs
 
-from envs import beginning, models, segments
+from envs import beginning, models, segments, stepping
 from envs.biteno import constants
 from envs.effects import LIBRARY
 from envs.logs import Controller, Run
@@ -613,6 +613,7 @@ def test_what_is_read_is_what_the_next_step_reads(rotor):
     x = {name: getattr(segment, name)[0] for name in ("target", "between", "feed", "stiffness", "damping", "limit")}
     x |= {"emf": segment.emf[0], "sample": np.ones((), bool)}
     data = rig._data.replace(qpos=jnp.asarray(START, jnp.float32), qvel=jnp.array([1.0, -2.0]))
+    data = jax.jit(stepping.placed)(model, data)
     memory, step = chain.start(values, chain.joints(data), x), jax.jit(chain.step)
     # Now the motor turns round, and crosses its play.
     x["target"], fast = START - 1.0, 0.0
