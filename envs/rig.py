@@ -22,7 +22,7 @@ from envs.axes import Axis, describe_axis, loose
 from envs.chain import MIN_FRICTION_NM, Chain
 from envs.effects import EVERY
 from envs.held import unread_joints
-from envs.models import links, suspended
+from envs.models import hinges, links, suspended
 from envs.segments import Segment
 from jaxtune import devices
 from jaxtune.mjx import parameters, set_const
@@ -97,6 +97,7 @@ class Rig:
             raise ValueError(f"robot: MJX cannot simulate it: {error}") from error
         self._data = mjx.make_data(self._model)
         self._scales: Mapping[str, np.ndarray] = {}
+        self.slides = tuple(np.array(self.joints)[~hinges(model, self.joints)].tolist())
         # A robot on a rig has no feet on the ground, so effects of contact have no place and drop out below.
         self.places = {"joint": self.joints, "body": self.bodies, "foot": (), "robot": ("robot",)}
         self.effects = {row.name: row for row in EVERY.values() if self.places[row.on] and row.needs != "free"}

@@ -1,7 +1,7 @@
 """Lists the hypotheses of discovery: every effect at every place alone, and at sets of places that are alike."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
 
@@ -21,7 +21,10 @@ _BENT, _STRAIGHT = 7, 3  # sizes of an effect without a slope at zero, and of on
 
 
 def hypotheses(
-    axes: Sequence[Axis], places: Mapping[str, Sequence[str]], rows: Mapping[str, Effect]
+    axes: Sequence[Axis],
+    places: Mapping[str, Sequence[str]],
+    rows: Mapping[str, Effect],
+    slides: Collection[str] = (),
 ) -> tuple[Hypothesis, ...]:
     """Lists the hypotheses about a robot, in the order of the library.
 
@@ -33,12 +36,15 @@ def hypotheses(
       axes: coordinates of the rig (the simulator with all effects built in).
       places: names of all joints, bodies and so on, by the kind of place that an effect may be on.
       rows: effects that are tried, by name.
+      slides: joints that slide. A size in their units is no size of a hinge: 5 N s/m are not 5 Nm s/rad.
     """
     index = {(axis.effect, axis.parameter, axis.place): number for number, axis in enumerate(axes)}
     found = []
     for row in rows.values():
         sets = place_sets(places[row.on])
-        found += [_hypothesis(axes, index, row, chosen) for chosen in sets]
+        in_units = row.on == "joint" and row.parameters[0].scale != "one"
+        alike = _apart(sets, slides) if in_units else sets
+        found += [_hypothesis(axes, index, row, chosen) for chosen in alike]
         if row.differs and len(places[row.on]) > 1:
             found.append(_each(axes, index, row, max(sets, key=len)))
     return tuple(found)
@@ -88,6 +94,12 @@ def place_sets(places: Sequence[str]) -> list[tuple[str, ...]]:
     sets = [(place,) for place in places] + pairs + several + [tuple(places)]
     # The first of several in another order.
     return list({frozenset(one): one for one in reversed(sets)}.values())[::-1]
+
+
+def _apart(sets: Sequence[tuple[str, ...]], slides: Collection[str]) -> list[tuple[str, ...]]:
+    """Divides sets of joints into those of hinges and those of slides, each of them once."""
+    parts = [tuple(one for one in chosen if (one in slides) == slide) for chosen in sets for slide in (False, True)]
+    return list({frozenset(part): part for part in parts[::-1] if part}.values())[::-1]
 
 
 def _mirrored(place: str) -> str | None:

@@ -147,7 +147,8 @@ def _free_or_asked(rig: Rig, signals: Sequence[str], controller: str, sensed: np
     """What is free under every hypothesis, and what the hypotheses and their forms are: fields of the problem."""
     follows, constants = controller == "unknown", SERVO_RATIOS if controller == "servo" else {}
     told = {name: row for name, row in rig.effects.items() if not follows or tells(row)}
-    every = hypotheses(rig.axes, rig.places, {name: row for name, row in told.items() if name in LIBRARY})
+    asked = {name: row for name, row in told.items() if name in LIBRARY}
+    every = hypotheses(rig.axes, rig.places, asked, rig.slides)
     unknowns, bounds = unknown_directions(rig.axes, rig.control_hz, signals, follows, rig.loose_centres())
     shapes = forms(rig.axes, rig.effects, every)
     return {

@@ -231,6 +231,22 @@ def test_what_joints_have_in_sizes_of_their_own_is_tried_so(spec, plain):
     assert {one.each for one in every} == {False, True}
 
 
+def test_a_size_of_slides_is_none_of_hinges(spec):
+    from envs.rig import Rig
+
+    gantry = spec.copy()
+    gantry.joint(JOINTS[0]).type = mujoco.mjtJoint.mjJNT_SLIDE
+    rig = Rig(gantry, JOINTS, 1000.0)
+    assert rig.slides == JOINTS[:1]
+    rows = {name: rig.effects[name] for name in ("viscous", "command_delay")}
+    found = {(one.name, one.places) for one in hypotheses(rig.axes, rig.places, rows, rig.slides) if not one.each}
+    alone = {(name, (joint,)) for name in rows for joint in JOINTS}
+    # A delay is in seconds at both.
+    assert found == alone | {("command_delay", JOINTS)}
+    every = hypotheses(rig.axes, rig.places, rows)
+    assert {(one.name, one.places) for one in every if not one.each} == alone | {(name, JOINTS) for name in rows}
+
+
 def test_no_place_loses_more_than_it_has(spec):
     """Armatures of 0.1 and 0.01 at once: coordinates are in the unit of the first."""
     from envs.rig import Rig
