@@ -224,7 +224,7 @@ class Form:
     screened: bool = False
     """True where the effect may show in this form alone: it is screened with the form's smallest size too."""
     beside: str = ""
-    """Another form of the effect, beside which alone this one may show: both are screened together too."""
+    """Another form of the effect, without which this one may not show: both are screened together too."""
     like: str = ""
     """Row, of as many parameters, that a small effect in this form is taken for: where that one leads, this is fitted
     too."""

@@ -189,8 +189,8 @@ ROWS = (
         forms=(
             Form("compliant", "compliance", ("nm_per_rad",)),
             Form("motor_friction", "backlash", ("at_motor",)),
-            # All that shows then is that the joint is not driven for a moment.
-            # Friction at the motor holds it where it is, and its controller sees nothing of that.
+            # All that shows then is that the joint is not driven for a moment. Friction at the motor makes that longer:
+            # it holds the motor within the play, of which the controller sees nothing.
             Form("joint_encoder", "joint_encoder", ("at_joint",), screened=True, beside="motor_friction"),
             Form("joint_log", "joint_log", ("at_joint",), screened=True),
         ),
@@ -214,7 +214,7 @@ ROWS = (
             Form("hardening", "compliance", ("hardening_per_rad2",)),
             Form("damped", "compliance", ("nm_s_per_rad",)),
             Form("motor_friction", "compliance", ("at_motor",)),
-            # Without a damper, a motor swings on and on that its controller does not see.
+            # Without a damper the motor swings on and on, since its controller does not see it.
             Form("joint_encoder", "joint_encoder", ("at_joint",), beside="damped"),
             Form("joint_log", "joint_log", ("at_joint",), screened=True),
         ),

@@ -92,14 +92,18 @@ def place_sets(places: Sequence[str]) -> list[tuple[str, ...]]:
         kinds.setdefault(_kind(place), []).append(place)
     several = [tuple(kind) for kind in kinds.values() if len(kind) > 1]
     sets = [(place,) for place in places] + pairs + several + [tuple(places)]
-    # The first of several in another order.
-    return list({frozenset(one): one for one in reversed(sets)}.values())[::-1]
+    return _distinct(sets)
 
 
 def _apart(sets: Sequence[tuple[str, ...]], slides: Collection[str]) -> list[tuple[str, ...]]:
     """Divides sets of joints into those of hinges and those of slides, each of them once."""
     parts = [tuple(one for one in chosen if (one in slides) == slide) for chosen in sets for slide in (False, True)]
-    return list({frozenset(part): part for part in parts[::-1] if part}.values())[::-1]
+    return _distinct([part for part in parts if part])
+
+
+def _distinct(sets: Sequence[tuple[str, ...]]) -> list[tuple[str, ...]]:
+    """Takes every set once: the first of several in another order."""
+    return list({frozenset(one): one for one in reversed(sets)}.values())[::-1]
 
 
 def _mirrored(place: str) -> str | None:

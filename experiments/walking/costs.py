@@ -7,7 +7,7 @@ import dataclasses
 import gc
 import os
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -36,7 +36,7 @@ _MODELS = 5  # search-parameter models whose mean is compared with one
 _TIMES = 3  # runs of a program, of which the fastest counts
 _ROLLOUTS, _UPDATES = "policy: rollouts", "policy: whole updates"
 
-Track = Callable[[Sequence], Iterable]
+Track = Callable[[Collection], Iterable]
 """Goes through what is to be measured, and shows how far it is; `iter` shows nothing."""
 
 

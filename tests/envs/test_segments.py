@@ -135,7 +135,7 @@ def test_a_quantum_is_found(quantum):
     assert (segments.noise(rounded) >= quantum / 12**0.5 * (1 - 1e-5)).all()
 
 
-@pytest.mark.parametrize("share", [0.3, 0.5, 0.7])
+@pytest.mark.parametrize("share", [0.2, 0.3, 0.5, 0.7, 1.0])
 def test_noise_is_found_where_rounding_is_as_coarse(share):
     # Noise of a share of a 12-bit encoder's count. Third differences are few counts then, and half of them one or none.
     rng, quantum, time = np.random.default_rng(7), 2 * np.pi / 4096, times(3.0, 500.0)
