@@ -110,13 +110,14 @@ def _far_off(result: Result) -> dict | None:
 def _changed(question: Question, result: Result) -> list[AcceptedTerm]:
     """Nominal parameters that went as far as they may. One at the joints of a named effect refines that effect."""
     rig, found = question.rig, []
-    for axis in (rig.axes[number] for number in result.changed):
+    for axis, change in ((rig.axes[number], change) for number, change in result.changed.items()):
         if any(term.hypothesis.name == axis.effect and axis.place in term.hypothesis.places for term in result.terms):
             continue
         every = hypotheses(rig.axes, rig.places, {axis.effect: rig.effects[axis.effect]})
         hypothesis = next(one for one in every if one.places == (axis.place,))
         over = [t.hypothesis.key for t in result.terms if t.refines is None and acts_within(hypothesis, t.hypothesis)]
-        found.append(AcceptedTerm(hypothesis, None, None, refines=over[0] if over else None))
+        refines = over[0] if over else None
+        found.append(AcceptedTerm(hypothesis, None, None, confusable_with=change.confusable_with, refines=refines))
     return found
 
 

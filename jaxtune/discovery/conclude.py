@@ -11,12 +11,13 @@ from jaxtune.discovery.candidate import Candidate, cost, key_of, measures, squar
 from jaxtune.discovery.evaluate import is_worse, position_gap, rms
 from jaxtune.discovery.evidence import Thresholds, ablate, passes, weigh_evidence
 from jaxtune.discovery.fit import Fit, begin, polish, refine
+from jaxtune.discovery.instead import instead
 from jaxtune.discovery.leads import at_some_places, beside, fit_leads, taken_for
 from jaxtune.discovery.naming import at_fewest_places, clear_places, moved_forms, renamed, with_refinements
 from jaxtune.discovery.noise_floor import Floor, NoiseFloor, Say
 from jaxtune.discovery.problem import Hypothesis, Problem
 from jaxtune.discovery.resample import standard_errors
-from jaxtune.discovery.result import AcceptedTerm, DroppedTerm, Settings, Suspect
+from jaxtune.discovery.result import AcceptedTerm, Change, DroppedTerm, Settings, Suspect
 from jaxtune.discovery.screen import Lead
 from jaxtune.discovery.shares import energy, enough, explained, explained_shares, lost_without, open_gaps, speak
 from jaxtune.discovery.state import State
@@ -44,7 +45,7 @@ class Conclusion:
     learned_parts: Mapping[Hashable, float]
     models: Mapping[str, np.ndarray]
     """Vectors [axes] that may become the corrected model, by what they are; the chosen one is first."""
-    changed: Mapping[int, float]
+    changed: Mapping[int, Change]
     dropped: tuple[DroppedTerm, ...]
     details: Mapping[str, Any]
 
@@ -83,6 +84,12 @@ def conclude(settings: Settings, problem: Problem, floor: NoiseFloor, state: Sta
     changed = _at_bounds(problem, best.fit, state.price) if explains else {}
     explains = explains and (len(changed) < settings.strained or usual[1].max() < settings.much)
     verdict = _verdict(problem, terms, changed) if explains else "unnamed"
+    if verdict != "unnamed" and changed:
+        say("rivals of a parameter")
+        changed = {
+            axis: replace(change, confusable_with=instead(settings, problem, at, state, best, axis))
+            for axis, change in changed.items()
+        }
     terms = tuple(
         replace(term, forms=(*term.forms, *moved_forms(problem, best.fit, errors, term.hypothesis))) for term in terms
     )
@@ -124,7 +131,7 @@ def _shares(
     return usual, *max(explained_shares([energy(one) for one in gaps], costs) for gaps in speaking)
 
 
-def _verdict(problem: Problem, terms: Sequence[AcceptedTerm], changed: Mapping[int, float]) -> str:
+def _verdict(problem: Problem, terms: Sequence[AcceptedTerm], changed: Mapping[int, Change]) -> str:
     """The verdict of a model that explains what there is."""
     if any(not problem.is_change(term.hypothesis, term.forms) for term in terms if term.refines is None):
         # A term about a nominal parameter is a change, however large: the model has the parameter.
@@ -277,8 +284,8 @@ def _by_select(problem: Problem, at: Floor, state: State, best: Candidate, learn
     return {name: models[name] for name in sorted(models, key=rank)}
 
 
-def _at_bounds(problem: Problem, fit: Fit, price: float) -> dict[int, float]:
-    """Nominal axes that went as far as they may, and how far that is in prior standard deviations.
+def _at_bounds(problem: Problem, fit: Fit, price: float) -> dict[int, Change]:
+    """Nominal axes that went as far as they may.
 
     Those are left out without which, at their nominal value, the model would cost hardly more.
     """
@@ -291,5 +298,5 @@ def _at_bounds(problem: Problem, fit: Fit, price: float) -> dict[int, float]:
         row = fit.free.directions[number]
         for axis in np.flatnonzero(row):
             if problem.prior[axis] > 0 and problem.prior[axis] == row[axis] and more > price:
-                found[int(axis)] = float(fit.coordinates[number])
+                found[int(axis)] = Change(float(fit.coordinates[number]))
     return found

@@ -104,6 +104,16 @@ class DroppedTerm:
 
 
 @dataclass(frozen=True)
+class Change:
+    """A nominal parameter that went as far as it may."""
+
+    deviations: float
+    """How far that is, in prior standard deviations."""
+    confusable_with: tuple[str, ...] = ()
+    """Names of effects that explain most of what it does, where it keeps its nominal value."""
+
+
+@dataclass(frozen=True)
 class Suspect:
     """An effect that may be part of the truth."""
 
@@ -164,8 +174,8 @@ class Result:
     """Keys of models that broke the simulation."""
     dropped: tuple[DroppedTerm, ...]
     """Effects of the cheapest model that did not pass, in the order in which they were taken out."""
-    changed: Mapping[int, float]
-    """Nominal axes that went as far as they may, with the distance in prior standard deviations."""
+    changed: Mapping[int, Change]
+    """Nominal axes that went as far as they may."""
     gap: Mapping[str, float]
     """Rms of the worst position on the sealed segments, in floor units: `before`, `null` and `after`."""
     proof: Mapping[str, Any]

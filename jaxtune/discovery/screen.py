@@ -13,12 +13,13 @@ from itertools import pairwise
 import numpy as np
 
 from jaxtune.discovery.candidate import of_further_sizes
-from jaxtune.discovery.curves import Curves, Group, Library, on_segments, probes_of, simulate_library
+from jaxtune.discovery.curves import Curves, Group, Library, groups_of, on_segments, probes_of, simulate_library
 from jaxtune.discovery.fit import Fit, Free, taken_over
 from jaxtune.discovery.least_squares import of_size
 from jaxtune.discovery.noise_floor import Floor, Say
 from jaxtune.discovery.problem import Hypothesis, are_distinct
 from jaxtune.discovery.profile import Changes, Profile, profile_of
+from jaxtune.discovery.result import Settings
 
 _BETWEEN = (0.0, 0.25, 0.5, 0.75)  # of the way from a size to the next, where costs are computed
 _VISIBLE = 4.0  # standard deviations
@@ -68,6 +69,31 @@ def promising(
     profile = profile_of(some, library.curves.changes, _shares(at, base, library.segments))
     leads = _once([_best(profile, group, library.curves, price) for group in groups])
     return [lead.hypotheses[0] for lead in leads[:count]]
+
+
+def screened_again(
+    settings: Settings,
+    at: Floor,
+    base: Fit,
+    free: Sequence[Hypothesis],
+    forms: Sequence[Hypothesis],
+    library: Library,
+    price: float,
+) -> list[Group]:
+    """Picks what is screened beside a model that is not the nominal one.
+
+    Args:
+      settings: how much is screened.
+      at: the floor at the main horizon.
+      base: the model, with slopes of all that is free in it.
+      free: what may join it. Forms of its own effects are all picked, and of other effects the most `promising`.
+      forms: that these effects may have.
+      library: of the nominal model.
+      price: of an effect.
+    """
+    own, effects = ([h for h in free if bool(h.form) == shaping] for shaping in (True, False))
+    more = promising(at, base, groups_of(effects, forms), library, price, settings.again) if effects else []
+    return groups_of([*own, *more], forms)
 
 
 def seen(at: Floor, nominal: Fit, groups: Sequence[Group], library: Library) -> tuple[frozenset[str], np.ndarray]:

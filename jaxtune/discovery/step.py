@@ -7,20 +7,19 @@ imitate what is missing, and a search from there would have to lead them back. I
 one effect may hide another. Where nothing joins the best model any more, each of its effects is replaced in turn.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from jaxtune.discovery.candidate import Candidate, key_of, total_cost
-from jaxtune.discovery.curves import Group, Library, groups_of, simulate_library
+from jaxtune.discovery.curves import groups_of, simulate_library
 from jaxtune.discovery.evaluate import usual
 from jaxtune.discovery.evidence import ablate, or_known
-from jaxtune.discovery.fit import Fit, polish, taken_over
+from jaxtune.discovery.fit import polish, taken_over
 from jaxtune.discovery.leads import beside, fit_leads, shaped, shortlist, stuck
 from jaxtune.discovery.localise import localise
 from jaxtune.discovery.noise_floor import Floor, NoiseFloor, Say
 from jaxtune.discovery.problem import Hypothesis, Problem, are_distinct
 from jaxtune.discovery.result import Settings
-from jaxtune.discovery.screen import promising, screen, seen
+from jaxtune.discovery.screen import screen, screened_again, seen
 from jaxtune.discovery.state import State
 
 
@@ -75,7 +74,7 @@ def step(
     # A form may be another one of an effect that is there.
     forms = beside(problem.forms, base.hypotheses)
     if state.screened:
-        again = _again(settings, at, base.fit, free, forms, library, state.price)
+        again = screened_again(settings, at, base.fit, free, forms, library, state.price)
         found = screen(at, base.fit, again, price=state.price, pairs=0, say=say)
     else:
         state = state.with_seen(settings, problem, *seen(at, state.nominal, every, library))
@@ -131,22 +130,6 @@ def _free(settings: Settings, problem: Problem, at: Floor, base: Candidate, stat
         for h in (*forms, *(() if full else problem.hypotheses))
         if h.key not in left_out and all(are_distinct(h, other) for other in base.hypotheses)
     ]
-
-
-def _again(
-    settings: Settings,
-    at: Floor,
-    base: Fit,
-    free: Sequence[Hypothesis],
-    forms: Sequence[Hypothesis],
-    library: Library,
-    price: float,
-) -> list[Group]:
-    """Picks what is screened again beside a model that has effects: all forms of these, and the other effects that
-    would lower its cost most if they changed it as they change the nominal model."""
-    own, effects = ([h for h in free if bool(h.form) == shaping] for shaping in (True, False))
-    more = promising(at, base, groups_of(effects, forms), library, price, settings.again) if effects else []
-    return groups_of([*own, *more], forms)
 
 
 def _unfree(problem: Problem, at: Floor) -> list[Hypothesis]:

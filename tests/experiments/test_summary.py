@@ -22,7 +22,7 @@ from experiments.discovery.summary import _effect, _far_off, details, free_runs,
 from jaxtune.discovery.evidence import Evidence, Thresholds, passes
 from jaxtune.discovery.fit import Fit, Free
 from jaxtune.discovery.naming import clear_places
-from jaxtune.discovery.result import AcceptedTerm, DroppedTerm, Result, Suspect
+from jaxtune.discovery.result import AcceptedTerm, Change, DroppedTerm, Result, Suspect
 
 JOINTS = ("shoulder", "elbow")
 GAINS = {"kp": np.array([40.0, 20.0]), "kd": np.array([2.0, 0.8]), "torque_limit_nm": np.array([15.0, 15.0])}
@@ -83,7 +83,7 @@ def found(question, **changes):
         not_testable=("drag",),
         not_finite=(),
         dropped=(DroppedTerm(every["viscous@shoulder"], EVIDENCE, ("confirmed", "clear_of_zero")),),
-        changed={gain: 3.0},
+        changed={gain: Change(3.0, ("drag",))},
         gap={"before": 3.0, "null": 2.0, "after": 1.0},
         proof={"cells": cells, "no_cell_worse": True, "others": {"without coulomb@elbow": 2.5}},
     )
@@ -99,7 +99,7 @@ def test_what_is_named_changed_and_neither(asked):
     # 1.96 standard errors of 0.02, in the scale of the coordinate.
     assert (value["high"] - value["low"]) / value["value"] == pytest.approx(2 * 1.96 * 0.02 / 0.5, rel=1e-3)
     # A parameter that no hypothesis is about can be at its bound all the same.
-    assert (change["name"], change["places"]) == ("damping_gain", ["shoulder"])
+    assert (change["name"], change["places"], change["confusable_with"]) == ("damping_gain", ["shoulder"], ["drag"])
     assert change["parameters"]["ratio"]["value"] == pytest.approx(np.exp(0.3), rel=1e-5)
     assert (weaker["name"], weaker["refines"]) == ("constant_push", "coulomb@elbow")
     assert summary["families"] == [{"family": "joint_friction", "places": ["elbow"], "probability": 0.97}]

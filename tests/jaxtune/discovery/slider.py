@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxtune.discovery.problem import Hypothesis, Problem, Segments
 
-AXES = ("mass", "damping", "coulomb", "push", "nothing", "cubic", "wild", "held")
+AXES = ("mass", "damping", "coulomb", "push", "nothing", "cubic", "wild", "held", "drag")
 HORIZONS = (0.1, 0.2, 0.4)
 DT, NOISE = 0.01, 0.002
 DRAWS = np.random.default_rng(5).standard_normal((12, 2)).clip(-2, 2)
@@ -18,7 +18,7 @@ DRAWS = np.random.default_rng(5).standard_normal((12, 2)).clip(-2, 2)
 def simulate(system, vector, segment, steps):
     """A slider of 1 kg, 1 N s/m and `system` N of friction pushed by a force [steps]; coordinates are what is added."""
     del steps
-    mass, damping, coulomb, push, _, cubic, wild, held = vector
+    mass, damping, coulomb, push, _, cubic, wild, held, drag = vector
 
     def step(state, force):
         x, v = state
@@ -26,7 +26,7 @@ def simulate(system, vector, segment, steps):
         rub = (system + coulomb) * jnp.tanh(jnp.where(held > 0, x, v) / 0.02) + cubic * x**3
         # A hypothesis that breaks the simulation wherever it is tried.
         broken = jnp.where(wild > 0, jnp.nan, 0.0)
-        v = v + DT * (force + push - (1.0 + damping) * v - rub) / jnp.exp(mass) + broken
+        v = v + DT * (force + push - (1.0 + damping + drag) * v - rub) / jnp.exp(mass) + broken
         x = x + DT * v
         return (x, v), (x, v)
 
@@ -59,6 +59,10 @@ HYPOTHESES = (
     hypothesis("nothing", (-5.0, 5.0), [-1.0, -0.05, 0.05, 1.0], "external"),
 )
 WILD = hypothesis("wild", (0.0, 1.0), [0.1], "external")
+
+
+# What brakes the slider as its own damping does.
+DRAG = hypothesis("drag", (0.0, 5.0), [0.3, 1.0, 3.0], "external")
 
 
 # Friction and a push stand for one effect at two places, which may have one size or a size each.

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from slider import AXES, BOTH, DIRECTION, EACH, HYPOTHESES, LEARNED, ONE_SIZE, ROWS, WARPED, WILD, problem
+from slider import AXES, BOTH, DIRECTION, DRAG, EACH, HYPOTHESES, LEARNED, ONE_SIZE, ROWS, WARPED, WILD, problem
 
 from jaxtune.discovery import leads, noise_floor, state, step, workflow
 from jaxtune.discovery.candidate import Candidate
@@ -279,10 +279,20 @@ def test_a_nominal_parameter_that_stops_at_its_bound_is_a_finding():
     asked = problem({"damping": 0.33}, hypotheses=HYPOTHESES[2:])
     result = workflow.discover(asked)
     assert result.verdict == "parameter_change"
-    assert result.changed == {AXES.index("damping"): pytest.approx(3.0)}
+    assert {axis: change.deviations for axis, change in result.changed.items()} == {
+        AXES.index("damping"): pytest.approx(3.0)
+    }
     # Where much is left, as many at their bounds as may not be imitate something else.
     for strained, much, verdict in ((1, 0.0, "unnamed"), (2, 0.0, "parameter_change"), (1, 9.0, "parameter_change")):
         assert workflow.discover(asked, Settings(strained=strained, much=much)).verdict == verdict
+
+
+@pytest.mark.parametrize("others, rivals", [((), ()), ((DRAG,), ("drag",))])
+def test_what_brakes_as_damping_does_may_be_there_in_its_place(others, rivals):
+    # Damping is a parameter and costs less, so beside it a drag gains nothing.
+    result = workflow.discover(problem({"drag": 0.33}, hypotheses=(*HYPOTHESES[2:], *others)))
+    assert result.verdict == "parameter_change"
+    assert [change.confusable_with for change in result.changed.values()] == [rivals]
 
 
 def test_without_a_name_the_user_gets_the_best_of_all_models_on_validation_runs():
