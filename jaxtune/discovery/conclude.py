@@ -63,7 +63,6 @@ def conclude(settings: Settings, problem: Problem, floor: NoiseFloor, state: Sta
     at = floor[problem.main_horizon]
     say("evidence")
     state = _where_it_shows(problem, at, _with_one_name(problem, at, state))
-    cheapest = state.best
     best, terms, ablated, dropped = _proved(settings, problem, floor, state)
     state = _with_what_passes(settings, problem, at, replace(state, best=best))
     if state.best is not best:
@@ -79,6 +78,7 @@ def conclude(settings: Settings, problem: Problem, floor: NoiseFloor, state: Sta
     )
     say("learned torque")
     learned = learn(settings, problem, at, best)
+    models = _by_select(problem, at, state, best, learned)
     usual, share, whole = _shares(settings, problem, at, (state.null, best, learned))
     explains = enough(settings, usual[1].max(), share if terms else 0.0, whole)
     changed = _at_bounds(problem, best.fit, state.price) if explains else {}
@@ -90,9 +90,6 @@ def conclude(settings: Settings, problem: Problem, floor: NoiseFloor, state: Sta
             axis: replace(change, confusable_with=instead(settings, problem, at, state, best, axis))
             for axis, change in changed.items()
         }
-    if verdict == "unnamed" and dropped:
-        learned = _better_on_select(at, learned, learn(settings, problem, at, _with_slopes(at, cheapest)))
-    models = _by_select(problem, at, state, best, learned)
     terms = tuple(
         replace(term, forms=(*term.forms, *moved_forms(problem, best.fit, errors, term.hypothesis))) for term in terms
     )
@@ -239,7 +236,8 @@ def _proved(
     def of_effect(effect: Hypothesis) -> Thresholds:
         return Thresholds(state.price * effect.worth)
 
-    best = _with_slopes(at, state.best)
+    (fit,) = polish([state.best.fit], at.residuals["train"], 0)
+    best = replace(state.best, fit=fit)
     # Much of what forms are about ends at its bounds: friction can be all at the motor, a limit as soft as it gets.
     of_form = Thresholds(0.5 * state.price, floors=0.0, of_left=0.0, inside=False, horizons=1, size=0.0)
     fitted = {one.key: one for one in state.candidates}
@@ -258,22 +256,13 @@ def _proved(
         (fit,) = polish([best.fit], at.residuals["train"], 1)
         best = renamed(problem, replace(best, fit=fit, select=at.residuals["select"](fit.vector[None])[0]))
     if not best.hypotheses:
-        best = _with_slopes(at, state.null)
+        best = state.null
+        (fit,) = polish([best.fit], at.residuals["train"], 0)
+        best = replace(best, fit=fit)
     # What explains most is named first.
     ranked = sorted((row for row in weighed.values() if not row[0].form), key=lambda row: -row[1].gain)
     terms = tuple(AcceptedTerm(h, evidence, of_effect(h), forms=best.forms_of(h)) for h, evidence, _ in ranked)
     return best, terms, {h.key: ablated.fit.vector for h, _, ablated in ranked}, tuple(dropped)
-
-
-def _with_slopes(at: Floor, one: Candidate) -> Candidate:
-    """A model with the slopes of all coordinates taken anew."""
-    (fit,) = polish([one.fit], at.residuals["train"], 0)
-    return replace(one, fit=fit)
-
-
-def _better_on_select(at: Floor, *models: Candidate) -> Candidate:
-    """The model that costs least on `select`: effects that did not pass are no names, but may simulate better."""
-    return min(models, key=lambda one: cost(at, (at.unflatten(one.select) ** 2).sum(axis=1)))
 
 
 def _by_select(problem: Problem, at: Floor, state: State, best: Candidate, learned: Candidate) -> dict[str, np.ndarray]:

@@ -143,8 +143,7 @@ class Result:
     model: np.ndarray
     """[axes]: the corrected model, as the simulator is given it: `proposed`, unless that was withdrawn."""
     model_is: str
-    """What `model` is: `nominal`, `null`, `effects`, or `learned` (effects, also such as did not pass, and a learned
-    torque)."""
+    """What `model` is: `nominal`, `null`, `effects`, or `learned` (effects and a learned torque)."""
     suspects: tuple[Suspect, ...]
     """Effects that may be part of the truth, most likely first, whatever the verdict."""
     families: Mapping[tuple[str, tuple[str, ...]], float]

@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import pytest
-from slider import AXES, problem
+from slider import problem
 
 from jaxtune.discovery import conclude, noise_floor, state, step
 from jaxtune.discovery.candidate import cost
@@ -39,19 +39,6 @@ def test_a_model_that_breaks_in_one_segment_is_not_saved(stepped):
     # The cost alone does not mind.
     assert costs[0] < costs[1]
     assert next(iter(conclude._by_select(asked, at, found, best, best))) in ("null", "nominal")
-
-
-def test_effects_that_did_not_pass_may_simulate_better_than_nothing(stepped, monkeypatch):
-    asked, floor, found = stepped
-    monkeypatch.setattr(conclude, "passes", lambda evidence, thresholds: {"matters": False})
-    answer = conclude.conclude(Settings(), asked, floor, found, lambda text: None)
-    assert answer.verdict == "unnamed"
-    assert not answer.terms
-    assert [one.hypothesis.name for one in answer.dropped] == ["coulomb"]
-    # It has no learned torque, so the effect alone is what is saved.
-    name, vector = next(iter(answer.models.items()))
-    assert name == "learned"
-    assert vector[AXES.index("coulomb")] == pytest.approx(0.5, abs=0.05)
 
 
 def test_the_answer_names_the_joints_that_show_an_effect(stepped):
