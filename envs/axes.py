@@ -19,7 +19,7 @@ _NOMINAL_RATIOS = {"link_mass": _PRIOR_SHARE, "link_inertia": _PRIOR_SHARE, "gai
 SERVO_RATIOS = {"torque_scale": 0.07, "back_emf": 0.1, "damping_gain": 0.0}
 _NOMINAL_FIELDS = {"armature": "dof_armature", "viscous": "dof_damping", "coulomb": "dof_frictionloss"}
 _LOOSE, _LEAST_LOOSE_M = 0.01, 1e-3  # by which a centre of mass is off: of the radius of gyration, and in m
-_MOST_TAKEN = 0.9  # of a field of the model: armature and damping must stay positive
+_MOST_TAKEN = 0.99  # of a field of the model: armature and damping must stay positive
 
 
 def loose(mass: np.ndarray, inertia: np.ndarray) -> np.ndarray:
@@ -60,6 +60,11 @@ class Axis:
     """Indices of the joints in which an effect at this place shows directly: the joint itself, or for a link all joints
     that carry it, nearest first."""
 
+    @property
+    def takes(self) -> bool:
+        """Says whether `least` takes away nearly all that the model has."""
+        return self.effect in _NOMINAL_FIELDS
+
 
 def describe_axis(
     model: mujoco.MjModel,
@@ -88,8 +93,9 @@ def describe_axis(
         prior_sd = _NOMINAL_RATIOS[row.name]
     elif row.name in _NOMINAL_FIELDS:
         nominal = float(getattr(model, _NOMINAL_FIELDS[row.name])[dof[index]] / scale)
-        # Dry friction acts on a signal, but what the model has of it can be taken as well.
-        least, prior_sd = max(least, -_MOST_TAKEN * nominal), _PRIOR_SHARE * nominal
+        # Dry friction acts on a signal, but what the model has of it can be taken as well. What many models have is a
+        # placeholder, ten times what it should be.
+        least, prior_sd = -_MOST_TAKEN * nominal, _PRIOR_SHARE * nominal
     return Axis(
         effect=row.name,
         parameter=parameter.name,

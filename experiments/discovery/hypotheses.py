@@ -230,6 +230,7 @@ def _hypothesis(
         directions=directions,
         probes=_probes(row.sizes, parameters, bounds[0, 0]),
         bounds=bounds,
+        spent=axes[first[0]].takes,
         prior=np.array([one.prior for one in parameters]),
         joints=tuple(sorted({joint for axis in first for joint in axes[axis].joints[:1]})),
     )

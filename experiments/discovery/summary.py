@@ -134,7 +134,7 @@ def _effect(rig: Rig, term: AcceptedTerm, fit: Fit, errors: np.ndarray) -> dict:
         parameter = next(one for one in known if one.name == axis.parameter)
         # Standard errors of the directions through this coordinate add up in quadrature; 1.96 makes it a 95 % interval.
         error = 1.96 * float(np.sqrt(sum((errors[i] * fit.free.directions[i][number]) ** 2 for i in mine)))
-        low, high = parameter.bounds
+        low, high = (axis.least if axis.takes else parameter.bounds[0]), parameter.bounds[1]
         # A limit or a stiffness that may as well not be there has no upper end.
         low = max(low, 1e-12) if parameter.form == "reciprocal" else low
         ends = np.clip([value - error, value + error], low, high)

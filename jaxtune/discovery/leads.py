@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 
@@ -14,6 +15,9 @@ from jaxtune.discovery.result import Settings
 from jaxtune.discovery.screen import Lead, Screen
 
 _MOST_PLACES = 3  # of one name among the leads that are fitted: they tell where; more would crowd out other names
+# Of a joint's usual inertia, damping or torque: from which share on the model's own may be a placeholder. And how much
+# of that is taken away.
+_OWN, _MOST_OWN = 0.2, 0.9
 _REACH = 0.5  # share of the best fit's gain that another one needs for fresh slopes
 
 
@@ -149,6 +153,28 @@ def stuck(null: Fit, hypotheses: Sequence[Hypothesis], leads: Sequence[Lead]) ->
             (axis,) = np.flatnonzero(hypothesis.directions[0])
             point = null.vector[axis] / hypothesis.directions[:, axis]
             found.append(Lead((hypothesis,), point, null.coordinates, null.cost))
+    return found
+
+
+def without_own(nominal: Fit, hypotheses: Sequence[Hypothesis], cost: float) -> list[Lead]:
+    """Lists leads that take away most of what the model has of its own, such as rotors and damping, alone and together.
+
+    In many models these are placeholders, ten and more times too large. With them nothing moves as it does, so effects
+    do not add up, and a screen that changes one at a time does not come to it.
+
+    Args:
+      nominal: the nominal model.
+      hypotheses: that may join it.
+      cost: of the null.
+    """
+    own = [h for h in hypotheses if h.spent and (h.bounds[:, 0] < -_OWN).any()]
+    widest = {(h.name, h.each): h for h in sorted(own, key=lambda h: len(h.places))}
+    found = []
+    for each in (False, True):
+        mine = [h for h in widest.values() if h.each == each]
+        for together in (c for count in range(1, len(mine) + 1) for c in combinations(mine, count)):
+            point = np.concatenate([_MOST_OWN * h.bounds[:, 0] for h in together])
+            found.append(Lead(together, point, nominal.coordinates, cost))
     return found
 
 

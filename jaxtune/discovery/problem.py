@@ -42,6 +42,8 @@ class Hypothesis:
     effect with several sizes, such as x, y and z, has a probe for each of them alone."""
     bounds: np.ndarray
     """[parameters, 2]: least and largest coordinate."""
+    spent: bool = False
+    """True where the least coordinates take away nearly all that the nominal model has of it, such as its damping."""
     prior: np.ndarray
     """[parameters]: coordinates up to which all sizes are about as likely before anything was measured."""
     joints: tuple[int, ...]

@@ -14,7 +14,7 @@ from jaxtune.discovery.curves import groups_of, simulate_library
 from jaxtune.discovery.evaluate import usual
 from jaxtune.discovery.evidence import ablate, or_known
 from jaxtune.discovery.fit import polish, taken_over
-from jaxtune.discovery.leads import beside, fit_leads, shaped, shortlist, stuck
+from jaxtune.discovery.leads import beside, fit_leads, shaped, shortlist, stuck, without_own
 from jaxtune.discovery.localise import localise
 from jaxtune.discovery.noise_floor import Floor, NoiseFloor, Say
 from jaxtune.discovery.problem import Hypothesis, Problem, are_distinct
@@ -87,6 +87,7 @@ def step(
         leads += shaped(beside(_unfree(problem, at), base.hypotheses), free, leads, settings.shaped)
     if base.fit is state.nominal:
         leads = leads + stuck(state.null.fit, [h for h in free if problem.is_nominal(h)], leads)
+        leads += without_own(base.fit, free, state.null.fit.cost)
     say(f"fit {len(leads)}")
     fitted = fit_leads(settings, at, base.fit, base.hypotheses, leads, state.price)
     broken = {key_of((*base.hypotheses, *lead.hypotheses)) for lead in leads} - {one.key for one in fitted}
