@@ -52,7 +52,7 @@ class Axis:
     """What one unit of the coordinate stands for, in the unit of the parameter."""
     least: float
     """Smallest coordinate. An effect that subtracts from a field of the model (armature, damping, dry friction) may
-    take nine tenths of it at most, so that the field stays positive."""
+    take all but a hundredth of it, so that the field stays positive."""
     prior_sd: float
     """Prior standard deviation, in coordinates, of a parameter that every model has (a nuisance that every hypothesis
     fits); zero for an effect that models lack."""

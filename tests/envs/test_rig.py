@@ -785,11 +785,11 @@ def test_prior_standard_deviations_are_in_coordinates(arm):
     assert {place for _, place in got} == {"shoulder", "elbow", "upper", "lower"}
 
 
-def test_a_tenth_of_a_field_stays_when_an_effect_takes_from_it(arm):
+def test_a_hundredth_of_a_field_stays_when_an_effect_takes_from_it(arm):
     least = {(axis.effect, axis.place): axis.least for axis in arm.rig.axes}
     # The arm's armature is 0.01 kg m^2; a coordinate stands for 0.11 and 0.03 of them.
-    np.testing.assert_allclose(least["armature", "shoulder"], -0.009 / 0.11, rtol=1e-6)
-    np.testing.assert_allclose(least["armature", "elbow"], -0.009 / 0.03, rtol=1e-6)
+    np.testing.assert_allclose(least["armature", "shoulder"], -0.0099 / 0.11, rtol=1e-6)
+    np.testing.assert_allclose(least["armature", "elbow"], -0.0099 / 0.03, rtol=1e-6)
     # It has no dry friction, of which nothing can be taken.
     assert least["coulomb", "elbow"] == 0.0
 
@@ -797,9 +797,12 @@ def test_a_tenth_of_a_field_stays_when_an_effect_takes_from_it(arm):
 def test_dry_friction_of_the_model_can_be_taken_as_well():
     spec = mujoco.MjSpec.from_string(rigs.ARM)
     spec.joint("elbow").frictionloss = 0.05
+    # A placeholder: more than any effect adds.
+    spec.joint("shoulder").armature = 1.0
     rig = Rig(spec, rigs.ARM_JOINTS, rigs.CONTROL_HZ)
-    least = {(axis.effect, axis.place): axis.least for axis in rig.axes}
-    assert least["coulomb", "elbow"] == pytest.approx(-0.045)
+    least = {(axis.effect, axis.place): axis.least * axis.scale for axis in rig.axes if axis.takes}
+    assert least["coulomb", "elbow"] == pytest.approx(-0.0495)
+    assert least["armature", "shoulder"] == pytest.approx(-0.99)
 
 
 def test_a_vector_has_its_axes_by_effect_parameter_and_place(arm):

@@ -105,6 +105,24 @@ def test_what_is_named_changed_and_neither(asked):
     assert summary["families"] == [{"family": "joint_friction", "places": ["elbow"], "probability": 0.97}]
 
 
+def test_what_a_placeholder_loses_has_an_interval(asked):
+    _, question = asked
+    every = {hypothesis.key: hypothesis for hypothesis in question.problem.hypotheses}
+    armature = every["armature@elbow"]
+    (number,) = np.flatnonzero(armature.directions[0])
+    axes = list(question.rig.axes)
+    # More than any effect adds is the model's own.
+    axes[number] = replace(axes[number], least=-2.0)
+    rig = SimpleNamespace(axes=axes, effects=question.rig.effects)
+    free = Free(armature.directions, np.ones(1), np.array([[-2.0, 5.0]]), np.array([False]))
+    fit = Fit(free, np.array([-1.99]), np.zeros(0), np.zeros((0, 1)), None)
+    effect = _effect(rig, AcceptedTerm(armature, EVIDENCE, Thresholds(10.0)), fit, np.array([0.01]))
+    got = effect["parameters"]["kg_m2"]
+    assert [got[name] / axes[number].scale for name in ("low", "value", "high")] == pytest.approx(
+        [-2.0, -1.99, -1.99 + 0.0196]
+    )
+
+
 def test_a_delay_that_is_filtered_has_two_times(asked):
     log, question = asked
     every = {hypothesis.key: hypothesis for hypothesis in question.problem.hypotheses}

@@ -287,6 +287,31 @@ def test_a_nominal_parameter_that_stops_at_its_bound_is_a_finding():
         assert workflow.discover(asked, Settings(strained=strained, much=much)).verdict == verdict
 
 
+@pytest.mark.parametrize("spent, verdict", [(True, "parameter_change"), (False, "unnamed")])
+def test_a_model_may_lose_all_that_it_has_of_its_own(spent, verdict):
+    # Its damping is a placeholder: the slider has a hundredth of it. A fit that ends at a bound says nothing elsewhere.
+    damping = replace(HYPOTHESES[1], bounds=np.array([[-0.99, 5.0]]), spent=spent)
+    result = workflow.discover(problem({"damping": -1.0}, hypotheses=(HYPOTHESES[0], damping, *HYPOTHESES[2:])))
+    assert result.verdict == verdict
+    assert [term.hypothesis.name for term in result.terms] == ["damping"] * spent
+    assert ("damping" in [one.hypothesis.name for one in result.dropped]) is not spent
+
+
+def test_what_a_model_has_of_its_own_is_taken_away_alone_and_together():
+    asked = problem({})
+    _, begun = state.begin(asked, measured_floor(asked))
+    mass, damping = (replace(one, spent=True) for one in HYPOTHESES[:2])
+    small = replace(HYPOTHESES[2], spent=True, bounds=np.array([[-0.1, 5.0]]))
+    one_place = replace(damping, places=())
+    found = leads.without_own(begun.nominal, [mass, one_place, damping, small, HYPOTHESES[3], EACH], 7.0)
+    # The one at most places counts. Of what is little, or no part of the model, nothing is taken.
+    assert [(lead.hypotheses, lead.point.tolist(), lead.cost) for lead in found] == [
+        ((damping,), [-0.81], 7.0),
+        ((mass,), [-0.9], 7.0),
+        ((damping, mass), [-0.81, -0.9], 7.0),
+    ]
+
+
 @pytest.mark.parametrize("others, rivals", [((), ()), ((DRAG,), ("drag",))])
 def test_what_brakes_as_damping_does_may_be_there_in_its_place(others, rivals):
     # Damping is a parameter and costs less, so beside it a drag gains nothing.
