@@ -76,7 +76,7 @@ def _bristles(chain, model, data, values, segment, inputs) -> dict:
     position = segment.past[0]
     # Other inputs, as gains and limits, are those of the history's first step.
     still = jnp.zeros_like(position)
-    inputs = inputs | {"target": segment.past_target[0], "between": still, "feed": segment.past_feed}
+    inputs = inputs | {"target": segment.past_told, "between": still, "feed": segment.past_feed}
     # Undoing a lag takes a slope, so it needs more rows than one.
     rest = _undone(chain, values, jnp.tile(jnp.stack([position, still]), (3, 1, 1)))[0]
     memory, torque = history.remember(chain, values, chain.start(values, rest, inputs), rest, inputs)

@@ -13,7 +13,7 @@ import jax
 import numpy as np
 
 from envs.clock import SAME_S, Clock, clock_of
-from envs.effects.memory import LONGEST_S, PAST_STEP_S, PAST_TARGET_STEP_S
+from envs.effects.memory import LONGEST_S, PAST_STEP_S, PAST_TARGET_S
 from envs.logs import Run
 from envs.readings import aligned, hermite, noise, quantum_of
 from envs.smoothing import lateness, smoothed
@@ -41,7 +41,7 @@ INPUTS = ("target", "between", "feed", "stiffness", "damping", "limit", "emf", "
 HISTORY_S = LONGEST_S + 0.02
 """Length of the history before a segment, in s: the longest delay and some time for lags to settle."""
 
-_PAST_S = 2.0  # how far back before the history positions and targets are kept
+_PAST_S = 2.0  # how far back before the history positions are kept
 
 
 @chex.dataclass(frozen=True)
@@ -68,8 +68,8 @@ class Segment:
     # the bristles of dry friction; in slow motion the history alone is too short for that. At the first of them
     # bristles balance all other torques.
     past: jax.Array
-    # [past targets, joints] rad, every 2 ms in the same time. A limit of their slew may still be far behind them.
-    past_target: jax.Array
+    past_target: jax.Array  # [past targets, joints] rad, at the times `envs.effects.memory.PAST_TARGET_S`
+    past_told: jax.Array  # [joints] rad, the target at the first of `past`
     past_feed: jax.Array  # [joints] Nm, torque that was sent directly at the first of `past`
     row_step: jax.Array  # [rows] the last step at or before each row; 0 is the segment's start
     row_share: jax.Array  # [rows] share of a step between that step and the row
@@ -248,10 +248,9 @@ def _of_run(run: Run, states: np.ndarray, start: np.ndarray, rows: np.ndarray, a
     # delay of whole rows would then seem likelier than any other.
     acceleration = np.gradient(velocity, run.time, axis=0)
     between_rows = [hermite(run.time, *pair, fine)[0] for pair in ((position, velocity), (velocity, acceleration))]
-    past, told_before = (
-        first[start][:, None] - HISTORY_S + step_s * np.arange(-round(_PAST_S / step_s), 1)
-        for first, step_s in ((run.time, PAST_STEP_S), (clock.rows, PAST_TARGET_STEP_S))
-    )
+    past = begin - HISTORY_S + PAST_STEP_S * np.arange(-round(_PAST_S / PAST_STEP_S), 1)
+    told_before = clock.rows[start] - HISTORY_S - _PAST_S
+    told_past = told_before[:, None] + _PAST_S + PAST_TARGET_S
     return Segment(
         target=target,
         between=between,
@@ -260,8 +259,9 @@ def _of_run(run: Run, states: np.ndarray, start: np.ndarray, rows: np.ndarray, a
         sample=np.diff(ticks, axis=1, prepend=-np.inf) > 0,
         measured=np.stack(between_rows, axis=2).astype(np.float32),
         past=hermite(run.time, position, velocity, past)[0].astype(np.float32),
-        past_target=_between_rows(run, run.signals.get("target"), clock, told_before)[0],
-        past_feed=_between_rows(run, run.sent_torque(), clock, told_before[:, 0])[0],
+        past_target=_between_rows(run, run.signals.get("target"), clock, told_past)[0],
+        past_told=_between_rows(run, run.signals.get("target"), clock, told_before)[0],
+        past_feed=_between_rows(run, run.sent_torque(), clock, told_before)[0],
         row_step=step,
         row_share=np.clip(at - step, 0.0, 1.0).astype(np.float32),
     )

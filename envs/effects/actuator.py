@@ -8,7 +8,7 @@ separates it from the others.
 import jax
 import jax.numpy as jnp
 
-from envs.effects.memory import LONGEST_S, PAST_TARGET_STEP_S, as_it_is, delay_line, delayed, lagged
+from envs.effects.memory import LONGEST_S, PAST_TARGET_S, as_it_is, delay_line, delayed, lagged
 from jaxtune.types import Effect, Form, Parameter
 
 _ACTUATOR = {"family": "actuator", "on": "joint"}
@@ -79,7 +79,8 @@ def _followed(values, targets, dt):
     targets = jnp.atleast_2d(targets)
     # Takes time only where there is a limit.
     begin = jnp.where((values["rad_per_s"] > 0).any(), 1, len(targets))
-    follow = lambda index, limited: _nearer(values, limited, targets[index], PAST_TARGET_STEP_S)  # noqa: E731
+    steps = jnp.diff(PAST_TARGET_S, prepend=PAST_TARGET_S[0])
+    follow = lambda index, limited: _nearer(values, limited, targets[index], steps[index])  # noqa: E731
     start = jnp.where(values["rad_per_s"] > 0, targets[0], targets[-1])
     return jax.lax.fori_loop(begin, len(targets), follow, start)
 

@@ -5,6 +5,7 @@ Each has a function that starts it in steady state and one that advances it by a
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 LONGEST_S = 0.1
 """Longest delay that a line can hold, in s. Simulations start with at least as much history (`envs.segments`)."""
@@ -12,8 +13,9 @@ LONGEST_S = 0.1
 PAST_STEP_S = 0.01
 """Time in s between the positions that lead to the history of a segment (`envs.segments`)."""
 
-PAST_TARGET_STEP_S = 0.002
-"""The same between targets, which may jump."""
+PAST_TARGET_S = np.concatenate([np.arange(-1000, 0) * 0.01, np.arange(1001) * 0.002]) - 2.0
+"""[past targets] times of past targets in s, seen from the start of a segment's history. Targets may jump, so the last
+ones are close. A slow limit of their slew may be behind them for many seconds."""
 
 
 def as_it_is(values, signal: jax.Array, dt: float) -> jax.Array:

@@ -110,7 +110,7 @@ def told_alike(null: Cuts, measured: Cuts, follows: bool = False) -> Cuts:
       measured: segments of the log that it imitates.
       follows: whether targets follow from a log's own readings (`envs.following`).
     """
-    own_fields = ("measured", "past", *(("target", "past_target") if follows else ()))
+    own_fields = ("measured", "past", *(("target", "past_target", "past_told") if follows else ()))
     return {
         split: {
             horizon: replace(

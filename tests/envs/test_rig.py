@@ -235,9 +235,10 @@ def test_bristles_of_a_segment_are_where_its_motion_has_wound_them(arm):
     target = START + np.concatenate([np.linspace(0.0, 0.06, 2000), np.linspace(0.06, 0.0, 2000)])[:, None]
     cut = recut(arm, target, **RUBBING)
     # As if each segment's history began with a robot that had always been there.
+    past = cut.segments.past
     stayed = {
-        name: np.repeat(values[:, -1:], values.shape[1], axis=1)
-        for name, values in (("past", cut.segments.past), ("past_target", cut.segments.past_target))
+        "past": np.repeat(past[:, -1:], past.shape[1], axis=1),
+        "past_told": np.asarray(cut.segments.past_target)[:, -1],
     }
     unwound = replace(cut, segments=cut.segments.replace(**stayed))
     assert np.ptp(cut.signals["q"], axis=(0, 1)).min() > 0.03
@@ -289,7 +290,7 @@ def test_a_robot_that_has_just_come_to_rest_is_not_balanced(arm, plain):
     segment = rigs.segment(arm.rig, START, target, kp=KP, kd=[0.4, 0.2])
     # Through some of its bristles' travel, from where it was.
     came = segment.past + np.array([[-1e-3, 1e-3], [0.0, 0.0]], np.float32)
-    read = arm.play(segment.replace(past=came, past_target=segment.past_target + came[0] - START), **RUBBING)
+    read = arm.play(segment.replace(past=came, past_told=segment.past_told + came[0] - START), **RUBBING)
     assert np.ptp(read["q"], axis=0).min() > 1e-4
 
 
@@ -306,6 +307,8 @@ SWING = np.array([0.4, -0.5]) + np.array([0.3, 0.4]) * np.sin(2 * np.pi * np.arr
         ("command_delay", {"seconds": 0.1}, 0.3e-3),
         ("torque_lag", {"seconds": 0.008}, 0.3e-3),
         ("target_slew", {"rad_per_s": 1.0}, 4e-3),
+        # It is behind throughout.
+        ("target_slew", {"rad_per_s": 0.3}, 1.5e-3),
         ("backlash", {"rad": 0.02}, 1e-3),
         ("backlash", {"rad": 0.005}, 0.8e-3),
         ("compliance", {"nm_per_rad": 200.0}, 2e-3),

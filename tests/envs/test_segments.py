@@ -395,16 +395,18 @@ def test_targets_between_rows_are_held_or_lines_or_unknown(moving):
     np.testing.assert_allclose(line[0, :150, 0] - line[0, 0, 0], first[:150], atol=1e-3)
 
 
-def test_targets_of_two_seconds_lead_to_a_segment():
-    time = times(4.0)
+def test_targets_of_twelve_seconds_lead_to_a_segment():
+    time = times(20.0)
     number = np.arange(len(time), dtype=float)[:, None] * [1.0, -1.0]
     cut = segments.cut([run(time, target=number)], 0.15, DT)
     past, first = np.asarray(cut.segments.past_target), np.asarray(cut.segments.target)[:, 0]
-    assert past.shape[1:] == (1001, 2)
+    assert past.shape[1:] == (2001, 2)
     np.testing.assert_array_equal(past[:, -1], first)
-    # A row holds for 5 ms, and the first one counts from long ago.
-    rows = np.floor(first[:, None, 0] - 0.4 * np.arange(1000, -1, -1) + 1e-6)
+    # A row holds for 5 ms, and the first one counts from long ago. Steps are of 10 ms, and of 2 ms in the last 2 s.
+    seconds = np.concatenate([2.0 + 0.01 * np.arange(1000, 0, -1), 0.002 * np.arange(1000, -1, -1)])
+    rows = np.floor(first[:, None, 0] - 200.0 * seconds + 1e-6)
     np.testing.assert_array_equal(past[..., 0], np.maximum(rows, 0.0))
+    np.testing.assert_array_equal(cut.segments.past_told[:, 0], np.maximum(first[:, 0] - 400.0, 0.0))
 
 
 def test_a_segment_knows_the_torque_that_was_sent_where_its_past_begins():
