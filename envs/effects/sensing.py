@@ -44,32 +44,48 @@ def _undo_delay(values, readings, dt):
 
 
 def _sensor_lag(values, readings, now, memory):
-    """seconds d readings' / dt = readings - readings'; velocities may have a shorter time constant than positions."""
-    return filtered(memory, readings, _time_constants(values), now.dt)
+    """seconds d readings' / dt = readings - readings', or two such stages whose times add up to `seconds`.
+
+    Velocities may have shorter times than positions.
+    """
+    first, second = _stages(values)
+    between, memory_1 = filtered(memory[0], readings, first, now.dt)
+    readings, memory_2 = filtered(memory[1], between, second, now.dt)
+    return readings, jnp.stack([memory_1, memory_2])
 
 
-def _time_constants(values):
-    """Of positions and velocities, [2, joints] s."""
-    return values["seconds"] * jnp.stack([jnp.ones_like(values["seconds"]), 1.0 - values["velocity_faster"]])
+def _stages(values):
+    """Time constants of both stages, of positions and velocities, [2, 2, joints] s; both are equal at the most."""
+    seconds, second = values["seconds"], 0.5 * values["second_stage"]
+    seconds = seconds * jnp.stack([jnp.ones_like(seconds), 1.0 - values["velocity_faster"]])
+    return jnp.stack([(1.0 - second) * seconds, second * seconds])
 
 
 def _behind(values, readings, dt):
     """Starts a lag one step before the readings of a joint that has always moved at one speed."""
     before = readings.at[0].add(-dt * readings[1])
-    return jnp.stack([before.at[0].add(-values["seconds"] * readings[1]), before])
+    first, second = _stages(values)[:, 0] * readings[1]
+    between = before.at[0].add(-first)
+    return jnp.stack([jnp.stack([between, before]), jnp.stack([between.at[0].add(-second), between])])
 
 
 def _undo_lag(values, readings, dt):
-    """readings = readings' + seconds d readings' / dt; slopes span 20 ms, as a step's are mostly noise.
+    """readings = readings' + (t1 + t2) d readings' / dt + t1 t2 d2 readings' / dt2, with both stages' time constants.
 
-    Of both alike: recorded velocities that do not agree with positions are not used, and those of a state follow from
-    its positions.
+    Slopes span 20 ms, as a step's are mostly noise. Of both signals alike: recorded velocities that do not agree with
+    positions are not used, and those of a state follow from its positions.
     """
+    second = 0.5 * values["second_stage"]
+    slope = _slope(readings, dt)
+    both = second * (1.0 - second) * values["seconds"] ** 2
+    return readings + values["seconds"] * slope + both * _slope(slope, dt)
+
+
+def _slope(readings, dt):
     count, half = len(readings), round(_HALF_SLOPE_S / dt)
     at = np.arange(count)
     after, before = np.minimum(at + half, count - 1), np.maximum(at - half, 0)
-    slope = (readings[after] - readings[before]) / ((after - before) * dt)[:, None, None]
-    return readings + values["seconds"] * slope
+    return (readings[after] - readings[before]) / ((after - before) * dt)[:, None, None]
 
 
 def _velocity_lag(values, readings, now, memory):
@@ -126,7 +142,11 @@ ROWS = (
         name="sensor_lag",
         on="joint",
         enters="sensor",
-        parameters=(_SECONDS, Parameter(name="velocity_faster", bounds=(0.0, 1.0), prior=1.0)),
+        parameters=(
+            _SECONDS,
+            Parameter(name="velocity_faster", bounds=(0.0, 1.0), prior=1.0),
+            Parameter(name="second_stage", bounds=(0.0, 1.0), prior=3.0, shape=True),
+        ),
         sizes=(0.001, 0.008),
         act=_sensor_lag,
         start=_behind,
@@ -135,7 +155,7 @@ ROWS = (
             Form("delayed", "sensor_delay", ("seconds",)),
             Form("fast_velocity", "sensor_lag", ("velocity_faster",)),
         ),
-        sentence="Positions and velocities are read through a low-pass filter, which may be faster for velocities.",
+        sentence="Positions and velocities are read through a low-pass filter of one or two stages.",
         excited_by="a chirp to 10 Hz at two controller gains",
         **_SENSING,
     ),

@@ -45,8 +45,8 @@ class Evidence:
     """95 % interval of the coordinate that is clearest of zero, of the effect or of its forms: where damping is free
     under every hypothesis, friction with the square of speed is what may be missing."""
     inside: bool
-    """True if all coordinates are inside their bounds; of sizes for each place, the one that is clearest of zero. A
-    model may lose all that it has (`Hypothesis.spent`): dampings and rotors of many are placeholders."""
+    """True if all sizes are inside their bounds; of sizes for each place, the one that is clearest of zero. A model may
+    lose all that it has (`Hypothesis.spent`): dampings and rotors of many are placeholders."""
     horizons: int
     """Number of horizons at which `train` and `select` cost less with it, prior included."""
     size: float
@@ -102,6 +102,8 @@ def weigh_evidence(
     (_, clearest, _, _), (_, _, value, error) = clear[0], max(clear)
     values, (low, high) = fit.coordinates[fit.along(hypothesis)], hypothesis.bounds.T
     inside = ((low < values) | hypothesis.spent) & (values < high)
+    # What only shapes an effect says nothing where it ends: a filter may have one stage.
+    inside |= ~(hypothesis.probes != 0).any(axis=0)
     relief = ablated.fit.penalty - fit.penalty
     mean_squares = [finite(one) / at.counts.bins for one in (before, now)]
     falls = [_largest_fall(*(measure(one) for one in mean_squares)) for measure in measures(at)]

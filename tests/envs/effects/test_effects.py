@@ -138,8 +138,8 @@ def test_a_coordinate_is_the_inverse_of_a_value(parameter, scale):
 @pytest.mark.parametrize("parameter", PARAMETERS)
 def test_a_coordinate_of_zero_is_no_effect(parameter):
     inner = parameter.inner(0.0, 0.3)
-    # What only shapes an effect has a value all the same: its scale.
-    np.testing.assert_allclose(inner, 0.3 if parameter.shape else 0.0, rtol=1e-6)
+    # What only shapes an effect may have a value all the same: its scale.
+    np.testing.assert_allclose(inner, 0.3 if parameter.shape and parameter.form == "ratio" else 0.0, rtol=1e-6)
 
 
 @pytest.mark.parametrize("row", ACTING, ids=lambda row: row.name)
@@ -557,13 +557,22 @@ def test_a_late_sensor_reads_positions_and_velocities_late():
     np.testing.assert_allclose(got[12:, :, 1], readings[:-12, :, 1], atol=1e-5)
 
 
-def test_a_lagging_sensor_is_behind_a_ramp_by_its_time_constant():
+@pytest.mark.parametrize("second_stage", [0.0, 0.6, 1.0])
+def test_a_lagging_sensor_is_behind_a_ramp_by_its_time_constant(second_stage):
     # 2 rad/s x 0.01 s, from the start on, since it came with that speed.
     time = DT * np.arange(300)
     ramp = np.stack([2.0 * time, np.full(300, 2.0)], axis=1)[:, :, None] * np.ones(JOINTS)
-    got = series("sensor_lag", ramp, seconds=0.01)
-    np.testing.assert_allclose(ramp[:, 0] - got[:, 0], 0.02, rtol=1e-4)
+    got = series("sensor_lag", ramp, seconds=0.01, second_stage=second_stage)
+    np.testing.assert_allclose(ramp[:, 0] - got[:, 0], 0.02, rtol=2e-4)
     np.testing.assert_allclose(got[:, 1], 2.0, rtol=1e-6)
+
+
+def test_a_filter_of_two_stages_is_one_behind_the_other():
+    once = series("sensor_lag", motion(), seconds=0.005)
+    twice = series("sensor_lag", once, seconds=0.005)
+    got = series("sensor_lag", motion(), seconds=0.01, second_stage=1.0)
+    # Until their starts are forgotten.
+    np.testing.assert_allclose(got[100:], twice[100:], atol=2e-5)
 
 
 def test_a_filter_of_positions_alone_or_of_velocities_alone():
@@ -584,6 +593,7 @@ def test_a_filter_of_positions_alone_or_of_velocities_alone():
         ("encoder_bias", {"rad": [0.03, -0.05]}),
         ("sensor_delay", {"seconds": [0.0124, 0.031]}),
         ("sensor_lag", {"seconds": [0.008, 0.02]}),
+        ("sensor_lag", {"seconds": [0.008, 0.02], "second_stage": 1.0}),
     ],
 )
 def test_what_a_sensor_did_is_undone(name, physical):
