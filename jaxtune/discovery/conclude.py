@@ -84,8 +84,7 @@ def conclude(settings: Settings, problem: Problem, floor: NoiseFloor, state: Sta
     changed = _at_bounds(problem, best.fit, state.price) if explains else {}
     explains = explains and (len(changed) < settings.strained or usual[1].max() < settings.much)
     verdict = _verdict(problem, terms, changed) if explains else "unnamed"
-    if verdict != "unnamed" and changed:
-        say("rivals of a parameter")
+    if verdict != "unnamed":
         changed = {
             axis: replace(change, confusable_with=instead(settings, problem, at, state, best, axis))
             for axis, change in changed.items()

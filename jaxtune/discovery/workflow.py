@@ -31,7 +31,6 @@ _STAGES = {
     "fit": 0.63,
     "evidence": 0.89,
     "learned torque": 0.93,
-    "rivals of": 0.95,
     "proof": 0.96,
 }
 _REPEATED = ("screen", "answers of", "fit")
