@@ -127,6 +127,7 @@ def unknown_directions(
     signals: Sequence[str] = (),
     follows: bool = False,
     centres: Mapping[str, np.ndarray] = MappingProxyType({}),
+    filter_s: float = 0.0,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Returns directions in the rig's coordinates along what neither log nor model says, and their bounds.
 
@@ -146,6 +147,8 @@ def unknown_directions(
       follows: whether the controller is one that follows measured motion (`envs.following`), of which all is known.
         What it asks for was measured, by sensors of unknown scale and offset.
       centres: by how much links' centres of mass may be off (`envs.rig.Rig.loose_centres`).
+      filter_s: time constant of the filter that the log says its velocities went through. The controller may have acted
+        on them.
 
     Returns:
       [unknowns, axes] of the size of half a period, of a quarter of a simulator's step, of half of the way between rows
@@ -156,7 +159,8 @@ def unknown_directions(
     common = {"sensor_delay": 0.5 / control_hz, "holding": _HOLDING}
     common |= {} if follows else {"command_delay": 0.5 / control_hz, "target_between_rows": 0.5}
     # Velocities of positions that were read before and now are those of half of the time in between.
-    common |= {"velocity_lag": 0.5 / control_hz} if "dq" in signals else {}
+    latest = ("dq" in signals) / control_hz + (0.0 if follows else filter_s)
+    common |= {"velocity_lag": 0.5 * latest} if latest else {}
     found = [([size * (axis.effect == effect) for axis in axes], (0.0, 2.0)) for effect, size in common.items()]
     # Semi-implicit Euler has positions of half a step after its velocities, and no step is longer than a period.
     lead = 0.25 * min(1.0 / control_hz, _LONGEST_SIMULATED_S)

@@ -255,6 +255,16 @@ def stale_notes(runs: Sequence[Run]) -> list[str]:
     return notes
 
 
+def velocity_filter_s(log: Log) -> float:
+    """Time constant in s of the filter that a log says its velocities went through; zero where it says nothing.
+
+    The controller may act on the velocities that were recorded, or on others.
+    """
+    corners = [corner for run in log.runs if "dq" in run.signals for corner in run.fact("dq", "filter_hz")]
+    known = [corner for corner in corners if np.isfinite(corner)]
+    return 1.0 / (2.0 * np.pi * min(known)) if known else 0.0
+
+
 def _drop_declared(log: Log) -> tuple[Log, list[str]]:
     """Leaves out signals of which the log says that they were filtered; notes say which."""
     notes = []

@@ -25,6 +25,7 @@ from experiments.discovery.measured import (
     drop_useless,
     on_read_times,
     stale_notes,
+    velocity_filter_s,
     without_sealed,
 )
 from jaxtune.discovery.problem import Problem
@@ -103,6 +104,7 @@ def build_question(
     horizons = fitting_horizons(log, horizons)
     rate = check_simulatable(log, spec, horizons)
     log, moved = on_read_times(with_splits(log))
+    filter_s = velocity_filter_s(log)
     log, notes = drop_useless(log)
     log = replace(log, runs=readings.with_noise(log.runs, without_sealed(log).runs))
     controller, ours = log.runs[0].controller.kind, follower(without_sealed(log), spec)
@@ -124,7 +126,7 @@ def build_question(
         system=plain.system,
         values=rig.inner,
         axes=len(rig.axes),
-        **_free_or_asked(rig, signals, controller, sensed),
+        **_free_or_asked(rig, signals, controller, sensed, filter_s),
         trees=rig.trees,
         axis_trees=np.array([_one_tree(rig.trees[list(axis.joints)]) for axis in rig.axes]),
         data=measured,
@@ -143,13 +145,15 @@ def build_question(
     )
 
 
-def _free_or_asked(rig: Rig, signals: Sequence[str], controller: str, sensed: np.ndarray) -> dict[str, Any]:
+def _free_or_asked(
+    rig: Rig, signals: Sequence[str], controller: str, sensed: np.ndarray, filter_s: float
+) -> dict[str, Any]:
     """What is free under every hypothesis, and what the hypotheses and their forms are: fields of the problem."""
     follows, constants = controller == "unknown", SERVO_RATIOS if controller == "servo" else {}
     told = {name: row for name, row in rig.effects.items() if not follows or tells(row)}
     asked = {name: row for name, row in told.items() if name in LIBRARY}
     every = hypotheses(rig.axes, rig.places, asked, rig.slides)
-    unknowns, bounds = unknown_directions(rig.axes, rig.control_hz, signals, follows, rig.loose_centres())
+    unknowns, bounds = unknown_directions(rig.axes, rig.control_hz, signals, follows, rig.loose_centres(), filter_s)
     shapes = forms(rig.axes, rig.effects, every)
     return {
         "hypotheses": every,

@@ -17,7 +17,7 @@ from envs.null_logs import Robot, as_recorded, play
 from experiments.discovery import playback
 from experiments.discovery.blind_cases import ARM
 from experiments.discovery.cutting import HORIZONS_S, cut_log, fitting_horizons, split_in_time
-from experiments.discovery.measured import drop_useless, read_logs
+from experiments.discovery.measured import drop_useless, read_logs, velocity_filter_s
 from experiments.discovery.question import build_question
 
 MEASURED = Path(__file__).parents[3] / "shared" / "data"
@@ -208,7 +208,10 @@ def test_torques_that_were_sent_are_not_compared(played, spec):
 def test_filters_that_the_log_declares_are_heeded_and_said(played):
     (run,) = played.runs
     known = {"dq": {"filter_hz": np.array([np.nan, 20.0])}, "q": {"filter_hz": np.array([40.0, 40.0])}}
-    log, notes = drop_useless(split_in_time(replace(played, runs=(replace(run, known=known),))))
+    declared = split_in_time(replace(played, runs=(replace(run, known=known),)))
+    assert velocity_filter_s(declared) == pytest.approx(1.0 / (40.0 * np.pi))
+    assert velocity_filter_s(played) == 0.0
+    log, notes = drop_useless(declared)
     assert notes == (
         "q was filtered at 40 Hz, as the log says; the delay is taken out",
         "dq was filtered at 20 Hz, as the log says, and is not used",

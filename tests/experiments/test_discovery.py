@@ -292,6 +292,11 @@ def test_the_travel_of_friction_is_unknown_where_the_model_has_friction(spec):
     moved = [rig.axes[number] for number in np.flatnonzero(lag[4])]
     assert [(axis.effect, axis.place) for axis in moved] == [("velocity_lag", joint) for joint in JOINTS]
     np.testing.assert_allclose(lag[4][lag[4] != 0] * most[4, 1], 1.0 / 500.0)
+    # A controller may act on velocities that were filtered before they were recorded, unless it is one of ours.
+    for follows, longest in ((False, 0.004 + 1.0 / 500.0), (True, 1.0 / 500.0)):
+        lag, most = unknown_directions(rig.axes, 500.0, ("dq", "q"), follows, filter_s=0.004)
+        (found,) = [row for row in lag if rig.axes[np.flatnonzero(row)[0]].effect == "velocity_lag"]
+        np.testing.assert_allclose(found[found != 0] * most[0, 1], longest)
     # The scale of torques is unknown where they are compared.
     more, _ = unknown_directions(rig.axes, 1000.0, ("abs_tau", "q"))
     np.testing.assert_array_equal(more[:6], directions)
