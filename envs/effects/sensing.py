@@ -82,6 +82,7 @@ def _undo_lag(values, readings, dt):
 
 
 def _slope(readings, dt):
+    """Slopes of readings [steps, 2, joints] over 20 ms, or what there is of that at the ends."""
     count, half = len(readings), round(_HALF_SLOPE_S / dt)
     at = np.arange(count)
     after, before = np.minimum(at + half, count - 1), np.maximum(at - half, 0)

@@ -51,9 +51,9 @@ def instead(
     groups = screened_again(settings, at, held, free, forms, library, state.price)
     leads = shortlist(settings, screen(at, held, groups, price=state.price, pairs=0), state.price)
     most, least = total_cost(at, without, 0.0), total_cost(at, best, 0.0)
-    found: dict[str, float] = {}
+    known, found = {h.key for h in best.hypotheses}, {}
     for one in fit_leads(settings, at, held, best.hypotheses, leads, state.price):
-        name = next(h.name for h in one.effects if h not in best.hypotheses)
+        name = next(h.name for h in one.effects if h.key not in known)
         explained = (most - total_cost(at, one, 0.0)) / max(most - least, 1e-9)
         found[name] = max(found.get(name, 0.0), explained)
     ranked = sorted((name for name, share in found.items() if share > settings.same), key=lambda name: -found[name])
