@@ -289,7 +289,7 @@ def test_a_nominal_parameter_that_stops_at_its_bound_is_a_finding():
 
 @pytest.mark.parametrize("spent, verdict", [(True, "parameter_change"), (False, "unnamed")])
 def test_a_model_may_lose_all_that_it_has_of_its_own(spent, verdict):
-    # Its damping is a placeholder: the slider has a hundredth of it. A fit that ends at a bound says nothing elsewhere.
+    # Its damping is a placeholder: the slider has none. Of anything else, a fit that ends at a bound says nothing.
     damping = replace(HYPOTHESES[1], bounds=np.array([[-0.99, 5.0]]), spent=spent)
     result = workflow.discover(problem({"damping": -1.0}, hypotheses=(HYPOTHESES[0], damping, *HYPOTHESES[2:])))
     assert result.verdict == verdict
