@@ -8,7 +8,7 @@ separates it from the others.
 import jax
 import jax.numpy as jnp
 
-from envs.effects.memory import LONGEST_S, PAST_TARGET_S, as_it_is, delay_line, delayed, lagged
+from envs.effects.memory import LONGEST_S, PAST_TARGET_S, delay_line, delayed, lagged, two_stages
 from jaxtune.types import Effect, Form, Parameter
 
 _ACTUATOR = {"family": "actuator", "on": "joint"}
@@ -62,15 +62,31 @@ def _last_target(values, targets, dt):
 
 
 def _target_slew(values, target, now, memory):
-    """d target' / dt = clip((target - target') / dt, -rate, rate); `values` hold 1 / rate."""
-    # The memory is the limited target itself.
+    """A target that moves at `rate` at most, and takes `ramp_s` seconds to reach that speed; `values` hold 1 / rate.
+
+    Of a target that stays, a ramp makes the trapezoid of a drive's profile: target' speeds up with the acceleration
+    rate / ramp_s, moves at the rate, and slows down so that it ends at rest. Without one it is
+
+        d target' / dt = clip((target - target') / dt, -rate, rate).
+    """
     memory = _nearer(values, memory, target, now.dt)
-    return memory, memory
+    return memory[0], memory
 
 
 def _nearer(values, limited, target, dt):
-    step = dt / jnp.maximum(values["rad_per_s"], 1e-9)
-    return limited + jnp.clip(target - limited, -step, step)
+    """Limited targets and their speeds [2, joints], after a step."""
+    inverse = jnp.maximum(values["rad_per_s"], 1e-9)
+    far = target - limited[0]
+    ramps = (values["rad_per_s"] > 0) & (values["ramp_s"] > 0)
+    acceleration = 1.0 / (inverse * jnp.maximum(values["ramp_s"], 1e-9))
+    # How fast it may be to come to rest at the target in whole steps: speed^2 + speed acceleration dt = 2 acceleration
+    # distance.
+    step = 0.5 * acceleration * dt
+    brakes = jnp.sqrt(step**2 + 2.0 * acceleration * jnp.abs(far)) - step
+    most = jnp.where(ramps, jnp.minimum(1.0 / inverse, brakes), 1.0 / inverse)
+    change = jnp.where(ramps, acceleration * dt, jnp.inf)
+    moved = jnp.clip(jnp.clip(far, -dt * most, dt * most), dt * (limited[1] - change), dt * (limited[1] + change))
+    return jnp.stack([limited[0] + moved, moved / dt])
 
 
 def _followed(values, targets, dt):
@@ -82,7 +98,7 @@ def _followed(values, targets, dt):
     steps = jnp.diff(PAST_TARGET_S, prepend=PAST_TARGET_S[0])
     follow = lambda index, limited: _nearer(values, limited, targets[index], steps[index])  # noqa: E731
     start = jnp.where(values["rad_per_s"] > 0, targets[0], targets[-1])
-    return jax.lax.fori_loop(begin, len(targets), follow, start)
+    return jax.lax.fori_loop(begin, len(targets), follow, jnp.stack([start, jnp.zeros_like(start)]))
 
 
 def _deadband(values, error, now, memory):
@@ -92,8 +108,17 @@ def _deadband(values, error, now, memory):
 
 
 def _torque_lag(values, torque, now, memory):
-    """seconds d torque' / dt = torque - torque'."""
-    return lagged(memory, torque, values["seconds"], now.dt)
+    """seconds d torque' / dt = torque - torque', or two such lags whose times add up to `seconds`."""
+    first, second = two_stages(values["seconds"], values["second_stage"])
+    between, memory_1 = lagged(memory[0], torque, first, now.dt)
+    torque, memory_2 = lagged(memory[1], between, second, now.dt)
+    return torque, jnp.stack([memory_1, memory_2])
+
+
+def _steady(values, torque, dt):
+    """Starts both lags with a torque that has always been the same."""
+    del values, dt
+    return jnp.stack([torque, torque])
 
 
 _HARDEST = 0.02  # softness below which powers leave single precision
@@ -109,7 +134,7 @@ ROWS = (
         sizes=(0.001, 0.008),
         act=_command_delay,
         start=_last_target,
-        forms=(Form("filtered", "torque_lag", ("seconds",)),),
+        forms=(Form("filtered", "torque_lag"),),
         sentence="Targets act later than they are sent.",
         excited_by="steps and a chirp to 10 Hz at two controller gains",
         **_ACTUATOR,
@@ -117,8 +142,12 @@ ROWS = (
     Effect(
         name="target_slew",
         enters="command",
-        parameters=(Parameter(name="rad_per_s", form="reciprocal", scale="speed", bounds=(0.0, 3.0), prior=0.5),),
+        parameters=(
+            Parameter(name="rad_per_s", form="reciprocal", scale="speed", bounds=(0.0, 3.0), prior=0.5),
+            Parameter(name="ramp_s", bounds=(0.0, 1.0), prior=0.1),
+        ),
         sizes=(0.05, 0.6),
+        forms=(Form("ramped", "target_slew", ("ramp_s",), screened=True),),
         act=_target_slew,
         start=_followed,
         sentence="The controller limits how fast its target may move.",
@@ -177,10 +206,13 @@ ROWS = (
     Effect(
         name="torque_lag",
         enters="torque",
-        parameters=(_LAG_SECONDS,),
+        parameters=(
+            _LAG_SECONDS,
+            Parameter(name="second_stage", bounds=(0.0, 1.0), prior=3.0, shape=True),
+        ),
         sizes=(0.001, 0.008),
         act=_torque_lag,
-        start=as_it_is,
+        start=_steady,
         forms=(Form("delayed", "command_delay", ("seconds",)),),
         sentence="The motor's torque follows the commanded torque with a lag.",
         excited_by="a chirp to 10 Hz at two controller gains",

@@ -18,15 +18,6 @@ PAST_TARGET_S = np.concatenate([np.arange(-1000, 0) * 0.01, np.arange(1001) * 0.
 ones are close. A slow limit of their slew may be behind them for many seconds."""
 
 
-def as_it_is(values, signal: jax.Array, dt: float) -> jax.Array:
-    """Starts the memory of a lag whose input has always been this signal: the signal itself.
-
-    `values` and `dt` are not used; every effect's `start` takes them.
-    """
-    del values, dt
-    return signal
-
-
 def delay_line(values, signal: jax.Array, dt: float) -> jax.Array:
     """Starts a delay line [steps, ...], newest first, whose input has always been this signal.
 
@@ -91,6 +82,20 @@ def filtered(memory: jax.Array, signal: jax.Array, seconds: jax.Array, dt: float
     before, sample = memory
     after = signal - share * (signal - sample) + stays * (before - sample)
     return after, jnp.stack([after, signal])
+
+
+def two_stages(seconds: jax.Array, second_stage: jax.Array) -> jax.Array:
+    """Divides the time of a filter among two first-order lags, one behind the other.
+
+    Args:
+      seconds: the sum of both time constants, any shape.
+      second_stage: from 0 (a single lag) to 1 (two equal ones), broadcasts against it.
+
+    Returns:
+      Both time constants, the longer one first, [2, ...].
+    """
+    second = 0.5 * second_stage
+    return jnp.stack([(1.0 - second) * seconds, second * seconds])
 
 
 def _decay(seconds: jax.Array, dt: float) -> tuple[jax.Array, jax.Array]:

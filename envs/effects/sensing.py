@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.effects.memory import LONGEST_S, delay_line, delayed, filtered
+from envs.effects.memory import LONGEST_S, delay_line, delayed, filtered, two_stages
 from jaxtune.types import Effect, Form, Parameter
 
 _SENSING = {"family": "sensing"}
@@ -56,9 +56,8 @@ def _sensor_lag(values, readings, now, memory):
 
 def _stages(values):
     """Time constants of both stages, of positions and velocities, [2, 2, joints] s; both are equal at the most."""
-    seconds, second = values["seconds"], 0.5 * values["second_stage"]
-    seconds = seconds * jnp.stack([jnp.ones_like(seconds), 1.0 - values["velocity_faster"]])
-    return jnp.stack([(1.0 - second) * seconds, second * seconds])
+    of_both = jnp.stack([jnp.ones_like(values["seconds"]), 1.0 - values["velocity_faster"]])
+    return two_stages(values["seconds"] * of_both, values["second_stage"])
 
 
 def _behind(values, readings, dt):
@@ -75,10 +74,9 @@ def _undo_lag(values, readings, dt):
     Slopes span 20 ms, as a step's are mostly noise. Of both signals alike: recorded velocities that do not agree with
     positions are not used, and those of a state follow from its positions.
     """
-    second = 0.5 * values["second_stage"]
+    first, second = two_stages(values["seconds"], values["second_stage"])
     slope = _slope(readings, dt)
-    both = second * (1.0 - second) * values["seconds"] ** 2
-    return readings + values["seconds"] * slope + both * _slope(slope, dt)
+    return readings + values["seconds"] * slope + first * second * _slope(slope, dt)
 
 
 def _slope(readings, dt):
@@ -134,7 +132,7 @@ ROWS = (
         act=_sensor_delay,
         start=delay_line,
         undo=_undo_delay,
-        forms=(Form("filtered", "sensor_lag", ("seconds",)),),
+        forms=(Form("filtered", "sensor_lag", ("seconds", "second_stage")),),
         sentence="Positions and velocities are read late.",
         excited_by="a chirp to 10 Hz at two controller gains",
         **_SENSING,

@@ -387,6 +387,37 @@ def test_every_form_moves_the_axes_of_its_parameter_at_the_places_of_its_effect(
     np.testing.assert_array_equal(part.directions, whole.directions)
 
 
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [("sensor_delay", "sensor_lag"), ("command_delay", "torque_lag"), ("coulomb", "stribeck")],
+)
+def test_two_effects_that_are_forms_of_each_other_may_change_names(spec, one, other):
+    from envs.effects import LIBRARY
+    from envs.rig import Rig
+    from jaxtune.discovery.candidate import Candidate
+    from jaxtune.discovery.naming import renamed
+
+    rig = Rig(spec, JOINTS, 1000.0)
+    every = hypotheses(rig.axes, rig.places, {name: LIBRARY[name] for name in (one, other)})
+    asked = SimpleNamespace(hypotheses=every, forms=forms(rig.axes, rig.effects, every))
+
+    def model(name, size, of_form):
+        """A model of an effect at the elbow with the other one as its form."""
+        (effect,) = (h for h in every if h.key == f"{name}@elbow")
+        twin = next(h for h in every if h.key == f"{other if name == one else one}@elbow")
+        (form,) = (f for f in asked.forms if f.shapes(effect) and np.array_equal(f.directions, twin.directions))
+        sizes = np.concatenate([np.full(len(effect.directions), size), np.full(len(form.directions), of_form)])
+        along = {effect.key: np.arange(len(effect.directions)), form.key: np.arange(len(effect.directions), len(sizes))}
+        fit = SimpleNamespace(coordinates=sizes, along=lambda part: along[part.key])
+        return Candidate((effect, form), fit, np.zeros(0))
+
+    for name, twin in ((one, other), (other, one)):
+        assert [h.key for h in renamed(asked, model(name, 0.02, 0.01)).effects] == [f"{name}@elbow"]
+        swapped = renamed(asked, model(name, 0.01, 0.02))
+        assert [h.key for h in swapped.effects] == [f"{twin}@elbow"]
+        assert sorted(bool(h.form) for h in swapped.hypotheses) == [False, True]
+
+
 def test_sizes_hide_what_the_library_has_and_what_it_has_not():
     standard = SIZES["standard"]
     assert (len(standard.hidden), standard.empty, len(standard.outside)) == (48, 40, 10)

@@ -129,13 +129,14 @@ def test_a_delay_that_is_filtered_has_two_times(asked):
     delay = every["sensor_delay@shoulder+elbow"]
     (form,) = [one for one in question.problem.forms if one.form == "filtered" and one.shapes(delay)]
     directions = np.concatenate([delay.directions, form.directions])
-    free = Free(directions, np.ones(2), np.tile([-1.0, 1.0], (2, 1)), np.array([False, False]))
-    fit = Fit(free, np.array([0.012, 0.003]), np.zeros(0), np.zeros((0, 2)), None)
+    free = Free(directions, np.ones(3), np.tile([-1.0, 1.0], (3, 1)), np.array([False] * 3))
+    fit = Fit(free, np.array([0.012, 0.003, 0.4]), np.zeros(0), np.zeros((0, 3)), None)
     terms = (AcceptedTerm(delay, EVIDENCE, Thresholds(10.0), forms=(form,)),)
-    result = found(question, terms=terms, fit=fit, errors=np.array([0.001, 0.001]), changed={}, needs_torque={})
+    result = found(question, terms=terms, fit=fit, errors=np.full(3, 0.001), changed={}, needs_torque={})
     (effect,) = summarise(question, log, Path("logs"), result)["effects"]
     assert effect["parameters"]["seconds"]["value"] == pytest.approx(0.012, rel=1e-5)
     assert effect["parameters"]["filtered.seconds"]["value"] == pytest.approx(0.003, rel=1e-5)
+    assert effect["parameters"]["filtered.second_stage"]["value"] == pytest.approx(0.4, rel=1e-5)
 
 
 def test_the_command_that_decides_can_be_typed_as_it_is(tmp_path, asked):

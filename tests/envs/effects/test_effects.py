@@ -278,7 +278,32 @@ def test_a_slow_controller_is_behind_what_it_was_told_seconds_ago():
     # that leads to the first of these targets, of 2 ms and 10 ms, counts as well.
     past = np.stack([PAST_TARGET_S > -0.301, -1.0 * (PAST_TARGET_S > -5.005)], axis=1)
     got = EVERY["target_slew"].start(values_of(EVERY["target_slew"], rad_per_s=[2.0, 0.1]), jnp.asarray(past), DT)
-    np.testing.assert_allclose(got, [0.604, -0.501], atol=1e-5)
+    np.testing.assert_allclose(got[0], [0.604, -0.501], atol=1e-5)
+    np.testing.assert_allclose(got[1], [2.0, -0.1], rtol=1e-5)
+
+
+def test_a_drive_speeds_up_and_slows_down():
+    # A drive of 2 rad/s and 10 rad/s^2 moves by 1 rad in 0.2 s + 0.3 s + 0.2 s, one without a ramp in 0.5 s. Back by
+    # 0.1 rad it does not reach its speed: 0.1 s up, and 0.1 s down.
+    targets = np.where(np.arange(1200) < 900, 1.0, 0.9)[:, None] * np.ones(JOINTS)
+    got = series("target_slew", targets, start=np.zeros(JOINTS), rad_per_s=2.0, ramp_s=[0.2, 0.0])
+    up = DT * np.arange(1, 201)[:, None]
+    np.testing.assert_allclose(got[:200, :1], 5.0 * up**2, atol=0.002)
+    np.testing.assert_allclose(got[200:400, :1], 0.2 + 2.0 * up, atol=0.002)
+    np.testing.assert_allclose(got[499:699, :1], 1.0 - 5.0 * (0.2 - up) ** 2, atol=0.003)
+    np.testing.assert_allclose(got[700:900, 0], 1.0, atol=1e-4)
+    assert got.max() < 1.0 + 1e-5
+    np.testing.assert_allclose(got[900:1000, 0], 1.0 - 5.0 * up[:100, 0] ** 2, atol=0.002)
+    np.testing.assert_allclose(got[1110:, 0], 0.9, atol=1e-4)
+    np.testing.assert_allclose(got[:500, 1], 0.002 * np.arange(1, 501), atol=1e-5)
+
+
+def test_a_drive_is_where_its_profile_has_brought_it():
+    # Told to move by 1 rad 0.3 s ago, it has come 0.2 rad while it sped up, and 0.2 rad at its speed.
+    past = np.tile((PAST_TARGET_S > -0.301)[:, None], (1, JOINTS))
+    row = EVERY["target_slew"]
+    got = row.start(values_of(row, rad_per_s=2.0, ramp_s=[0.2, 0.0]), jnp.asarray(past, jnp.float32), DT)
+    np.testing.assert_allclose(got, [[0.4, 0.604], [2.0, 2.0]], atol=0.01)
 
 
 def test_a_deadband_swallows_half_its_width_on_each_side():
@@ -366,6 +391,17 @@ def test_a_lagging_torque_rises_as_an_exponential():
     constant, within = np.array([0.01, 0.004]), DT * np.linspace(0.0, 1.0, 1001)[:, None]
     means = [np.trapezoid(1 - np.exp(-(DT * n + within) / constant), within, axis=0) / DT for n in range(50)]
     np.testing.assert_allclose(got[1:], [2.0, -1.0] * np.array(means), atol=1e-5)
+
+
+def test_a_torque_may_lag_behind_in_two_stages():
+    # A step answer of 1 - (T1 exp(-t / T1) - T2 exp(-t / T2)) / (T1 - T2), whose means over a step are those at its
+    # middle, to the square of the step.
+    got = series("torque_lag", np.ones((80, JOINTS)), start=np.zeros(JOINTS), seconds=0.02, second_stage=[0.0, 0.6])
+    time, (long, short) = DT * (np.arange(80) + 0.5), (0.014, 0.006)
+    once = 1.0 - np.exp(-time / 0.02)
+    twice = 1.0 - (long * np.exp(-time / long) - short * np.exp(-time / short)) / (long - short)
+    np.testing.assert_allclose(got, np.stack([once, twice], axis=1), atol=2e-3)
+    assert np.abs(once - twice).max() > 0.05
 
 
 # Transmission: a joint that is held, so that what the motor does is all there is.
