@@ -136,7 +136,7 @@ def test_a_delay_that_is_filtered_has_two_times(asked):
     (effect,) = summarise(question, log, Path("logs"), result)["effects"]
     assert effect["parameters"]["seconds"]["value"] == pytest.approx(0.012, rel=1e-5)
     assert effect["parameters"]["filtered.seconds"]["value"] == pytest.approx(0.003, rel=1e-5)
-    assert effect["parameters"]["filtered.second_stage"]["value"] == pytest.approx(0.4, rel=1e-5)
+    assert effect["parameters"]["second_stage"]["value"] == pytest.approx(0.4, rel=1e-5)
 
 
 def test_the_command_that_decides_can_be_typed_as_it_is(tmp_path, asked):
