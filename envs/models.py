@@ -197,8 +197,7 @@ def suspended(spec: mujoco.MjSpec, joints: Sequence[str] | None = None) -> mujoc
     """
     spec = without_files(spec.copy())
     still = [] if joints is None else held.elements(spec, joints)
-    free = [joint for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_FREE]
-    for element in (*spec.keys, *spec.actuators, *spec.sensors, *spec.pairs, *spec.tuples, *still, *free):
+    for element in (*spec.keys, *spec.actuators, *spec.sensors, *spec.pairs, *spec.tuples, *still, *free_joints(spec)):
         spec.delete(element)
     for joint in spec.joints:
         joint.actgravcomp = False
@@ -208,6 +207,11 @@ def suspended(spec: mujoco.MjSpec, joints: Sequence[str] | None = None) -> mujoc
     model = spec.compile()
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
     return model
+
+
+def free_joints(spec: mujoco.MjSpec) -> list:
+    """Lists the free joints of a robot: those of a base that moves, or hangs on the test rig."""
+    return [joint for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_FREE]
 
 
 def hinges(model: mujoco.MjModel, joints: Sequence[str]) -> np.ndarray:

@@ -31,8 +31,8 @@ from jaxtune.types import Effect, Parameter
 ByEffect = Mapping[str, Mapping[str, jax.Array]]
 """Coordinates or values by effect and parameter, [places] each."""
 
-System = tuple[mjx.Model, mjx.Data, jax.Array]
-"""A robot's model and first state in MJX, and the direction of gravity in its IMU's frame, [3]."""
+System = tuple[mjx.Model, mjx.Data]
+"""A robot's model and first state in MJX."""
 
 # Of the solver. After 100 steps with friction in every joint, positions are 0.05 to 1.4 microrad (rms) from those of a
 # solver that has converged; with three iterations, up to 8.
@@ -98,20 +98,18 @@ class Rig:
         self._data = mjx.make_data(self._model)
         self._scales: Mapping[str, np.ndarray] = {}
         self.slides = tuple(np.array(self.joints)[~hinges(model, self.joints)].tolist())
-        # A robot on a rig has no feet on the ground, so effects of contact have no place and drop out below.
+        # A robot on a rig has no feet on the ground, so what they need has no place and drops out below.
         self.places = {"joint": self.joints, "body": self.bodies, "foot": (), "robot": ("robot",)}
         self.effects = {row.name: row for row in EVERY.values() if self.places[row.on] and row.needs != "free"}
         rows, period_s = tuple(self.effects.values()), 1.0 / control_hz
         self.chain = Chain(self.dt, rows, self.qpos, self.dof, self._bodies, period_s, 0.5 * self.dt, self.trees)
         self.axes = self._describe_axes()
-        # The IMU is taken to sit on the first body, which carries the others.
-        self._gravity = sensing.resting_gravity(model)
 
     @property
     def system(self) -> System:
         """The numbers of this robot, which programs take as an argument; see `on`."""
         # Not on a device yet: a program may run on several.
-        return jax.tree.map(np.asarray, (self._model, self._data, self._gravity))
+        return jax.tree.map(np.asarray, (self._model, self._data))
 
     @property
     def layout(self) -> tuple:
@@ -124,7 +122,7 @@ class Rig:
     def on(self, system: System) -> "Rig":
         """Returns the rig with another robot of the same layout on it, also inside a compiled program."""
         other = copy.copy(self)
-        model, other._data, other._gravity = system
+        model, other._data = system
         # Most frames of bodies are parallel to their parent's. Where the program knows that, on a CPU a step takes 0.6
         # of the time.
         other._model = model.replace(body_quat=self._model.body_quat)
@@ -348,6 +346,7 @@ class Rig:
         step, share = segment.row_step, segment.row_share[:, None]
         following = jnp.minimum(step + 1, len(future["sample"]) - 1)
         read = jax.tree.map(lambda x: x[step] + share * (x[following] - x[step]), read)
-        # The base does not move, so the IMU reads the same at all rows.
-        gravity, _ = chain.stage("gravity", values, self._gravity, None, {})
+        # The base does not move, so the IMU reads the same at all rows. It is taken to sit on the first body, which
+        # carries the others.
+        gravity, _ = chain.stage("gravity", values, sensing.resting_gravity(model), None, {})
         return read | {"gravity": jnp.broadcast_to(gravity, (len(step), 3))}

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from mujoco import mjx
 
 LAYOUT = {
     "velocity": np.full(3, 2.0, np.float32),
@@ -48,11 +49,12 @@ def projected_gravity(quat: jax.Array, down: Sequence[float] = (0.0, 0.0, -1.0))
     return rotate_inverse(quat, jnp.array(down))
 
 
-def resting_gravity(model: mujoco.MjModel) -> jax.Array:
+def resting_gravity(model: mujoco.MjModel | mjx.Model) -> jax.Array:
     """Computes what an IMU on the first body of a robot on a rig reads, a unit vector [3], by the model's gravity."""
-    size = np.linalg.norm(model.opt.gravity)
-    down = model.opt.gravity / size if size > 0 else np.array([0.0, 0.0, -1.0])
-    return projected_gravity(jnp.asarray(model.body_quat[1], jnp.float32), down)
+    gravity = jnp.asarray(model.opt.gravity, jnp.float32)
+    # Without gravity, that of a level ground.
+    gravity = jnp.where((gravity != 0).any(), gravity, jnp.array([0.0, 0.0, -1.0]))
+    return projected_gravity(jnp.asarray(model.body_quat[1], jnp.float32), gravity / jnp.linalg.norm(gravity))
 
 
 def clock(phase: jax.Array) -> jax.Array:

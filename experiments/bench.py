@@ -156,7 +156,7 @@ def rig(args: Args, track: Track) -> dict:
     }
     rows = {}
     for name, (spec, joints) in track(robots.items()):
-        model, start, _ = jax.device_put(Rig(spec, joints, control_hz=200.0).system)
+        model, start = jax.device_put(Rig(spec, joints, control_hz=200.0).system)
         model = model.tree_replace({"opt.ls_iterations": _LINE_SEARCHES})
         poses = start.qpos + np.random.default_rng(0).normal(scale=0.1, size=(_SIDE_BY_SIDE, model.nq))
         found = {}

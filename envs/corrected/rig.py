@@ -13,7 +13,7 @@ import numpy as np
 
 from envs.corrected.record import EFFECTS, MODEL, Effects
 from envs.effects import EVERY
-from envs.models import without_files, write_inertia
+from envs.models import free_joints, without_files, write_inertia
 from envs.rig import Rig
 
 
@@ -31,7 +31,8 @@ def save(folder: Path, spec: mujoco.MjSpec, rig: Rig, vector: np.ndarray) -> Non
     """
     folder.mkdir(parents=True, exist_ok=True)
     (folder / MODEL).write_text(_corrected_spec(spec, rig, vector).to_xml())
-    content = {"joints": list(rig.joints), "control_hz": rig.control_hz, "effects": _physical(rig, vector)}
+    effects = _physical(rig, vector, hung=bool(free_joints(spec)))
+    content = {"joints": list(rig.joints), "control_hz": rig.control_hz, "effects": effects}
     (folder / EFFECTS).write_text(json.dumps(content, indent=1) + "\n")
 
 
@@ -49,15 +50,19 @@ def _corrected_spec(spec: mujoco.MjSpec, rig: Rig, vector: np.ndarray) -> mujoco
         # From the nominal model: on the device every joint has a trace of friction, which MJX needs.
         joint.frictionloss = max(float(model.dof_frictionloss[dof] + values["coulomb"]["torque_nm"][number]), 0.0)
         joint.solimp_friction = np.asarray(device.dof_solimp[dof], float)
+    if any(np.any(value) for value in values["ground_slope"].values()) and not free_joints(spec):
+        spec.option.gravity = np.asarray(device.opt.gravity, float)
     # A spec is written as XML only after it compiled.
     spec.compile()
     return spec
 
 
-def _physical(rig: Rig, vector: np.ndarray) -> dict[str, dict[str, dict[str, float]]]:
+def _physical(rig: Rig, vector: np.ndarray, hung: bool) -> dict[str, dict[str, dict[str, float]]]:
     """Computes physical values, by effect, place and parameter, of the effects that MJCF cannot express."""
     # Coulomb friction is a signal on the rig, but a field (`frictionloss`) in MJCF.
     in_model = {name for name, row in rig.effects.items() if row.enters == "model"} | {"coulomb"}
+    # How a robot hung says nothing of the ground that it will walk on.
+    in_model -= {"ground_slope"} if hung else set()
     # A coordinate of zero means no effect, except for a shape: there zero is a value of its own where the effect acts.
     there = {(axis.effect, axis.place) for axis, coordinate in zip(rig.axes, vector, strict=True) if coordinate}
     effects = {}

@@ -14,6 +14,7 @@ from mujoco import rollout
 
 from envs import held, segments
 from envs.logs import Log, Run
+from envs.models import free_joints
 
 CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 _LONGEST_STEP_S = 0.001
@@ -94,8 +95,7 @@ def playable(spec: mujoco.MjSpec, log: Log) -> mujoco.MjSpec:
     """
     spec = spec.copy()
     still = held.elements(spec, log.joints)
-    free = [joint for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_FREE]
-    for element in (*spec.keys, *spec.actuators, *spec.sensors, *spec.tuples, *still, *free):
+    for element in (*spec.keys, *spec.actuators, *spec.sensors, *spec.tuples, *still, *free_joints(spec)):
         spec.delete(element)
     spec.option.timestep = step_s(log)
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT

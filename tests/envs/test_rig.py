@@ -11,7 +11,7 @@ import pytest
 import reference
 import rigs
 
-from envs import beginning, models, segments, stepping
+from envs import beginning, models, segments, sensing, stepping
 from envs.biteno import constants
 from envs.effects import LIBRARY
 from envs.logs import Controller, Run
@@ -645,6 +645,28 @@ def test_the_imu_reads_gravity_as_it_is_mounted(arm):
     np.testing.assert_allclose(tilted["gravity"][0], [0.02, -0.01, -1.0], atol=3e-4)
 
 
+TURNED = {"roll_rad": 0.2, "pitch_rad": -0.1}
+
+
+def test_a_base_that_is_not_level_moves_as_a_turned_one(arm):
+    turned = rigs.ARM.replace("<worldbody>", '<worldbody><body name="base" quat="1 0 0 0">', 1)
+    spec = mujoco.MjSpec.from_string(turned.replace("</worldbody>", "</body></worldbody>"))
+    rolled, pitched, both = np.zeros(4), np.zeros(4), np.zeros(4)
+    mujoco.mju_axisAngle2Quat(rolled, np.array([1.0, 0.0, 0.0]), TURNED["roll_rad"])
+    mujoco.mju_axisAngle2Quat(pitched, np.array([0.0, 1.0, 0.0]), TURNED["pitch_rad"])
+    mujoco.mju_mulQuat(both, rolled, pitched)
+    spec.body("base").quat = both
+    model = spec.compile()
+    model.opt.timestep = arm.rig.dt
+    segment = rigs.segment(arm.rig, START, steps_of(START), kp=[60.0, 30.0], kd=[0.8, 0.4])
+    read = arm.play(segment, ground_slope={"robot": TURNED})
+    agrees(read, rigs.in_mujoco(arm.rig, model, segment))
+    assert np.abs(read["q"] - arm.play(segment)["q"]).max() > 0.005
+    # Its IMU turns with it.
+    expected = sensing.projected_gravity(jnp.asarray(both, jnp.float32))
+    np.testing.assert_allclose(read["gravity"], [expected] * rigs.STEPS, atol=1e-6)
+
+
 # The model.
 
 FIELDS = (*reference.FIELDS[:9], "body_inertia")
@@ -815,8 +837,8 @@ def test_a_vector_has_its_axes_by_effect_parameter_and_place(arm):
         assert tree[axis.effect][axis.parameter][axis.index] == number
         assert rig.places[rig.effects[axis.effect].on][axis.index] == axis.place
     assert sum(len(places) for effect in tree.values() for places in effect.values()) == len(rig.axes)
-    # A base that is held shows nothing of the ground.
-    assert set(LIBRARY) - set(rig.effects) == {"ground_friction", "ground_compliance", "ground_slope"}
+    # Feet in the air show nothing of the ground.
+    assert set(LIBRARY) - set(rig.effects) == {"ground_friction", "ground_compliance"}
 
 
 def test_physics_reads_values_in_their_units(arm):

@@ -30,8 +30,11 @@ WRONG = {
     "encoder_bias": {"elbow": {"rad": 0.01}},
     "drag": {"lower": {"n_s_per_m": 1.5}},
     "imu_tilt": {"robot": {"pitch_rad": 0.02}},
+    "ground_slope": {"robot": {"roll_rad": 0.03, "pitch_rad": -0.05}},
 }
-IN_THE_MODEL = {"link_mass", "link_inertia", "com_offset", "payload", "armature", "viscous", "coulomb"}
+IN_THE_MODEL = {
+    *("link_mass", "link_inertia", "com_offset", "payload", "armature", "viscous", "coulomb", "ground_slope")
+}
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -89,6 +92,18 @@ def test_what_mujoco_has_a_form_for_is_in_the_mjcf(folder):
     np.testing.assert_allclose(model.dof_armature, [0.01, 0.023], rtol=1e-5)
     np.testing.assert_allclose(model.dof_damping, [0.16, 0.05], rtol=1e-5)
     np.testing.assert_allclose(model.dof_frictionloss, [0.0, 0.07], rtol=1e-5)
+
+
+def test_the_ground_of_a_robot_that_hung_is_not_in_its_model(tmp_path):
+    """Where it walks, the ground is another one; simulated as it hung, it moves as before."""
+    spec = models.spec("biteno")
+    rig = Rig(spec, constants.JOINTS, 1000.0)
+    slope = {"robot": {"roll_rad": 0.03, "pitch_rad": -0.05}}
+    corrected.save(tmp_path, spec, rig, rigs.Player(rig).vector(ground_slope=slope))
+    loaded, vector = corrected.load(tmp_path)
+    np.testing.assert_array_equal(loaded.mj_model.opt.gravity, [0.0, 0.0, -9.81])
+    found = {axis.parameter: value for axis, value in zip(loaded.axes, vector, strict=True) if value}
+    assert found == pytest.approx(slope["robot"], rel=1e-5)
 
 
 @pytest.mark.parametrize("turn", ['quat="0.9 0.1 0.3 -0.2"', 'euler="0.3 0.5 -0.7"'])
