@@ -1,7 +1,7 @@
 """Effects of the ground, which change the model.
 
-Those of the feet show only on a free base. A robot on the test rig does not have them, and discovery lists them as not
-testable.
+Those of the feet show only on a free base. A robot on the test rig does not have them, and discovery lists them as
+not testable.
 """
 
 import jax.numpy as jnp

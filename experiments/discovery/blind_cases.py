@@ -86,8 +86,9 @@ def _spread(names: Sequence[str], count: int) -> tuple[tuple[str, float], ...]:
     return tuple((names[i % len(names)], SEVERITIES[i % len(SEVERITIES)]) for i in range(count))
 
 
-# Where velocities lag they are not compared, so such a log has no severity beside one without the effect.
-_HIDDEN = tuple(name for name, row in LIBRARY.items() if not row.needs and name != "velocity_lag")
+# Where velocities lag they are not compared, so such a log has no severity beside one without the effect. How the base
+# is mounted is no effect of the robot, and has no joint to be found at.
+_HIDDEN = tuple(name for name, row in LIBRARY.items() if not row.needs and row.on != "robot" and name != "velocity_lag")
 _ARM = (str(ARM), ("shoulder", "elbow"), ((40.0, 20.0), (2.0, 0.8), (15.0, 15.0)))
 _BITENO = ("biteno", constants.JOINTS, ((60.0,) * 6, (2.0,) * 6, (60.0,) * 6))
 SIZES = {
