@@ -102,8 +102,11 @@ def _followed(chain, model, data, values, motion, first, memory) -> tuple[mjx.Da
     # Where joints are behind their motors was not measured. It matters, and takes time, only if gears give way.
     gears = {row.name: row.parameters[0].name for row in chain.entering("transmission")}
     gives = jnp.stack([values[name][size] != 0 for name, size in gears.items()]).any(axis=0)
-    pressing = torque - model.dof_armature[chain.dof] * acceleration[:steps]
-    first = first | history.pressed(chain, values, pressing[: round(_PRESSED_S / chain.dt)])
+    shortly = round(_PRESSED_S / chain.dt)
+    speeding = acceleration[:shortly]
+    needed = history.needed(chain, model, still, truth[0], speeding.mean(axis=0))
+    pressing = torque[:shortly] - model.dof_armature[chain.dof] * speeding
+    first = first | history.pressed(chain, values, pressing, needed)
 
     def at(index, data, memory, speeding):
         """The robot at a step of the motion, with accelerations [joints]."""

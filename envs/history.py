@@ -105,12 +105,43 @@ def bristles(chain: Chain, model: mjx.Model, data: mjx.Data, values, memory: dic
     return {row.name: row.start(values[row.name], (carried, past), chain.dt) for row in chain.entering("bristle")}
 
 
-def pressed(chain: Chain, values, torque: jax.Array) -> dict:
-    """Makes the memories of the transmission from torques [steps, joints] Nm on the gears, one step after another.
+def needed(chain: Chain, model: mjx.Model, data: mjx.Data, joint: jax.Array, speeding: jax.Array) -> jax.Array:
+    """Computes the torques with which links move as they were measured, without friction, [joints] Nm.
 
-    A rotor's own acceleration takes a part of the motor's torque, which does not press on the gears.
+    Rotors are left out.
+
+    Args:
+      chain: of the robot.
+      model: of the robot, effects on its fields included.
+      data: of the robot, in any state.
+      joint: positions and velocities, [2, joints].
+      speeding: accelerations, [joints].
     """
-    return {row.name: row.start(values[row.name], torque, chain.dt) for row in chain.entering("transmission")}
+    qpos, qvel = data.qpos.at[chain.qpos].set(joint[0]), data.qvel.at[chain.dof].set(joint[1])
+    there = stepping.placed(model, data.replace(qpos=qpos, qvel=qvel))
+    inertia = mjx.full_m(model, there)[chain.dof][:, chain.dof]
+    moves = inertia @ speeding - model.dof_armature[chain.dof] * speeding
+    return moves + (there.qfrc_bias - there.qfrc_passive)[chain.dof]
+
+
+def pressed(chain: Chain, values, torque: jax.Array, needed: jax.Array) -> dict:
+    """Makes the memories of the transmission from what presses on the gears.
+
+    That is what the motor gives less what rubs there, and also what the link needs and what rubs there. The two differ
+    by all that rubs, of which `at_motor` is the share before the gears. A motor that is off gives nothing; its friction
+    may carry the link all the same, which then lies on the side of the play to which its weight drives it.
+
+    Args:
+      chain: of the robot.
+      values: of the effects.
+      torque: of the motors, less what accelerates the rotors, [steps, joints] Nm, one step after another.
+      needed: of the links, [joints] Nm (`needed`).
+    """
+    found = {}
+    for row in chain.entering("transmission"):
+        mine = values[row.name]
+        found[row.name] = row.start(mine, torque + mine["at_motor"] * (needed - torque), chain.dt)
+    return found
 
 
 def light(chain: Chain, model: mjx.Model, data: mjx.Data) -> jax.Array:

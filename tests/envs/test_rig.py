@@ -11,7 +11,7 @@ import pytest
 import reference
 import rigs
 
-from envs import beginning, models, segments, sensing, stepping
+from envs import beginning, history, models, segments, sensing, stepping
 from envs.biteno import constants
 from envs.effects import LIBRARY
 from envs.logs import Controller, Run
@@ -585,6 +585,49 @@ def pushed(
         data.qfrc_applied[at] += torque
         mujoco.mj_step(model, data)
     return np.array(expected), rigs.segment(arm.rig, start if log_at_joint else motor, target, kp, kd)
+
+
+def test_links_need_the_torques_of_inverse_dynamics(arm, plain):
+    state, speeding = np.array([START, [1.5, -0.8]]), np.array([3.0, -5.0])
+    data = mujoco.MjData(plain)
+    data.qpos[:], data.qvel[:], data.qacc[:] = *state, speeding
+    mujoco.mj_inverse(plain, data)
+    got = arm.run(needed_by, arm.vector(), state.astype(np.float32), speeding.astype(np.float32))
+    np.testing.assert_allclose(got, data.qfrc_inverse - plain.dof_armature * speeding, rtol=1e-4)
+
+
+def needed_by(rig, values, state, speeding):
+    return history.needed(rig.chain, rig.model(values), rig._data, state, speeding)
+
+
+@pytest.mark.parametrize("trend", [-1.0, 1.0])
+def test_a_motor_that_is_off_carries_its_link_by_friction(arm, trend):
+    """The link lies on the side of the play to which its weight drives it, whatever noise says of accelerations."""
+    rubs = {"coulomb": {name: {"torque_nm": 3.0} for name in rigs.ARM_JOINTS}}
+    off = rigs.segment(arm.rig, START, START, limit=0.0)
+    begin = round((segments.HISTORY_S - beginning._GEARS_S) / arm.rig.dt)
+    noise = np.zeros_like(off.measured)
+    noise[begin : begin + 11, 1] = trend * arm.rig.dt * np.arange(-5, 6)[:, None]
+    read = arm.play(off.replace(measured=off.measured + noise), **rubs, backlash={"elbow": PLAY | {"at_motor": 1.0}})
+    # As without play: no link falls, and none meets its motor.
+    np.testing.assert_allclose(read["q"], arm.play(off, **rubs)["q"], atol=2e-4)
+
+
+PLAY = {"rad": 0.04}
+
+
+def test_what_presses_on_gears_is_shared_as_friction_is(arm):
+    torque, needed = np.tile(np.float32([1.0, -1.0]), (10, 1)), np.float32([-0.5, 3.0])
+
+    def start(rig, values, torque, needed):
+        return history.pressed(rig.chain, values, torque, needed)
+
+    for at_motor, pressing in ((0.0, [1.0, -1.0]), (1.0, [-0.5, 3.0]), (0.5, [0.25, 1.0])):
+        play = {name: PLAY | {"at_motor": at_motor} for name in rigs.ARM_JOINTS}
+        spring = {name: {"nm_per_rad": 50.0, "at_motor": at_motor} for name in rigs.ARM_JOINTS}
+        got = arm.run(start, arm.vector(backlash=play, compliance=spring), torque, needed)
+        np.testing.assert_allclose(got["backlash"][0], 0.02 * np.sign(pressing), rtol=1e-5)
+        np.testing.assert_allclose(got["compliance"][0], np.array(pressing) / 50.0, rtol=1e-4)
 
 
 def test_rotors_without_inertia_and_motors_that_are_off_stay_with_their_links():
