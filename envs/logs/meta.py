@@ -4,6 +4,7 @@
 """
 
 import difflib
+import re
 import reprlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -66,6 +67,12 @@ class _Loader(yaml.SafeLoader):
                     None, None, f"key {_short.repr(key)} is there twice", node.start_mark
                 )
         return super().construct_mapping(node, deep)
+
+
+# Python and JSON write 6e-05, which is a number in YAML 1.2 and text in the 1.1 of this parser.
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(r"[-+]?[0-9]+(\.[0-9]*)?[eE][-+]?[0-9]+$"), list("-+0123456789")
+)
 
 
 def _is_column(item: tuple[str, Any]) -> bool:

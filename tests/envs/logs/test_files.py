@@ -50,6 +50,13 @@ def put(folder, table=None, meta=(), name="run_000.csv"):
     return folder
 
 
+@pytest.mark.parametrize("written", ["6e-05", "6E-5", "+6e-5", "0.6e-4", "6.0e-05"])
+def test_a_small_number_is_one_as_python_and_json_write_it(tmp_path, written):
+    meta = put(tmp_path, meta={"signals": {"q": {"noise_sd": "SMALL"}}}) / "meta.yaml"
+    meta.write_text(meta.read_text().replace("SMALL", written))
+    np.testing.assert_allclose(logs.read(tmp_path).runs[0].fact("q", "noise_sd"), 6e-5)
+
+
 @pytest.mark.parametrize("name", ["run_000.csv", "run_000.npz"])
 def test_a_log_is_read_as_it_is(tmp_path, name):
     log = logs.read(put(tmp_path / "log", name=name))
