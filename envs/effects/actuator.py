@@ -8,7 +8,7 @@ separates it from the others.
 import jax
 import jax.numpy as jnp
 
-from envs.effects.memory import LONGEST_S, PAST_TARGET_S, delay_line, delayed, lagged, two_stages
+from envs.effects.memory import LONGEST_S, PAST_TARGET_S, SECOND_STAGE, delay_line, delayed, lagged, two_stages
 from jaxtune.types import Effect, Form, Parameter
 
 _ACTUATOR = {"family": "actuator", "on": "joint"}
@@ -206,10 +206,7 @@ ROWS = (
     Effect(
         name="torque_lag",
         enters="torque",
-        parameters=(
-            _LAG_SECONDS,
-            Parameter(name="second_stage", bounds=(0.0, 1.0), prior=3.0, shape=True),
-        ),
+        parameters=(_LAG_SECONDS, SECOND_STAGE),
         sizes=(0.001, 0.008),
         act=_torque_lag,
         start=_steady,

@@ -7,6 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxtune.types import Parameter
+
 LONGEST_S = 0.1
 """Longest delay that a line can hold, in s. Simulations start with at least as much history (`envs.segments`)."""
 
@@ -82,6 +84,10 @@ def filtered(memory: jax.Array, signal: jax.Array, seconds: jax.Array, dt: float
     before, sample = memory
     after = signal - share * (signal - sample) + stays * (before - sample)
     return after, jnp.stack([after, signal])
+
+
+SECOND_STAGE = Parameter(name="second_stage", bounds=(0.0, 1.0), prior=3.0, shape=True)
+"""How slow the second lag of a filter is, for `two_stages`."""
 
 
 def two_stages(seconds: jax.Array, second_stage: jax.Array) -> jax.Array:

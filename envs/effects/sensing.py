@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.effects.memory import LONGEST_S, delay_line, delayed, filtered, two_stages
+from envs.effects.memory import LONGEST_S, SECOND_STAGE, delay_line, delayed, filtered, two_stages
 from jaxtune.types import Effect, Form, Parameter
 
 _SENSING = {"family": "sensing"}
@@ -144,7 +144,7 @@ ROWS = (
         parameters=(
             _SECONDS,
             Parameter(name="velocity_faster", bounds=(0.0, 1.0), prior=1.0),
-            Parameter(name="second_stage", bounds=(0.0, 1.0), prior=3.0, shape=True),
+            SECOND_STAGE,
         ),
         sizes=(0.001, 0.008),
         act=_sensor_lag,

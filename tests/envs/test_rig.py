@@ -600,6 +600,9 @@ def needed_by(rig, values, state, speeding):
     return history.needed(rig.chain, rig.model(values), rig._data, state, speeding)
 
 
+PLAY = {"rad": 0.04}
+
+
 @pytest.mark.parametrize("trend", [-1.0, 1.0])
 def test_a_motor_that_is_off_carries_its_link_by_friction(arm, trend):
     """The link lies on the side of the play to which its weight drives it, whatever noise says of accelerations."""
@@ -611,9 +614,6 @@ def test_a_motor_that_is_off_carries_its_link_by_friction(arm, trend):
     read = arm.play(off.replace(measured=off.measured + noise), **rubs, backlash={"elbow": PLAY | {"at_motor": 1.0}})
     # As without play: no link falls, and none meets its motor.
     np.testing.assert_allclose(read["q"], arm.play(off, **rubs)["q"], atol=2e-4)
-
-
-PLAY = {"rad": 0.04}
 
 
 def test_what_presses_on_gears_is_shared_as_friction_is(arm):

@@ -299,11 +299,12 @@ def test_a_drive_speeds_up_and_slows_down():
 
 
 def test_a_drive_is_where_its_profile_has_brought_it():
-    # Told to move by 1 rad 0.3 s ago, it has come 0.2 rad while it sped up, and 0.2 rad at its speed.
+    # Told to move by 1 rad 0.3 s ago, it has come 0.2 rad while it sped up, in 100 steps of 2 ms of which each counts
+    # with the speed at its end (2 mrad more), and 0.2 rad and a step of 4 mrad at its speed.
     past = np.tile((PAST_TARGET_S > -0.301)[:, None], (1, JOINTS))
     row = EVERY["target_slew"]
     got = row.start(values_of(row, rad_per_s=2.0, ramp_s=[0.2, 0.0]), jnp.asarray(past, jnp.float32), DT)
-    np.testing.assert_allclose(got, [[0.4, 0.604], [2.0, 2.0]], atol=0.01)
+    np.testing.assert_allclose(got, [[0.406, 0.604], [2.0, 2.0]], atol=1e-4)
 
 
 def test_a_deadband_swallows_half_its_width_on_each_side():
