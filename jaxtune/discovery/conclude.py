@@ -12,7 +12,7 @@ from jaxtune.discovery.evaluate import is_worse, position_gap, rms
 from jaxtune.discovery.evidence import Thresholds, ablate, passes, weigh_evidence
 from jaxtune.discovery.fit import Fit, begin, polish, refine
 from jaxtune.discovery.instead import instead
-from jaxtune.discovery.leads import at_some_places, beside, fit_leads, taken_for
+from jaxtune.discovery.leads import at_some_places, beside, fit_leads, known_in_forms, taken_for
 from jaxtune.discovery.naming import at_fewest_places, clear_places, moved_forms, renamed, with_refinements
 from jaxtune.discovery.noise_floor import Floor, NoiseFloor, Say
 from jaxtune.discovery.problem import Hypothesis, Problem
@@ -173,6 +173,7 @@ def _with_what_passes(settings: Settings, problem: Problem, at: Floor, state: St
     off. Of the same effect at more places or fewer, `_where_it_shows` chooses last.
     """
     found, known = [], {one.key for one in state.candidates}
+    costs = [(one, total_cost(at, one, state.price)) for one in state.candidates]
     for effect in state.best.effects:
         mine = effect, *state.best.forms_of(effect)
         keys = {part.key for part in mine}
@@ -182,7 +183,8 @@ def _with_what_passes(settings: Settings, problem: Problem, at: Floor, state: St
         alone = Lead((effect,), points[0], state.null.fit.coordinates, state.null.fit.cost)
         whole = replace(alone, hypotheses=mine, point=np.concatenate(points))
         leads = taken_for(alone, forms, free)
-        leads += [one for one in at_some_places(whole, forms, free) if key_of((*others, *one.hypotheses)) not in known]
+        untried = (*at_some_places(whole, forms, free), *known_in_forms(effect, costs, forms, free))
+        leads += [one for one in untried if key_of((*others, *one.hypotheses)) not in known]
         if leads:
             base = ablate(at, state.best, effect)
             (fit,) = polish([base.fit], at.residuals["train"], 0)

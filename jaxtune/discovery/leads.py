@@ -125,6 +125,33 @@ def at_some_places(lead: Lead, forms: Sequence[Hypothesis], free: Sequence[Hypot
     return found
 
 
+def known_in_forms(
+    effect: Hypothesis, known: Sequence[tuple[Candidate, float]], forms: Sequence[Hypothesis], free: Sequence[Hypothesis]
+) -> list[Lead]:
+    """Lists other effects in some form, at the places of a model's effect, that alone cost less than that one alone.
+
+    Forms are fitted beside the best model's effects. So where a model of several has a wrong one, the right one may
+    have been tried in its place without its form, and with it in a step before, alone.
+
+    Args:
+      effect: of the model.
+      known: fitted models, with what each costs.
+      forms: that may join what is left of the model.
+      free: effects that may join it.
+    """
+    may_join = {one.key for one in (*forms, *free)}
+    alone = [(one, cost) for one, cost in known if len(one.effects) == 1]
+    limit = min((cost for one, cost in alone if one.effects[0].key == effect.key), default=np.inf)
+    found = []
+    for one, cost in alone:
+        (other,) = one.effects
+        same = other.places == effect.places and other.key != effect.key
+        if same and one.forms_of(other) and cost < limit and {part.key for part in one.hypotheses} <= may_join:
+            point = np.concatenate([one.fit.coordinates[one.fit.along(part)] for part in one.hypotheses])
+            found.append(Lead(one.hypotheses, point, one.fit.coordinates, cost))
+    return found
+
+
 def _start(form: Hypothesis) -> np.ndarray:
     """The point at which the fit of a form begins, [parameters]."""
     if np.count_nonzero((form.probes != 0).any(axis=0)) > 1:

@@ -531,6 +531,29 @@ def test_what_may_pass_for_a_named_effect_is_fitted_in_its_place():
     assert _with_what_passes(Settings(), asked, at, ended).best is other
 
 
+def test_what_was_better_alone_in_a_form_is_fitted_in_a_model_of_several():
+    damping, coulomb, push = HYPOTHESES[1:4]
+    asked = problem({"coulomb": 0.8, "cubic": 10.0, "push": 0.4}, forms=(WARPED,))
+    floor, begun = state.begin(asked, measured_floor(asked))
+    at, null = floor[asked.main_horizon], begun.null.fit
+
+    def fitted(*hypotheses):
+        point = np.concatenate([one.probes[1] for one in hypotheses])
+        lead = Lead(hypotheses, point, null.coordinates, null.cost)
+        return leads.fit_leads(Settings(), at, null, (), [lead], 0.0)[0]
+
+    wrong, alone = fitted(damping, push), fitted(coulomb, WARPED)
+    known = replace(begun, best=wrong, candidates=(fitted(damping), alone, wrong))
+    assert _with_what_passes(Settings(), asked, at, known).best.key == f"{WARPED.key} + {coulomb.key} + {push.key}"
+    # Without that form, or at other places, it says nothing.
+    for other in (fitted(coulomb), replace(alone, hypotheses=(replace(coulomb, places=("x",)), WARPED))):
+        assert _with_what_passes(Settings(), asked, at, replace(known, candidates=(other, wrong))).best is wrong
+    # Nor does one that was worse.
+    costs = [(fitted(damping), 10.0), (alone, 11.0)]
+    assert leads.known_in_forms(damping, costs, [WARPED], HYPOTHESES) == []
+    assert len(leads.known_in_forms(damping, [(alone, 11.0)], [WARPED], HYPOTHESES)) == 1
+
+
 def test_an_effect_at_several_places_is_fitted_at_some_of_them():
     at_one, at_two = (
         replace(ONE_SIZE, places=(place,), directions=rows[None])
