@@ -30,6 +30,7 @@ def measure_scales(rig: Rig, runs: Sequence[Run]) -> dict[str, np.ndarray]:
         damping    torque / rms(dq)            Nm s/rad
         quadratic  torque / rms(dq)^2          Nm s^2/rad^2
         stiffness  torque / (0.02 angle)       Nm/rad
+        spring     torque / rms angle from where the model's springs rest    Nm/rad
         hardening  1 / (0.02 angle)^2          1/rad^2
         inertia    diagonal of the joint-space inertia in the mean pose, kg m^2
         mass       mass of the body, or a twentieth of all links' where that is more: what a light wrist
@@ -70,6 +71,7 @@ def measure_scales(rig: Rig, runs: Sequence[Run]) -> dict[str, np.ndarray]:
     turns = hinges(rig.mj_model, rig.joints)
     angle = np.where(turns, 1.0, _PINION_M)
     wound = _WOUND * angle
+    angles = [one - rig.mj_model.qpos_spring[rig.qpos] for one in pose]
     pace = _rms(speed)
     drag, fast = _drag(rig, mean_pose, torque, pace)
     before, after = rig.chain.beside
@@ -78,6 +80,7 @@ def measure_scales(rig: Rig, runs: Sequence[Run]) -> dict[str, np.ndarray]:
         "damping": torque / pace,
         "quadratic": torque / pace**2,
         "stiffness": torque / wound,
+        "spring": torque / np.maximum(_rms(angles), wound),
         "hardening": 1.0 / wound**2,
         "inertia": inertia,
         "mass": np.maximum(mass, _LOAD * mass.sum()),

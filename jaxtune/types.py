@@ -121,6 +121,7 @@ Scale = Literal[
     "damping",
     "quadratic",
     "stiffness",
+    "spring",
     "hardening",
     "inertia",
     "mass",
@@ -138,7 +139,7 @@ Scale = Literal[
 Except for `one`, its size depends on the robot and on how it moved in the log; `envs.scales` measures it. Per joint:
 `torque` is the rms torque (Nm), `speed` the rms speed (rad/s), `slow` a tenth of it, `damping` torque / speed,
 `quadratic` torque / speed^2, `angle` 1 rad of a hinge or 0.05 m of a slide, `stiffness` torque / (0.02 angle),
-`hardening` 1 / (0.02 angle)^2, `motor` the largest torque limit / speed, `of_before`
+`spring` torque / rms angle, `hardening` 1 / (0.02 angle)^2, `motor` the largest torque limit / speed, `of_before`
 and `of_after` torque / that of the joint before and after, `inertia` the diagonal of the joint-space
 inertia (kg m^2). Per body: `mass` (kg), the body's or, where that is more, a twentieth of all links', `drag`, a drag of
 the centre of mass that takes the rms torque of a joint (N s/m), and `air`, drag / speed.

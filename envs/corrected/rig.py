@@ -37,7 +37,7 @@ def save(folder: Path, spec: mujoco.MjSpec, rig: Rig, vector: np.ndarray) -> Non
 
 
 def _corrected_spec(spec: mujoco.MjSpec, rig: Rig, vector: np.ndarray) -> mujoco.MjSpec:
-    """Makes the nominal MJCF with the corrected inertias, armatures, dampings and friction losses, compiled."""
+    """Makes the nominal MJCF with the corrected inertias, armatures, dampings, springs and dry frictions, compiled."""
     values = rig.values(rig.tree(jnp.asarray(vector, jnp.float32)))
     model, device = rig.mj_model, jax.jit(rig.model)(values)
     spec = without_files(spec.copy())
@@ -47,6 +47,7 @@ def _corrected_spec(spec: mujoco.MjSpec, rig: Rig, vector: np.ndarray) -> mujoco
         dof, joint = rig.dof[number], spec.joint(name)
         joint.armature = float(device.dof_armature[dof])
         joint.damping = [float(device.dof_damping[dof]), *np.ravel(joint.damping)[1:]]
+        joint.stiffness = [float(device.jnt_stiffness[model.joint(name).id]), *np.ravel(joint.stiffness)[1:]]
         # From the nominal model: on the device every joint has a trace of friction, which MJX needs.
         joint.frictionloss = max(float(model.dof_frictionloss[dof] + values["coulomb"]["torque_nm"][number]), 0.0)
         joint.solimp_friction = np.asarray(device.dof_solimp[dof], float)

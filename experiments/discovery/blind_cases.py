@@ -36,9 +36,10 @@ SIZE_BOUNDS = {
     "sensor_lag": (0.001, 0.06),
     "drag": (0.1, 100.0),
     "constant_push": (0.01, 15.0),
+    "joint_spring": (0.01, 50.0),
     "cogging": (0.02, 15.0),
     "temperature_fade": (0.02, 0.9),
-    "cable_stiffness": (0.1, 500.0),
+    "detent": (0.1, 500.0),
     "loose_foot": (0.01, 1.5),
 }
 """Sizes between which a severity is searched, in the unit of the effect's first parameter. The harmless size is first,
@@ -82,8 +83,9 @@ class Size:
 
 
 def _spread(names: Sequence[str], count: int) -> tuple[tuple[str, float], ...]:
-    """Pairs effects in turn with severities in turn."""
-    return tuple((names[i % len(names)], SEVERITIES[i % len(SEVERITIES)]) for i in range(count))
+    """Pairs effects in turn with severities in turn, one on in every round of the effects."""
+    size, rounds = len(names), len(SEVERITIES)
+    return tuple((names[i % size], SEVERITIES[(i + i // size) % rounds]) for i in range(count))
 
 
 # Where velocities lag they are not compared, so such a log has no severity beside one without the effect. How the base

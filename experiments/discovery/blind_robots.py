@@ -20,7 +20,7 @@ from experiments.discovery.target_runs import TargetRun, scaled
 _ENCODER_RAD = 2 * np.pi / 2**14  # 14 bits, common for joint encoders
 _SPEED_NOISE, _SPEED_QUANTUM = 0.01, 0.005  # standard deviation and rounding of joint velocities, rad/s
 
-OUTSIDE = ("cogging", "temperature_fade", "cable_stiffness", "loose_foot")
+OUTSIDE = ("cogging", "temperature_fade", "detent", "loose_foot")
 """Effects that the library does not have, so that the right verdict is `unnamed`."""
 
 
@@ -191,12 +191,15 @@ class _Robot:
         return position, speed
 
     def _outside(self, position) -> np.ndarray:
-        """Returns torques in Nm that depend on position alone: a push, cogging, or a cubic cable spring."""
+        """Returns torques in Nm that depend on position alone: a push, a spring that stiffens, cogging, or a detent."""
         effect, size, at = self._truth.effect, self._truth.size, self._at
         if effect == "constant_push":
             return size * at
         if effect == "cogging":
             return size * at * np.sin(20.0 * position)
-        if effect == "cable_stiffness":
-            return -size * at * position**3
+        if effect == "joint_spring":
+            return -size * at * position * (1.0 + 0.3 * position**2)
+        if effect == "detent":
+            # A magnet that holds the joint within a tenth of a radian, and hardly farther off.
+            return -size * at * position * np.exp(-50.0 * position**2)
         return np.zeros(len(at))

@@ -126,7 +126,10 @@ def at_some_places(lead: Lead, forms: Sequence[Hypothesis], free: Sequence[Hypot
 
 
 def known_in_forms(
-    effect: Hypothesis, known: Sequence[tuple[Candidate, float]], forms: Sequence[Hypothesis], free: Sequence[Hypothesis]
+    effect: Hypothesis,
+    known: Sequence[tuple[Candidate, float]],
+    forms: Sequence[Hypothesis],
+    free: Sequence[Hypothesis],
 ) -> list[Lead]:
     """Lists other effects in some form, at the places of a model's effect, that alone cost less than that one alone.
 

@@ -42,6 +42,9 @@ def test_a_torque_of_one_is_what_moves_the_joint(kp):
         # The weight of 0.6 kg, 0.125 m from the elbow, would be 0.74 Nm if it hung level.
         assert 0.05 < found["torque"][1] < 2.0
     np.testing.assert_allclose(found["damping"] * found["speed"], found["torque"], rtol=1e-5)
+    # A spring that takes all of the torque at the rms angle.
+    angle = np.sqrt((played.runs[0].signals["q"] ** 2).mean(axis=0))
+    np.testing.assert_allclose(found["spring"] * angle, found["torque"], rtol=1e-3)
     np.testing.assert_allclose(found["of_before"][1] * found["torque"][0], found["torque"][1], rtol=1e-5)
     np.testing.assert_allclose(found["of_after"][0] * found["torque"][1], found["torque"][0], rtol=1e-5)
     # The shoulder alone moves the upper arm, whose centre is 0.15 m away: drag there is damping of the shoulder.

@@ -84,7 +84,8 @@ def test_too_few_runs_to_split_are_refused(spec):
         ("compliance", 60.0),
         ("cogging", 0.5),
         ("temperature_fade", 0.5),
-        ("cable_stiffness", 3.0),
+        ("joint_spring", 2.0),
+        ("detent", 3.0),
         ("loose_foot", 0.2),
     ],
 )

@@ -287,3 +287,9 @@ def _drag(setting: Setting, links: Kinematics, at: list[int]):
 def _constant_push(setting: Setting):
     """With a slow ripple of 5 %, as of a spring that the robot pulls along."""
     return lambda torque, now: torque + setting.size * (1.0 + 0.05 * np.sin(20.0 * now.share))
+
+
+@FORMS.add("outside", differs=False)
+def _joint_spring(setting: Setting):
+    """It rests at a quarter of a radian."""
+    return lambda torque, now: torque - setting.size * (now.q - 0.25)

@@ -274,3 +274,9 @@ def _drag(setting: Setting, links: Kinematics, at: list[int]):
 @FORMS.add("outside", differs=False)
 def _constant_push(setting: Setting):
     return lambda torque, now: torque + setting.size
+
+
+@FORMS.add("outside", scalar=False)
+def _joint_spring(setting: Setting):
+    """A cable that stiffens as it is bent."""
+    return lambda torque, now: torque - setting.size * now.q * (1.0 + (now.q / 0.9) ** 2)

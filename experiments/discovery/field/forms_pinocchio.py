@@ -274,3 +274,9 @@ def _drag(setting: Setting, links: Kinematics, at: list[int]):
 @FORMS.add("outside", differs=False)
 def _constant_push(setting: Setting):
     return lambda torque, now: torque + setting.size
+
+
+@FORMS.add("outside", scalar=False)
+def _joint_spring(setting: Setting):
+    """A balancer on a crank, whose arm gets shorter as it turns."""
+    return lambda torque, now: torque - setting.size * 0.8 * np.sin(now.q / 0.8)

@@ -21,18 +21,13 @@ def _temperature_fade(setting: Setting):
 
 
 @OUTSIDE.add("outside")
-def _cable_spring(setting: Setting):
-    """A cable that is slack on one side, stiffens on the other, and lags behind by friction in its sheath."""
-    state: dict[str, np.ndarray] = {}
+def _detent(setting: Setting):
+    """A magnet that holds the joint where it comes within 0.15 rad, at two angles."""
 
-    def act(torque: np.ndarray, now: Now) -> np.ndarray:
-        sheath = state.get("x", now.q)
-        # The sheath moves along once the cable slides by 0.06 rad.
-        state["x"] = sheath = np.clip(sheath, now.q - 0.06, now.q + 0.06)
-        tight = np.maximum(sheath + 0.3, 0.0)
-        return torque - setting.size * (2.0 * tight**2 + 6.0 * (now.q - sheath))
+    def pull(away: np.ndarray) -> np.ndarray:
+        return away / 0.15 * np.exp(0.5 - 0.5 * (away / 0.15) ** 2)
 
-    return act
+    return lambda torque, now: torque - setting.size * (pull(now.q - 0.2) + pull(now.q + 0.5))
 
 
 @OUTSIDE.add("numbers")

@@ -13,7 +13,7 @@ FAMILIES = {
     "transmission": ("backlash", "compliance", "armature"),
     "inertia": ("link_mass", "com_offset", "payload"),
     "sensing": ("encoder_bias", "sensor_delay", "sensor_lag", "velocity_lag"),
-    "external": ("drag", "constant_push"),
+    "external": ("drag", "constant_push", "joint_spring"),
 }
 """Names of the library that a suspended robot can show, by family."""
 
@@ -61,6 +61,7 @@ def bounds(effect: str, robot: Robot, place: int, scales: Scales) -> tuple[float
         "link_mass": (1.03, 3.0),
         "com_offset": (0.002, min(0.09, length)),
         "constant_push": (0.02 * torque, 1.5 * torque),
+        "joint_spring": (0.02 * torque, 3.0 * torque),
         "drag": (0.02 * torque / speed / length**2, 3.0 * torque / speed / length**2),
         "torque_scale": (0.98, 0.35),
         "gain_error": (0.98, 0.35),
@@ -70,7 +71,7 @@ def bounds(effect: str, robot: Robot, place: int, scales: Scales) -> tuple[float
         # Outside the library.
         "cogging": (0.03 * torque, 2.0 * torque),
         "temperature_fade": (0.05, 0.85),
-        "cable_spring": (0.03 * torque, 3.0 * torque),
+        "detent": (0.03 * torque, 3.0 * torque),
         "loose_foot": (0.02 * robot.mass[place], 1.5 * robot.mass[place]),
         "gear_error": (0.001, 0.06),
         "joint_coupling": (0.03, 0.8),

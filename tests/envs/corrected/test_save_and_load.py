@@ -29,11 +29,13 @@ WRONG = {
     "compliance": {"shoulder": {"nm_per_rad": 55.0}},
     "encoder_bias": {"elbow": {"rad": 0.01}},
     "drag": {"lower": {"n_s_per_m": 1.5}},
+    "joint_spring": {"elbow": {"nm_per_rad": 0.6}},
     "imu_tilt": {"robot": {"pitch_rad": 0.02}},
     "ground_slope": {"robot": {"roll_rad": 0.03, "pitch_rad": -0.05}},
 }
 IN_THE_MODEL = {
-    *("link_mass", "link_inertia", "com_offset", "payload", "armature", "viscous", "coulomb", "ground_slope")
+    *("link_mass", "link_inertia", "com_offset", "payload", "armature", "viscous", "coulomb", "joint_spring"),
+    "ground_slope",
 }
 
 
@@ -92,6 +94,7 @@ def test_what_mujoco_has_a_form_for_is_in_the_mjcf(folder):
     np.testing.assert_allclose(model.dof_armature, [0.01, 0.023], rtol=1e-5)
     np.testing.assert_allclose(model.dof_damping, [0.16, 0.05], rtol=1e-5)
     np.testing.assert_allclose(model.dof_frictionloss, [0.0, 0.07], rtol=1e-5)
+    np.testing.assert_allclose(model.jnt_stiffness, [0.0, 0.6], rtol=1e-5)
 
 
 def test_the_ground_of_a_robot_that_hung_is_not_in_its_model(tmp_path):

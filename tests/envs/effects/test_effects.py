@@ -744,6 +744,7 @@ IN_THE_MODEL = {
     ),
     "armature": ({"elbow": {"kg_m2": 0.02}}, [('name="elbow"', 'name="elbow" armature="0.03"')]),
     "coulomb": ({"elbow": {"torque_nm": 0.2}}, [('name="elbow"', 'name="elbow" frictionloss="0.2"')]),
+    "joint_spring": ({"elbow": {"nm_per_rad": 1.5}}, [('name="elbow"', 'name="elbow" stiffness="1.5"')]),
     # Geometries give a body mass and inertia alike.
     "link_mass": ({"lower": {"ratio": 1.5}}, [('mass="0.6"', 'mass="0.9"')]),
     "com_offset": (
