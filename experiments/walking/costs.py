@@ -21,6 +21,7 @@ from envs.targets import mujoco_c
 from envs.targets.host import Engine, HostTarget
 from envs.targets.mjx import MjxTarget
 from experiments.common.config import Preset
+from experiments.walking import one_step
 from experiments.walking.learner import Learner, Policy
 from experiments.walking.policies import starting_policy
 from experiments.walking.robots import BITENO
@@ -205,11 +206,15 @@ def estimates(sizes: Preset, policy: str, radius: float, seeds: Sequence[int], t
     def regress(key, data):
         return regression.train(config.regression, data.trajectory, data.sampled_coords, dist)
 
-    raw = dataclasses.replace(config.spm, reads="steps")
+    raw, step_sizes = dataclasses.replace(config.spm, reads="steps"), one_step.OneStepConfig()
     methods = {
         "search-parameter model": (partial(fit, config.spm), partial(spm.estimate, config.spm)),
         "search-parameter model of raw steps": (partial(fit, raw), partial(spm.estimate, raw)),
         f"{_MODELS} search-parameter models, mean": (fit_several, mean_estimate),
+        "one-step model": (
+            lambda key, data: one_step.train(key, step_sizes, data.trajectory, data.sampled_coords, dist),
+            partial(one_step.estimate, step_sizes),
+        ),
         "regression": (regress, partial(regression.estimate, config.regression)),
     }
     collect = _compiled(lambda key: machine.collect(key, start, dist))
