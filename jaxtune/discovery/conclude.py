@@ -80,7 +80,8 @@ def conclude(settings: Settings, problem: Problem, floor: NoiseFloor, state: Sta
     learned = learn(settings, problem, at, best)
     models = _by_select(problem, at, state, best, learned)
     usual, share, whole = _shares(settings, problem, at, (state.null, best, learned))
-    explains = enough(settings, usual[1].max(), share if terms else 0.0, whole)
+    named = sum(term.refines is None for term in terms)
+    explains = enough(settings, usual[1].max(), share if terms else 0.0, whole, named)
     changed = _at_bounds(problem, best.fit, state.price) if explains else {}
     explains = explains and (len(changed) < settings.strained or usual[1].max() < settings.much)
     verdict = _verdict(problem, terms, changed) if explains else "unnamed"

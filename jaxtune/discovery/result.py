@@ -33,8 +33,8 @@ class Settings:
     level: float = 0.05
     """Probability of naming something where nothing is missing, which the thresholds allow."""
     share: float = 0.7
-    """Share of the explainable gap, and of the explainable cost, that the accepted effects must explain together; with
-    less the verdict is `unnamed`."""
+    """Share of the explainable gap, and of the explainable cost, that an accepted effect must explain; with less the
+    verdict is `unnamed`. Several may leave together what one may leave, divided by their number."""
     share_near: float = 0.5
     """That share where at most `near` floor units are left. No form of the library is exactly the robot's, and what it
     leaves weighs more in a small gap."""

@@ -55,16 +55,20 @@ def explained_shares(energies: Sequence[float], costs: Sequence[float]) -> tuple
     return min(both), explained(energies[0], energies[1], 0.0)
 
 
-def enough(settings: Settings, left: float, share: float, whole: float) -> bool:
+def enough(settings: Settings, left: float, share: float, whole: float, effects: int) -> bool:
     """Whether a model explains what there is, well enough to say what is missing, or that nothing is.
+
+    Several effects must leave less than one: each of them could make up for a part of what the library has no name for.
 
     Args:
       settings: how much is asked.
       left: largest gap that it leaves in floor units.
       share: what its effects explain of the explainable gap, zero without effects.
       whole: what they explain of the whole gap above the floor.
+      effects: number of effects that it would name.
     """
-    asked = settings.share_near if left <= settings.near else settings.share
+    of_one = settings.share_near if left <= settings.near else settings.share
+    asked = 1.0 - (1.0 - of_one) / max(effects, 1)
     return left <= settings.at_floor or (share >= asked and whole >= settings.least)
 
 

@@ -440,18 +440,22 @@ def test_typical_segments_speak_where_others_do_not_pay_for_them(typical, usual,
 
 
 @pytest.mark.parametrize(
-    ("left", "share", "whole", "expected"),
+    ("left", "share", "whole", "effects", "expected"),
     [
-        (1.4, 0.0, 0.0, True),  # at the floor nothing need be explained
-        (2.1, 0.6, 0.5, True),
-        (2.1, 0.4, 0.4, False),
-        (5.0, 0.6, 0.5, False),  # of a large gap more has to be explained
-        (5.0, 0.8, 0.5, True),
-        (2.1, 1.0, 0.2, False),  # neither effects nor a learned torque explain much
+        (1.4, 0.0, 0.0, 0, True),  # at the floor nothing need be explained
+        (2.1, 0.6, 0.5, 1, True),
+        (2.1, 0.4, 0.4, 1, False),
+        (5.0, 0.6, 0.5, 1, False),  # of a large gap more has to be explained
+        (5.0, 0.8, 0.5, 1, True),
+        (2.1, 1.0, 0.2, 1, False),  # neither effects nor a learned torque explain much
+        (5.0, 0.8, 0.5, 2, False),  # two could have made up for something else
+        (5.0, 0.86, 0.5, 2, True),
+        (5.0, 0.86, 0.5, 3, False),
+        (1.4, 0.0, 0.0, 3, True),
     ],
 )
-def test_effects_that_explain_enough(left, share, whole, expected):
-    assert enough(Settings(), left, share, whole) is expected
+def test_effects_that_explain_enough(left, share, whole, effects, expected):
+    assert enough(Settings(), left, share, whole, effects) is expected
 
 
 def test_an_effect_costs_what_chance_gains_on_null_logs():
