@@ -51,7 +51,8 @@ class Args:
     ]
     """speed: training steps per second, with exact and fast physics. devices: steps per second of episodes and of
     training on one device, two, four and so on. profile: where the time of a tuning goes. estimates: errors of the
-    regression and of the search-parameter model, also of raw steps and of five models, on the same episodes.
+    regression, of a one-step model and of the search-parameter model, also of raw steps and of five models, on the
+    same episodes.
     memory: resident memory of this process over 50 tunings with training. targets: simulation steps per second of
     every engine that is installed. rig: simulation steps per second of suspended robots, with the step of MJX and
     with that of discovery. logs: seconds to read ten minutes of 40 columns at 1 kHz. tuner: seconds to compile and

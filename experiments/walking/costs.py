@@ -29,6 +29,7 @@ from experiments.walking.work import peaks, work
 from jaxtune import devices, dvm, readings, regression, spm, tuner
 from jaxtune import dist as dists
 from jaxtune.mjx import parameters
+from jaxtune.settings import TunerConfig
 from jaxtune.types import ParamDist
 
 _STEPS = 50  # in which the speed of MuJoCo C is measured
@@ -192,31 +193,7 @@ def estimates(sizes: Preset, policy: str, radius: float, seeds: Sequence[int], t
     learner = Learner(sizes, BITENO.chosen("legs6"))
     machine, config = learner.tuner(), sizes.tuner
     dist = learner.dist(parameters.nominal(learner.entries), radius)
-    start = starting_policy(policy, learner)
-
-    def fit(settings, key, data):
-        return spm.train(key, settings, data.trajectory, data.sampled_coords, dist)[0]
-
-    def fit_several(key, data):
-        return jax.lax.map(lambda key: fit(config.spm, key, data), jax.random.split(key, _MODELS))
-
-    def mean_estimate(models, measured):
-        return jax.vmap(partial(spm.estimate, config.spm), (0, None))(models, measured).mean(axis=0)
-
-    def regress(key, data):
-        return regression.train(config.regression, data.trajectory, data.sampled_coords, dist)
-
-    raw, step_sizes = dataclasses.replace(config.spm, reads="steps"), one_step.OneStepConfig()
-    methods = {
-        "search-parameter model": (partial(fit, config.spm), partial(spm.estimate, config.spm)),
-        "search-parameter model of raw steps": (partial(fit, raw), partial(spm.estimate, raw)),
-        f"{_MODELS} search-parameter models, mean": (fit_several, mean_estimate),
-        "one-step model": (
-            lambda key, data: one_step.train(key, step_sizes, data.trajectory, data.sampled_coords, dist),
-            partial(one_step.estimate, step_sizes),
-        ),
-        "regression": (regress, partial(regression.estimate, config.regression)),
-    }
+    start, methods = starting_policy(policy, learner), _estimators(config, dist)
     collect = _compiled(lambda key: machine.collect(key, start, dist))
     found, truths = {name: ([], []) for name in methods}, []
     for seed in track(seeds):
@@ -244,6 +221,34 @@ def estimates(sizes: Preset, policy: str, radius: float, seeds: Sequence[int], t
             "mass": np.abs(_mass(learner, dist, answers) / mass - 1.0).mean(),
         }
     return rows
+
+
+def _estimators(config: TunerConfig, dist: ParamDist) -> dict[str, tuple[Callable, Callable]]:
+    """What is compared: by name `(key, data) -> model` and `(model, set) -> coordinates in radii`."""
+
+    def fit(settings, key, data):
+        return spm.train(key, settings, data.trajectory, data.sampled_coords, dist)[0]
+
+    def fit_several(key, data):
+        return jax.lax.map(lambda key: fit(config.spm, key, data), jax.random.split(key, _MODELS))
+
+    def mean_estimate(models, measured):
+        return jax.vmap(partial(spm.estimate, config.spm), (0, None))(models, measured).mean(axis=0)
+
+    def regress(key, data):
+        return regression.train(config.regression, data.trajectory, data.sampled_coords, dist)
+
+    raw, step_sizes = dataclasses.replace(config.spm, reads="steps"), one_step.OneStepConfig()
+    return {
+        "search-parameter model": (partial(fit, config.spm), partial(spm.estimate, config.spm)),
+        "search-parameter model of raw steps": (partial(fit, raw), partial(spm.estimate, raw)),
+        f"{_MODELS} search-parameter models, mean": (fit_several, mean_estimate),
+        "one-step model": (
+            lambda key, data: one_step.train(key, step_sizes, data.trajectory, data.sampled_coords, dist),
+            partial(one_step.estimate, step_sizes),
+        ),
+        "regression": (regress, partial(regression.estimate, config.regression)),
+    }
 
 
 def _mass(learner: Learner, dist: ParamDist, radii: np.ndarray) -> np.ndarray:
