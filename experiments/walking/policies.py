@@ -60,7 +60,8 @@ def walk(
     policy = learner.init(key_init)
     dist = learner.dist(parameters.nominal(learner.entries), learner.preset.policy_radius)
     chunk = min(learner.preset.chunk, updates)
-    train = devices.on_all(jax.jit(lambda key, policy: learner.train(key, policy, dist, chunk)))
+    # A policy carries its training robots, which a GPU need not hold twice.
+    train = devices.on_all(jax.jit(lambda key, policy: learner.train(key, policy, dist, chunk), donate_argnums=1))
     task = progress.add_task("training", total=updates * learner.preset.ppo.steps_per_update) if progress else None
     curve = []
     identity = {
