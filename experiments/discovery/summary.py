@@ -7,15 +7,15 @@ import numpy as np
 
 from envs.effects import LIBRARY
 from envs.logs import Log
-from envs.rig import Rig
 from experiments.discovery.hypotheses import hypotheses
 from experiments.discovery.next_experiment import deciding_experiment
 from experiments.discovery.question import Question
 from experiments.discovery.whole_runs import simulate_runs
 from jaxtune.discovery.fit import Fit
-from jaxtune.discovery.problem import Hypothesis, acts_within
+from jaxtune.discovery.problem import Hypothesis, Problem, acts_within
 from jaxtune.discovery.result import AcceptedTerm, Result
 
+_LATE = ("command_delay", "sensor_delay")
 _FAR_OFF = 6.0  # floor units; none of the 194 robots that lacked nothing in the benchmarks reached it (5.2)
 _PART = 0.1  # least share of what a learned torque explains at which a part of it is listed
 _SHOWN = 12  # places with the largest gap that the summary lists
@@ -37,7 +37,7 @@ def summarise(question: Question, log: Log, folder: Path, result: Result) -> dic
     """
     effects, changes, not_named = [], [], []
     for term in (*result.terms, *_changed(question, result)):
-        effect = _effect(question.rig, term, result.fit, result.errors)
+        effect = _effect(question, term, result.fit, result.errors)
         if term.refines is not None or result.verdict == "unnamed":
             not_named.append(effect | {"refines": term.refines})
         elif question.problem.is_change(term.hypothesis, term.forms):
@@ -121,9 +121,9 @@ def _changed(question: Question, result: Result) -> list[AcceptedTerm]:
     return found
 
 
-def _effect(rig: Rig, term: AcceptedTerm, fit: Fit, errors: np.ndarray) -> dict:
+def _effect(question: Question, term: AcceptedTerm, fit: Fit, errors: np.ndarray) -> dict:
     """Describes a fitted effect: physical values with 95 % intervals, and what would distinguish it from its rivals."""
-    hypothesis, parameters = term.hypothesis, {}
+    rig, hypothesis, parameters = question.rig, term.hypothesis, {}
     places = hypothesis.places if term.clear is None else term.clear
     rows = [(part.form, row) for part in (hypothesis, *term.forms) for row in part.directions]
     for form, direction in rows:
@@ -133,7 +133,10 @@ def _effect(rig: Rig, term: AcceptedTerm, fit: Fit, errors: np.ndarray) -> dict:
         scale, known = axis.scale, rig.effects[axis.effect].parameters
         parameter = next(one for one in known if one.name == axis.parameter)
         # Standard errors of the directions through this coordinate add up in quadrature; 1.96 makes it a 95 % interval.
-        error = 1.96 * float(np.sqrt(sum((errors[i] * fit.free.directions[i][number]) ** 2 for i in mine)))
+        several = [errors[i] * fit.free.directions[i][number] for i in mine]
+        if axis.effect in _LATE:
+            several.append(_wait(question.problem, direction)[number])
+        error = 1.96 * float(np.linalg.norm(several))
         low, high = (axis.least if axis.takes else parameter.bounds[0]), parameter.bounds[1]
         # A limit or a stiffness that may as well not be there has no upper end.
         low = max(low, 1e-12) if parameter.form == "reciprocal" else low
@@ -156,6 +159,17 @@ def _effect(rig: Rig, term: AcceptedTerm, fit: Fit, errors: np.ndarray) -> dict:
         "confusable_with": list(term.confusable_with),
         "split_by": f"{rig.effects[hypothesis.name].excited_by} on {', '.join(places)}",
     }
+
+
+def _wait(problem: Problem, direction: np.ndarray) -> np.ndarray:
+    """Standard deviations [axes] of an unknown delay of all joints that lies along a hypothesis' direction [axes].
+
+    When within its period a controller reads is not known, and a delay of all joints takes the place of that. What is
+    unknown is as likely anywhere within its bounds.
+    """
+    along = ((problem.unknowns != 0) <= (direction != 0)).all(axis=1)
+    widths = np.ptp(problem.unknown_bounds[along], axis=1)[:, None] * problem.unknowns[along]
+    return np.linalg.norm(widths, axis=0) / np.sqrt(12.0)
 
 
 def _names(forms: Sequence[Hypothesis]) -> str | None:

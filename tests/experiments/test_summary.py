@@ -116,7 +116,9 @@ def test_what_a_placeholder_loses_has_an_interval(asked):
     rig = SimpleNamespace(axes=axes, effects=question.rig.effects)
     free = Free(armature.directions, np.ones(1), np.array([[-2.0, 5.0]]), np.array([False]))
     fit = Fit(free, np.array([-1.99]), np.zeros(0), np.zeros((0, 1)), None)
-    effect = _effect(rig, AcceptedTerm(armature, EVIDENCE, Thresholds(10.0)), fit, np.array([0.01]))
+    effect = _effect(
+        replace(question, rig=rig), AcceptedTerm(armature, EVIDENCE, Thresholds(10.0)), fit, np.array([0.01])
+    )
     got = effect["parameters"]["kg_m2"]
     assert [got[name] / axes[number].scale for name in ("low", "value", "high")] == pytest.approx(
         [-2.0, -1.99, -1.99 + 0.0196]
@@ -137,6 +139,20 @@ def test_a_delay_that_is_filtered_has_two_times(asked):
     assert effect["parameters"]["seconds"]["value"] == pytest.approx(0.012, rel=1e-5)
     assert effect["parameters"]["filtered.seconds"]["value"] == pytest.approx(0.003, rel=1e-5)
     assert effect["parameters"]["second_stage"]["value"] == pytest.approx(0.4, rel=1e-5)
+
+
+def test_a_delay_of_all_joints_is_no_surer_than_when_its_controller_reads(asked):
+    _, question = asked
+    every = {hypothesis.key: hypothesis for hypothesis in question.problem.hypotheses}
+    sizes = {}
+    for key in ("command_delay@shoulder+elbow", "command_delay@elbow"):
+        own = every[key]
+        free = Free(own.directions, np.ones(1), np.array([[0.0, 0.1]]), np.array([False]))
+        fit = Fit(free, np.array([0.02]), np.zeros(0), np.zeros((0, 1)), None)
+        got = _effect(question, AcceptedTerm(own, EVIDENCE, Thresholds(10.0)), fit, np.array([1e-9]))
+        sizes[key] = np.diff([got["parameters"]["seconds"][end] for end in ("low", "high")])[0] / 2
+    # Any time within a period of 1 ms; beside a delay of one joint the wait of all is free in the fit.
+    assert list(sizes.values()) == pytest.approx([1.96 * 0.001 / np.sqrt(12.0), 0.0], abs=1e-7)
 
 
 def test_the_command_that_decides_can_be_typed_as_it_is(tmp_path, asked):
@@ -285,7 +301,7 @@ def test_an_effect_with_a_size_for_each_place_is_told_of_those_that_are_clear(as
     fit = Fit(free, np.array([0.01, 0.5]), np.zeros(0), np.zeros((0, 2)), None)
     errors = np.array([0.02, 0.02])
     clear = clear_places(fit, errors, each)
-    effect = _effect(question.rig, AcceptedTerm(each, EVIDENCE, Thresholds(10.0), clear=clear), fit, errors)
+    effect = _effect(question, AcceptedTerm(each, EVIDENCE, Thresholds(10.0), clear=clear), fit, errors)
     assert effect["places"] == ["elbow"]
     assert list(effect["parameters"]) == ["torque_nm.elbow"]
     size = effect["parameters"]["torque_nm.elbow"]
