@@ -12,10 +12,9 @@ from experiments.discovery.next_experiment import deciding_experiment
 from experiments.discovery.question import Question
 from experiments.discovery.whole_runs import simulate_runs
 from jaxtune.discovery.fit import Fit
-from jaxtune.discovery.problem import Hypothesis, Problem, acts_within
+from jaxtune.discovery.problem import Hypothesis, acts_within
 from jaxtune.discovery.result import AcceptedTerm, Result
 
-_LATE = ("command_delay", "sensor_delay")
 _FAR_OFF = 6.0  # floor units; none of the 194 robots that lacked nothing in the benchmarks reached it (5.2)
 _PART = 0.1  # least share of what a learned torque explains at which a part of it is listed
 _SHOWN = 12  # places with the largest gap that the summary lists
@@ -134,8 +133,9 @@ def _effect(question: Question, term: AcceptedTerm, fit: Fit, errors: np.ndarray
         parameter = next(one for one in known if one.name == axis.parameter)
         # Standard errors of the directions through this coordinate add up in quadrature; 1.96 makes it a 95 % interval.
         several = [errors[i] * fit.free.directions[i][number] for i in mine]
-        if axis.effect in _LATE:
-            several.append(_wait(question.problem, direction)[number])
+        if axis.effect == "command_delay":
+            # A controller that takes targets once in its period makes whole periods of any delay.
+            several.append(1.0 / (rig.control_hz * scale * np.sqrt(12.0)))
         error = 1.96 * float(np.linalg.norm(several))
         low, high = (axis.least if axis.takes else parameter.bounds[0]), parameter.bounds[1]
         # A limit or a stiffness that may as well not be there has no upper end.
@@ -159,17 +159,6 @@ def _effect(question: Question, term: AcceptedTerm, fit: Fit, errors: np.ndarray
         "confusable_with": list(term.confusable_with),
         "split_by": f"{rig.effects[hypothesis.name].excited_by} on {', '.join(places)}",
     }
-
-
-def _wait(problem: Problem, direction: np.ndarray) -> np.ndarray:
-    """Standard deviations [axes] of an unknown delay of all joints that lies along a hypothesis' direction [axes].
-
-    When within its period a controller reads is not known, and a delay of all joints takes the place of that. What is
-    unknown is as likely anywhere within its bounds.
-    """
-    along = ((problem.unknowns != 0) <= (direction != 0)).all(axis=1)
-    widths = np.ptp(problem.unknown_bounds[along], axis=1)[:, None] * problem.unknowns[along]
-    return np.linalg.norm(widths, axis=0) / np.sqrt(12.0)
 
 
 def _names(forms: Sequence[Hypothesis]) -> str | None:
