@@ -29,7 +29,7 @@ from envs.rig import Rig
 from experiments.common import checkpoint, compiler, files
 from experiments.common.cli import bars, console, run
 from experiments.common.config import Preset, preset
-from experiments.walking import costs, foreign, memory
+from experiments.walking import costs, estimates, foreign, memory
 from experiments.walking.costs import Track
 from experiments.walking.learner import Learner
 from experiments.walking.policies import starting_policy
@@ -257,7 +257,7 @@ MEASURES = {
     "speed": speed,
     "devices": lambda args, track: costs.on_devices(preset(args.preset), args.policy, track),
     "profile": lambda args, track: costs.profile(preset(args.preset), args.policy, track),
-    "estimates": lambda args, track: costs.estimates(
+    "estimates": lambda args, track: estimates.compare(
         _noisy(preset(args.preset), args), args.policy, args.radius, args.seeds, track
     ),
     "memory": lambda args, track: costs.memory(preset(args.preset), args.policy, track=track),

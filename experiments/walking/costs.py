@@ -1,17 +1,12 @@
-"""Where the time of a tuning goes, what more devices save of it, how exact its estimates are, and its memory.
+"""Where the time of a tuning goes, what more devices save of it, and its memory; `experiments.bench` prints them."""
 
-`experiments.bench` prints all four.
-"""
-
-import dataclasses
 import gc
 import os
 import time
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
@@ -21,20 +16,16 @@ from envs.targets import mujoco_c
 from envs.targets.host import Engine, HostTarget
 from envs.targets.mjx import MjxTarget
 from experiments.common.config import Preset
-from experiments.walking import one_step
 from experiments.walking.learner import Learner, Policy
 from experiments.walking.policies import starting_policy
 from experiments.walking.robots import BITENO
 from experiments.walking.work import peaks, work
-from jaxtune import devices, dvm, readings, regression, spm, tuner
+from jaxtune import devices, dvm, readings, regression, tuner
 from jaxtune import dist as dists
 from jaxtune.mjx import parameters
-from jaxtune.settings import TunerConfig
-from jaxtune.types import ParamDist
 
 _STEPS = 50  # in which the speed of MuJoCo C is measured
 _SETTLED = 5  # tunings after which memory should be flat
-_MODELS = 5  # search-parameter models whose mean is compared with one
 _TIMES = 3  # runs of a program, of which the fastest counts
 _ROLLOUTS, _UPDATES = "policy: rollouts", "policy: whole updates"
 
@@ -113,8 +104,8 @@ def _parts(learner: Learner, start: Policy) -> dict[str, _Part]:
 
     steps, count = sizes.episode_steps, config.episodes + config.held_out_sets * config.set_episodes
     measure, simulate = episodes(config.set_episodes, steps), lambda policy: machine.collect(key, policy, dist)
-    measured, collected = _compiled(measure)(start), _compiled(simulate)(start)
-    gate, model = (_compiled(program)(collected) for program in (train_dvm, regress))
+    measured, collected = compiled(measure)(start), compiled(simulate)(start)
+    gate, model = (compiled(program)(collected) for program in (train_dvm, regress))
     novelty, estimate = partial(dvm.novelty, config.dvm), partial(regression.estimate, config.regression)
     return {
         "measured episodes": _Part(measure, (start,), simulates=config.set_episodes * steps),
@@ -176,93 +167,6 @@ def on_devices(sizes: Preset, policy: str, track: Track = iter) -> dict[str, dic
     return rows
 
 
-def estimates(sizes: Preset, policy: str, radius: float, seeds: Sequence[int], track: Track = iter) -> dict[str, dict]:
-    """Compares estimates of the coordinates of simulated robots, on the same episodes.
-
-    Args:
-      sizes: of a tuning; the number of robots is that of held-out sets.
-      policy: what walks.
-      radius: of the distribution.
-      seeds: every seed has episodes and models of its own.
-      track: shows which seed it is.
-
-    Returns:
-      By method: mean and 0.9-quantile of |estimate - truth| in radii, over all robots, coordinates and seeds, and the
-      mean by coordinate; the mean error of the robot's mass, as a share of it; seconds to fit.
-    """
-    learner = Learner(sizes, BITENO.chosen("legs6"))
-    machine, config = learner.tuner(), sizes.tuner
-    dist = learner.dist(parameters.nominal(learner.entries), radius)
-    start, methods = starting_policy(policy, learner), _estimators(config, dist)
-    collect = _compiled(lambda key: machine.collect(key, start, dist))
-    found, truths = {name: ([], []) for name in methods}, []
-    for seed in track(seeds):
-        key_collect, key_fit = jax.random.split(jax.random.PRNGKey(seed))
-        data = collect(key_collect)
-        truths.append(np.asarray(dists.normalise(dist, data.held_out_coords)))
-        for name, (train, answer) in methods.items():
-            model, seconds = _timed(train, (key_fit, data))
-            every = _compiled(
-                lambda model, sets, answer=answer: devices.in_chunks(answer, (sets,), readings.SETS, shared=(model,))
-            )
-            answers, times = found[name]
-            answers.append(np.asarray(every(model, data.held_out)))
-            times.append(seconds)
-    truth, rows = np.concatenate(truths), {}
-    mass = _mass(learner, dist, truth)
-    for name, (answers, times) in found.items():
-        answers = np.concatenate(answers)
-        errors = np.abs(answers - truth)
-        rows[name] = {
-            "error": errors.mean(),
-            "error_90": np.quantile(errors, 0.9),
-            "fit_s": min(times),
-            **dict(zip(dists.names(dist), errors.mean(axis=0).tolist(), strict=True)),
-            "mass": np.abs(_mass(learner, dist, answers) / mass - 1.0).mean(),
-        }
-    return rows
-
-
-def _estimators(config: TunerConfig, dist: ParamDist) -> dict[str, tuple[Callable, Callable]]:
-    """What is compared: by name `(key, data) -> model` and `(model, set) -> coordinates in radii`."""
-
-    def fit(settings, key, data):
-        return spm.train(key, settings, data.trajectory, data.sampled_coords, dist)[0]
-
-    def fit_several(key, data):
-        return jax.lax.map(lambda key: fit(config.spm, key, data), jax.random.split(key, _MODELS))
-
-    def mean_estimate(models, measured):
-        return jax.vmap(partial(spm.estimate, config.spm), (0, None))(models, measured).mean(axis=0)
-
-    def regress(key, data):
-        return regression.train(config.regression, data.trajectory, data.sampled_coords, dist)
-
-    raw, step_sizes = dataclasses.replace(config.spm, reads="steps"), one_step.OneStepConfig()
-    return {
-        "search-parameter model": (partial(fit, config.spm), partial(spm.estimate, config.spm)),
-        "search-parameter model of raw steps": (partial(fit, raw), partial(spm.estimate, raw)),
-        f"{_MODELS} search-parameter models, mean": (fit_several, mean_estimate),
-        "one-step model": (
-            lambda key, data: one_step.train(key, step_sizes, data.trajectory, data.sampled_coords, dist),
-            partial(one_step.estimate, step_sizes),
-        ),
-        "regression": (regress, partial(regression.estimate, config.regression)),
-    }
-
-
-def _mass(learner: Learner, dist: ParamDist, radii: np.ndarray) -> np.ndarray:
-    """Mass of BITeno [robots] in kg, of coordinates [robots, coords] in radii."""
-    model = learner.robot.mj_model
-    ratio = np.exp(np.asarray(dists.ravel(dist.centre)) + np.asarray(dists.ravel(dist.radius)) * radii)
-    added = [
-        model.body_mass[[model.body(link).id for link in entry.targets]].sum() * (ratio[:, number] - 1.0)
-        for number, entry in enumerate(learner.entries[name] for name in dists.names(dist))
-        if "body_mass" in entry.fields
-    ]
-    return model.body_mass.sum() + np.sum(added, axis=0)
-
-
 def memory(sizes: Preset, policy: str, tunings: int = 50, track: Track = iter) -> dict[str, dict]:
     """Measures the resident memory of this process over many tunings, each with its training.
 
@@ -300,16 +204,8 @@ def _resident() -> int:
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
-def _timed(program: Callable, inputs: tuple) -> tuple[Any, float]:
-    """What a program returns, and the seconds that it takes when it is compiled."""
-    run = _compiled(program)
-    jax.block_until_ready(run(*inputs))
-    begin = time.monotonic()
-    found = jax.block_until_ready(run(*inputs))
-    return found, time.monotonic() - begin
-
-
-def _compiled(program: Callable) -> Callable:
+def compiled(program: Callable) -> Callable:
+    """Compiles a program for all devices."""
     return devices.on_all(jax.jit(program))
 
 
@@ -319,8 +215,8 @@ def _seconds(program: Callable, inputs: tuple) -> tuple[float, float]:
     fresh = jax.jit(lambda *args: program(*args))
     whole = devices.on_all(lambda *args: fresh.lower(*args).compile())
     begin = time.monotonic()
-    compiled = whole(*inputs)
-    moments, run = [time.monotonic()], devices.on_all(compiled)
+    built = whole(*inputs)
+    moments, run = [time.monotonic()], devices.on_all(built)
     for _ in range(_TIMES):
         jax.block_until_ready(run(*inputs))
         moments.append(time.monotonic())

@@ -6,7 +6,7 @@ observation changes in the next step. The estimate of a set is the coordinates u
     c* = argmax over c in the box of  sum over steps of log N(o_t+1 - o_t; f(o_t, a_t, ..., o_t-h, a_t-h, c), s^2),
 
 found by Gauss-Newton. Like the regression it needs observations and actions alone. It is measured beside the others in
-`experiments.walking.costs.estimates`; no update uses it.
+`experiments.walking.estimates.compare`; no update uses it.
 """
 
 from dataclasses import dataclass
