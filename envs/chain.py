@@ -46,6 +46,7 @@ class Now:
     rigid: jax.Array  # [joints] share of dry friction that is not of bristles
     body_velocity: jax.Array  # [bodies, 3] m/s of the centres of mass
     between: jax.Array  # [joints] rad, how far targets are from the held ones if they move on between rows
+    unit: jax.Array  # [joints] unit of angle: 1 rad of a hinge, or the way in m that a slide has instead
     before: jax.Array  # [joints] index of the joint before in the model's order, past the last where there is none
     after: jax.Array  # [joints] the same of the joint after
 
@@ -91,6 +92,8 @@ class Chain:
     order, which is then the leapfrog scheme."""
     trees: np.ndarray | None = None
     """[joints] kinematic trees of the joints; one where None."""
+    units: np.ndarray | None = None
+    """[joints] 1 rad of a hinge, or the way in m that a slide has instead (`envs.rig.Rig.units`); hinges where None."""
 
     @property
     def beside(self) -> tuple[np.ndarray, np.ndarray]:
@@ -377,6 +380,7 @@ class Chain:
             rigid=none + 1.0,
             body_velocity=jnp.zeros((len(self.bodies), 3)),
             between=x["between"],
+            unit=none + 1.0 if self.units is None else jnp.asarray(self.units, jnp.float32),
             before=jnp.asarray(self.beside[0]),
             after=jnp.asarray(self.beside[1]),
         )

@@ -38,6 +38,7 @@ System = tuple[mjx.Model, mjx.Data]
 # solver that has converged; with three iterations, up to 8.
 _ITERATIONS = 4
 _LONGEST_STEP_S = 0.001
+_PINION_M = 0.05  # radius of a pinion that moves a slide
 
 
 class Rig:
@@ -97,12 +98,24 @@ class Rig:
             raise ValueError(f"robot: MJX cannot simulate it: {error}") from error
         self._data = mjx.make_data(self._model)
         self._scales: Mapping[str, np.ndarray] = {}
-        self.slides = tuple(np.array(self.joints)[~hinges(model, self.joints)].tolist())
+        turns = hinges(model, self.joints)
+        self.slides = tuple(np.array(self.joints)[~turns].tolist())
+        # Of angle: 1 rad of a hinge; of a slide what its pinion moves it by.
+        self.units = np.where(turns, 1.0, _PINION_M)
         # A robot on a rig has no feet on the ground, so what they need has no place and drops out below.
         self.places = {"joint": self.joints, "body": self.bodies, "foot": (), "robot": ("robot",)}
         self.effects = {row.name: row for row in EVERY.values() if self.places[row.on] and row.needs != "free"}
-        rows, period_s = tuple(self.effects.values()), 1.0 / control_hz
-        self.chain = Chain(self.dt, rows, self.qpos, self.dof, self._bodies, period_s, 0.5 * self.dt, self.trees)
+        self.chain = Chain(
+            dt=self.dt,
+            rows=tuple(self.effects.values()),
+            qpos=self.qpos,
+            dof=self.dof,
+            bodies=self._bodies,
+            period_s=1.0 / control_hz,
+            lead_s=0.5 * self.dt,
+            trees=self.trees,
+            units=self.units,
+        )
         self.axes = self._describe_axes()
 
     @property
@@ -116,7 +129,7 @@ class Rig:
         """All that compiled programs depend on beside `system`: robots of equal layout can share them."""
         addresses = (self.qpos.tobytes(), self.dof.tobytes(), self._bodies.tobytes(), self.trees.tobytes())
         frames = np.asarray(self._model.body_quat).tobytes()
-        paces = self.dt, self.control_hz
+        paces = self.dt, self.control_hz, self.units.tobytes()
         return self.joints, self.bodies, *paces, addresses, frames, jax.tree.structure(self.system)
 
     def on(self, system: System) -> "Rig":

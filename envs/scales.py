@@ -9,12 +9,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from envs.logs import Run
-from envs.models import hinges
 from envs.regimes import control_torque
 from envs.rig import Rig
 from envs.segments import smoothed
 
-_PINION_M = 0.05
 _WOUND = 0.02  # rad, by which a spring winds up under the rms torque
 _LOAD = 0.05  # of the mass of all links
 _LEVER_M = 0.001  # a centre of mass on its joint's axis is not dragged
@@ -68,9 +66,7 @@ def measure_scales(rig: Rig, runs: Sequence[Run]) -> dict[str, np.ndarray]:
     mass, inertia = rig.inertias(mean_pose)
     moves = inertia * _rms(rise)
     torque = np.where(_rms(torque) > _DRIVEN * moves, _rms(torque), moves)
-    turns = hinges(rig.mj_model, rig.joints)
-    angle = np.where(turns, 1.0, _PINION_M)
-    wound = _WOUND * angle
+    wound = _WOUND * rig.units
     angles = [one - rig.mj_model.qpos_spring[rig.qpos] for one in pose]
     pace = _rms(speed)
     drag, fast = _drag(rig, mean_pose, torque, pace)
@@ -88,7 +84,7 @@ def measure_scales(rig: Rig, runs: Sequence[Run]) -> dict[str, np.ndarray]:
         "air": drag / fast,
         "speed": pace,
         "slow": 0.1 * pace,
-        "angle": angle,
+        "angle": rig.units,
         "motor": np.maximum(np.concatenate(limit).max(axis=0), 1e-6) / pace,
         # Any number will do where there is none.
         "of_before": torque / np.append(torque, 1.0)[before],

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 
 from jaxtune.types import Effect, Parameter
 
-_LEAST_TRAVEL_RAD = 1e-4  # bristles that are stiffer would need shorter steps; the engine's own friction is as sharp
+# Of the unit of angle: bristles that are stiffer would need shorter steps, and the engine's own friction is as sharp.
+_LEAST_TRAVEL = 1e-4
 
 
 def _presliding(values, friction, now, memory):
@@ -18,7 +19,7 @@ def _presliding(values, friction, now, memory):
     travel = values["travel_rad"]
     # The memory is z, the deflection of the bristles in shares of that at which they slide.
     wound = jnp.clip(memory + now.dt * now.speed / jnp.maximum(travel, 1e-9), -1.0, 1.0)
-    there = travel > _LEAST_TRAVEL_RAD
+    there = travel > _LEAST_TRAVEL * now.unit
     return jnp.stack([jnp.where(there, 0.0, bound), torque - jnp.where(there, bound * wound, 0.0)]), wound
 
 
@@ -41,7 +42,7 @@ PRESLIDING = Effect(
     family="joint_friction",
     on="joint",
     enters="bristle",
-    parameters=(Parameter(name="travel_rad", bounds=(0.0, 0.05), prior=0.005),),
+    parameters=(Parameter(name="travel_rad", scale="angle", bounds=(0.0, 0.05), prior=0.005),),
     sizes=(0.0005, 0.005),
     act=_presliding,
     start=_wound,

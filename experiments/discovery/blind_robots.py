@@ -23,6 +23,16 @@ _SPEED_NOISE, _SPEED_QUANTUM = 0.01, 0.005  # standard deviation and rounding of
 OUTSIDE = ("cogging", "temperature_fade", "detent", "loose_foot")
 """Effects that the library does not have, so that the right verdict is `unnamed`."""
 
+# Torques at a joint's positions in rad, by effect and per unit of its size.
+_OF_POSITION = {
+    "constant_push": np.ones_like,
+    "cogging": lambda position: np.sin(20.0 * position),
+    # It stiffens.
+    "joint_spring": lambda position: -position * (1.0 + 0.3 * position**2),
+    # A magnet that holds the joint within a tenth of a radian, and hardly farther off.
+    "detent": lambda position: -position * np.exp(-50.0 * position**2),
+}
+
 
 def record(
     spec: mujoco.MjSpec,
@@ -191,15 +201,6 @@ class _Robot:
         return position, speed
 
     def _outside(self, position) -> np.ndarray:
-        """Returns torques in Nm that depend on position alone: a push, a spring that stiffens, cogging, or a detent."""
-        effect, size, at = self._truth.effect, self._truth.size, self._at
-        if effect == "constant_push":
-            return size * at
-        if effect == "cogging":
-            return size * at * np.sin(20.0 * position)
-        if effect == "joint_spring":
-            return -size * at * position * (1.0 + 0.3 * position**2)
-        if effect == "detent":
-            # A magnet that holds the joint within a tenth of a radian, and hardly farther off.
-            return -size * at * position * np.exp(-50.0 * position**2)
-        return np.zeros(len(at))
+        """Returns torques in Nm that depend on position alone (`_OF_POSITION`)."""
+        shape = _OF_POSITION.get(self._truth.effect)
+        return np.zeros(len(self._at)) if shape is None else self._truth.size * self._at * shape(position)

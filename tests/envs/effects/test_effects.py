@@ -39,6 +39,7 @@ def now(speed=0.0, **fields):
         "rigid": joints,
         "body_velocity": np.zeros((JOINTS, 3), np.float32),
         "between": joints * 0.0,
+        "unit": joints,
         "before": np.array([JOINTS, 0]),
         "after": np.array([1, JOINTS]),
     }
@@ -329,6 +330,15 @@ def test_a_soft_limit_is_the_usual_one_of_some_power(softness):
     torque, power = np.array([1.0, -3.0]), 1.0 / softness
     expected = torque / (1.0 + np.abs(torque / 2.0) ** power) ** softness
     np.testing.assert_allclose(act("torque_limit", torque, torque_nm=2.0, softness=softness), expected, rtol=1e-4)
+
+
+def test_bristles_of_a_slide_may_be_shorter_than_those_of_a_hinge():
+    # 20 um are much for a slide, and for a hinge in rad too little to be told from the engine's own friction.
+    friction = np.tile([[0.4], [0.1]], JOINTS)
+    for speed, torque in ((0.0, 0.1), (0.01, 0.1 - 0.4 * 0.5)):
+        at = now(speed=speed, unit=np.array([1.0, 0.05], np.float32))
+        got = act("presliding", friction, memory=np.zeros(JOINTS), at=at, travel_rad=20e-6)
+        np.testing.assert_allclose(got, [[0.4, 0.0], [0.1, torque]], atol=1e-6)
 
 
 def test_bristles_give_way_and_then_slide():
