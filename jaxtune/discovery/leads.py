@@ -74,6 +74,37 @@ def shaped(forms: Sequence[Hypothesis], free: Sequence[Hypothesis], leads: Seque
     return found
 
 
+def shaped_after(
+    base: Fit,
+    present: Sequence[Hypothesis],
+    forms: Sequence[Hypothesis],
+    free: Sequence[Hypothesis],
+    fitted: Sequence[Candidate],
+    count: int,
+) -> list[Lead]:
+    """Lists forms that were not tried (`shaped`) of the fitted models of one more effect that cost least.
+
+    A fit finds more than the screen does, so these may be others than its first leads.
+
+    Args:
+      base: the model beside which they were fitted.
+      present: its effects.
+      forms: of all effects.
+      free: effects that may join it.
+      fitted: models with more effects.
+      count: how many of them get their forms.
+    """
+    tried, leads = {one.key for one in fitted}, []
+    for one in sorted(fitted, key=lambda one: one.fit.cost):
+        group = one.hypotheses[len(present) :]
+        if sum(not part.form for part in group) == 1:
+            start, keeps = base.coordinates.copy(), ~np.any([taken_over(base.free, part) for part in group], axis=0)
+            start[keeps], point = np.split(one.fit.coordinates, [np.count_nonzero(keeps)])
+            leads.append(Lead(group, point, start, one.fit.cost))
+    found = shaped(forms, free, leads[:count], count)
+    return [lead for lead in found if key_of((*present, *lead.hypotheses)) not in tried]
+
+
 def taken_for(lead: Lead, forms: Sequence[Hypothesis], free: Sequence[Hypothesis]) -> list[Lead]:
     """Lists what may pass for the one effect of a lead (`jaxtune.types.Form.like`), at the same places.
 

@@ -23,7 +23,7 @@ class Settings:
     pairs: int = 8
     """How many of the best pairs are fitted."""
     shaped: int = 4
-    """How many of the best hypotheses are fitted in all their forms as well."""
+    """How many of the best hypotheses, by the screen and again by their fits, are fitted in all their forms as well."""
     swaps: int = 4
     """How many hypotheses are fitted in the place of an effect."""
     finalists: int = 4

@@ -14,7 +14,7 @@ from jaxtune.discovery.curves import groups_of, simulate_library
 from jaxtune.discovery.evaluate import usual
 from jaxtune.discovery.evidence import ablate, or_known
 from jaxtune.discovery.fit import polish, taken_over
-from jaxtune.discovery.leads import beside, fit_leads, shaped, shortlist, stuck, without_own
+from jaxtune.discovery.leads import beside, fit_leads, shaped, shaped_after, shortlist, stuck, without_own
 from jaxtune.discovery.localise import localise
 from jaxtune.discovery.noise_floor import Floor, NoiseFloor, Say
 from jaxtune.discovery.problem import Hypothesis, Problem, are_distinct
@@ -81,15 +81,19 @@ def step(
         groups, pairs = groups_of(free, forms), settings.firsts
         found = screen(at, base.fit, groups, price=state.price, fitted=fit, pairs=pairs, library=library, say=say)
     leads = shortlist(settings, found, state.price)
+    shapes = beside(_unfree(problem, at), base.hypotheses)
     if swapping:
         leads = leads[: settings.swaps]
     else:
-        leads += shaped(beside(_unfree(problem, at), base.hypotheses), free, leads, settings.shaped)
+        leads += shaped(shapes, free, leads, settings.shaped)
     if base.fit is state.nominal:
         leads = leads + stuck(state.null.fit, [h for h in free if problem.is_nominal(h)], leads)
         leads += without_own(base.fit, free, state.null.fit.cost)
     say(f"fit {len(leads)}")
     fitted = fit_leads(settings, at, base.fit, base.hypotheses, leads, state.price)
+    if not swapping:
+        more = shaped_after(base.fit, base.hypotheses, shapes, free, fitted, settings.shaped)
+        leads, fitted = leads + more, fitted + fit_leads(settings, at, base.fit, base.hypotheses, more, state.price)
     broken = {key_of((*base.hypotheses, *lead.hypotheses)) for lead in leads} - {one.key for one in fitted}
     state = replace(state.with_candidates(fitted), not_finite=(*state.not_finite, *sorted(broken)))
     cost = {one.key: total_cost(at, one, state.price) for one in (*fitted, best)}

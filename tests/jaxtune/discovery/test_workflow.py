@@ -9,7 +9,7 @@ import pytest
 from slider import AXES, BOTH, DIRECTION, DRAG, EACH, HYPOTHESES, LEARNED, ONE_SIZE, ROWS, WARPED, WILD, problem
 
 from jaxtune.discovery import leads, noise_floor, state, step, workflow
-from jaxtune.discovery.candidate import Candidate
+from jaxtune.discovery.candidate import Candidate, key_of
 from jaxtune.discovery.conclude import _rivals, _with_what_passes
 from jaxtune.discovery.evaluate import is_worse
 from jaxtune.discovery.evidence import Evidence
@@ -516,6 +516,28 @@ def test_a_form_that_is_an_effect_of_its_own_is_fitted_alone_too():
     pair = Lead((coulomb, push), np.array([0.8, 0.3]), np.zeros(2), 10.0)
     assert [lead.hypotheses[-1].key for lead in leads.shaped([DIRECTION, WARPED], (), [pair], 1)] == [WARPED.key]
     assert [form.key for form in leads.beside([DIRECTION, WARPED], [push])] == [WARPED.key]
+
+
+def test_fitted_models_that_cost_least_get_their_forms():
+    damping, coulomb, push = HYPOTHESES[1:4]
+    asked = problem({"coulomb": 0.8, "cubic": 10.0}, forms=(WARPED,))
+    floor, begun = state.begin(asked, measured_floor(asked))
+    at, null = floor[asked.main_horizon], begun.null.fit
+    first = [Lead((one,), one.probes[1], null.coordinates, null.cost) for one in (damping, coulomb, push)]
+    fitted = leads.fit_leads(Settings(), at, null, (), first, 0.0)
+    # The screen may have put the right one last.
+    (found,) = leads.shaped_after(null, (), [WARPED], HYPOTHESES, fitted, 1)
+    assert key_of(found.hypotheses) == f"{WARPED.key} + {coulomb.key}"
+    # It begins where the fit stands.
+    alone = next(one for one in fitted if one.key == coulomb.key)
+    assert found.point[0] == alone.fit.coordinates[-1]
+    np.testing.assert_array_equal(found.start, alone.fit.coordinates[:-1])
+    (both,) = leads.fit_leads(Settings(), at, null, (), [found], 0.0)
+    assert both.fit.cost < alone.fit.cost - 10.0
+    # What was fitted is not fitted again, and pairs get no forms.
+    assert leads.shaped_after(null, (), [WARPED], HYPOTHESES, [*fitted, both], 1) == []
+    pair = replace(alone, hypotheses=(coulomb, push))
+    assert leads.shaped_after(null, (), [WARPED], HYPOTHESES, [pair], 1) == []
 
 
 def test_what_may_pass_for_a_named_effect_is_fitted_in_its_place():
