@@ -100,7 +100,7 @@ class Rig:
         self._scales: Mapping[str, np.ndarray] = {}
         turns = hinges(model, self.joints)
         self.slides = tuple(np.array(self.joints)[~turns].tolist())
-        # Of angle: 1 rad of a hinge; of a slide what its pinion moves it by.
+        # Of angle, [joints]: 1 rad of a hinge; of a slide the way in m that its pinion moves it by.
         self.units = np.where(turns, 1.0, _PINION_M)
         # A robot on a rig has no feet on the ground, so what they need has no place and drops out below.
         self.places = {"joint": self.joints, "body": self.bodies, "foot": (), "robot": ("robot",)}
