@@ -39,6 +39,7 @@ System = tuple[mjx.Model, mjx.Data]
 _ITERATIONS = 4
 _LONGEST_STEP_S = 0.001
 _PINION_M = 0.05  # radius of a pinion that moves a slide
+_PARALLEL = 0.1  # share of axes' common length that may lie across it
 
 
 class Rig:
@@ -241,18 +242,19 @@ class Rig:
     def loose_centres(self) -> dict[str, np.ndarray]:
         """Directions along which centres of mass are known least, [directions, 3] m in the link's frame, by link.
 
-        A direction is as long as a centre is usually off (`envs.axes.loose`). Along the axis of its own hinge a link's
-        centre hardly shows, and is left out.
+        A direction is as long as a centre is usually off (`envs.axes.loose`). Where all hinges that carry a link are
+        parallel, its centre shows across them alone, and where none does, not at all; the rest is left out.
         """
-        model, found = self.mj_model, {}
+        data, found = self._posed(np.zeros(len(self.joints))), {}
         for name in self.bodies:
-            body = model.body(name)
-            size = loose(body.mass, body.inertia[None])[0]
-            hinged = body.jntnum[0] == 1 and model.jnt_type[body.jntadr[0]] == mujoco.mjtJoint.mjJNT_HINGE
-            # Rows of `across` are orthonormal, the last two of them across the axis.
-            axis = model.jnt_axis[body.jntadr[0]] if hinged else np.zeros(3)
-            across = np.linalg.svd(axis[None])[2]
-            found[name] = size * (across[1:] if hinged else across)
+            body = self.mj_model.body(name)
+            carrying = [self.mj_model.joint(self.joints[number]).id for number in self.moves("body", name)]
+            turning = [one for one in carrying if self.mj_model.jnt_type[one] == mujoco.mjtJoint.mjJNT_HINGE]
+            axes = data.xaxis[turning].reshape(-1, 3) @ data.xmat[body.id].reshape(3, 3)
+            _, lengths, directions = np.linalg.svd(axes)
+            several = (lengths > _PARALLEL * lengths[:1]).sum() > 1
+            shown = directions if several else directions[1:] if turning else directions[:0]
+            found[name] = loose(body.mass, body.inertia[None])[0] * shown
         return found
 
     def moves(self, on: str, place: str) -> tuple[int, ...]:

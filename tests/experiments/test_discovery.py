@@ -342,6 +342,41 @@ def test_centres_of_mass_are_loose_across_their_hinges(spec):
     assert loose(np.ones(1), np.full((1, 3), 2.0 / 3.0))[0] == pytest.approx(0.01)
 
 
+@pytest.mark.parametrize(
+    ("kinds", "axes", "count"),
+    [
+        (("hinge", "hinge"), ("1 0 0", "0 1 0"), 3),
+        (("hinge", "hinge"), ("0 0 1", "0 0 -1"), 2),
+        (("slide", "hinge"), ("1 0 0", "0 1 0"), 2),
+        (("slide", "slide"), ("1 0 0", "0 1 0"), 0),
+    ],
+)
+def test_a_centre_is_loose_in_those_directions_that_its_joints_feel(kinds, axes, count):
+    from envs.rig import Rig
+
+    first, last = (
+        f'<joint name="{name}" type="{kind}" axis="{axis}"/>'
+        f'<inertial pos="0.01 0.02 0.1" mass="1" diaginertia="0.003 0.002 0.001"/>'
+        for name, kind, axis in zip("ab", kinds, axes, strict=True)
+    )
+    bodies = f'<body name="first">{first}<body name="last" pos="0 0.1 0.3" euler="0 0 30">{last}</body></body>'
+    spec = mujoco.MjSpec.from_string(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>")
+    shifts = Rig(spec, ("a", "b"), 1000.0).loose_centres()["last"]
+    assert len(shifts) == count
+
+    def torques(shift):
+        spec.body("last").ipos = np.array([0.01, 0.02, 0.1]) + shift
+        model = spec.compile()
+        data = mujoco.MjData(model)
+        data.qpos, data.qvel, data.qacc = [0.4, -0.7], [3.0, 2.0], [20.0, -30.0]
+        mujoco.mj_inverse(model, data)
+        return data.qfrc_inverse.copy()
+
+    rest = np.linalg.svd(np.vstack([shifts, np.zeros((1, 3))]))[2][count:]
+    assert all(np.abs(torques(shift) - torques(0.0)).max() > 1e-3 for shift in shifts)
+    assert all(np.abs(torques(0.002 * unfelt) - torques(0.0)).max() < 1e-9 for unfelt in rest)
+
+
 def test_more_friction_is_a_change_of_the_model_and_stiction_is_missing_in_it(spec):
     from envs.effects import LIBRARY
     from envs.rig import Rig
