@@ -133,8 +133,7 @@ ROWS = (
         start=delay_line,
         undo=_undo_delay,
         forms=(Form("filtered", "sensor_lag", ("seconds", "second_stage")),),
-        # The readings of the one are those of the other, whatever the robot: in both, what the controller asks for shows
-        # in them so much later.
+        # The readings of the one are those of the other, whatever the robot.
         sentence="Positions and velocities are read late, or motors do late what the controller asks for: readings "
         "are the same.",
         excited_by="a chirp to 10 Hz at two controller gains",
