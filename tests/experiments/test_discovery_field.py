@@ -109,10 +109,22 @@ def test_wrong_masses_are_not_severe(short):
     drawn = scene("mujoco_c", "arm3")
     heavy = drawn.real.with_at("mass", 2, 1.1 * drawn.real.mass[2])
     heavy = heavy.with_at("inertia", 2, 1.1 * drawn.real.inertia[2])
-    # What a prior deviation explains hardly counts; an offset of the mass, which no nominal parameter has, does.
-    aside = heavy.with_at("com", 2, heavy.com[2] + np.array([0.03, 0.0, 0.0]))
-    alone, strange = drawn.meter.severities(drawn.meter.play([heavy, aside]))
+    # What a prior deviation explains hardly counts; an offset of the mass, which no model is off by, does.
+    shifted = [heavy.with_at("com", 2, heavy.com[2] + [shift, 0.0, 0.0]) for shift in (1e-3, 0.03)]
+    alone, little, strange = drawn.meter.severities(drawn.meter.play([heavy, *shifted]))
+    assert little < 1.5 * alone
     assert strange > 5 * alone
+
+
+def test_every_number_of_a_nominal_model_is_off(short):
+    drawn = scene("mujoco_c", "arm3")
+    for name in ("mass", "inertia", "armature", "damping", "friction", "kp", "kd", "com"):
+        real, nominal = (np.asarray(getattr(one, name)) for one in (drawn.real, drawn.nominal))
+        assert (real[nominal != 0] != nominal[nominal != 0]).all()
+        if name == "com":
+            assert (real != nominal).all() and np.abs(real - nominal).max() <= 3e-3
+        else:
+            assert np.abs(np.log(real[nominal != 0] / nominal[nominal != 0])).max() <= 0.151
 
 
 def test_a_delay_line_returns_what_was_there():

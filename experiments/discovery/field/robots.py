@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 
 _GRAVITY = 9.81
+_OFF_CENTRE_M = 0.03  # by which centres of mass are off at most, by the relative error of the other numbers
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -230,12 +231,12 @@ def _mass_matrix(robot: Robot, bent: np.ndarray) -> np.ndarray:
 
 
 def mistaken(robot: Robot, error: float, rng: np.random.Generator) -> Robot:
-    """Returns the real robot behind a nominal one: each number is off by a factor of its own, up or down.
+    """Returns the real robot behind a nominal one: each number is off by itself, up or down.
 
     Args:
       robot: the nominal one.
       error: masses (with inertias), armatures, dampings and frictions are off by exp(0.5 to 1.5 times this), gains by
-        exp(0.15 to 0.5 times this).
+        exp(0.15 to 0.5 times this), and centres of mass by up to 30 mm times this in each direction (3 mm at 0.1).
       rng: random numbers.
     """
 
@@ -253,6 +254,7 @@ def mistaken(robot: Robot, error: float, rng: np.random.Generator) -> Robot:
         friction=robot.friction * off(),
         kp=robot.kp * off(1 / 3),
         kd=robot.kd * off(1 / 3),
+        com=robot.com + _OFF_CENTRE_M * error * rng.uniform(-1.0, 1.0, robot.com.shape),
     )
 
 

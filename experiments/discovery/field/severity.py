@@ -22,6 +22,7 @@ from experiments.discovery.field.sizes import Scales
 _HORIZON_S = 0.15
 _BIN_S = 0.01
 _PRIOR = {"mass": 0.1, "armature": 0.1, "damping": 0.1, "friction": 0.1, "kp": 0.035, "kd": 0.035}
+_LOOSE_M = 1e-3  # prior deviation of a centre of mass in each direction
 _MOST = 3.0  # prior deviations that a parameter may be off
 _MOST_SEVERE = 1e4  # in place of infinity, which files cannot hold
 _RUNS, _STARTS = 4, 9  # that are measured, and segments of each
@@ -156,6 +157,8 @@ class Meter:
                 if field == "mass":
                     off = off.with_at("inertia", joint, robot.inertia[joint] * np.exp(deviation))
                 robots.append(off)
+        for joint, centre in enumerate(robot.com):
+            robots += [robot.with_at("com", joint, centre + shift) for shift in _LOOSE_M * np.eye(3)]
         count = len(lanes.run)
         fields = {
             name: np.tile(value, (len(robots),) + (1,) * (np.ndim(value) - 1))
