@@ -25,8 +25,12 @@ def _coulomb(values, bound, now, memory):
 
 
 def _stribeck(values, bound, now, memory):
-    """bound' = bound + torque exp(-|speed| / Stribeck speed)."""
-    return bound + values["torque_nm"] * jnp.exp(-jnp.abs(now.speed) / values["speed_rad_s"]), memory
+    """bound' = bound + torque exp(-(|speed| / Stribeck speed)^(1 + gaussian)).
+
+    Both powers are in use: one (Tustin, 1947) and two (Armstrong-Helouvry, Dupont and Canudas de Wit, 1994, section 2.1).
+    """
+    share = jnp.abs(now.speed) / values["speed_rad_s"]
+    return bound + values["torque_nm"] * jnp.exp(-(share ** (1.0 + values["gaussian"]))), memory
 
 
 def _load_friction(values, bound, now, memory):
@@ -67,6 +71,7 @@ ROWS = (
         parameters=(
             Parameter(name="torque_nm", scale="torque", bounds=(0.0, 5.0), prior=0.3),
             Parameter(name="speed_rad_s", form="ratio", scale="slow", bounds=(-2.0, 2.0), shape=True),
+            Parameter(name="gaussian", bounds=(0.0, 1.0), prior=3.0, shape=True),
         ),
         sizes=(0.05, 0.3),
         act=_stribeck,

@@ -21,7 +21,7 @@ WRONG = {
     "armature": {"elbow": {"kg_m2": 0.013}},
     "viscous": {"shoulder": {"nm_s_per_rad": 0.11}},
     "coulomb": {"elbow": {"torque_nm": 0.07}},
-    "stribeck": {"shoulder": {"torque_nm": 0.1, "speed_rad_s": 0.2}},
+    "stribeck": {"shoulder": {"torque_nm": 0.1, "speed_rad_s": 0.2, "gaussian": 0.5}},
     "command_delay": {"elbow": {"seconds": 0.0035}},
     "torque_limit": {"shoulder": {"torque_nm": 2.5}},
     "gain_error": {"elbow": {"ratio": 0.9}},

@@ -223,14 +223,17 @@ def test_coulomb_friction_is_what_is_added_to_the_bound():
 
 
 def test_stribeck_friction_decays_with_speed_whichever_way():
-    def extra(speed):
-        return act("stribeck", [0.1, 0.1], at=now(speed), torque_nm=0.3, speed_rad_s=0.5)
+    def extra(speed, **form):
+        return act("stribeck", [0.1, 0.1], at=now(speed), torque_nm=0.3, speed_rad_s=0.5, **form)
 
     # At rest all of it, at the speed of its name 1 / e, at five times that 0.007.
     np.testing.assert_allclose(extra(0.0), 0.4, rtol=1e-6)
     np.testing.assert_allclose(extra(0.5), 0.1 + 0.3 * 0.367879, rtol=1e-5)
     np.testing.assert_allclose(extra(-0.5), extra(0.5), rtol=1e-6)
     np.testing.assert_allclose(extra(2.5), 0.1 + 0.3 * 0.0067379, rtol=1e-5)
+    # With a square in the exponent it is as much at rest and at that speed, and less at twice of it, 1 / e^4.
+    for speed, share in ((0.0, 1.0), (-0.5, 0.367879), (1.0, 0.0183156)):
+        np.testing.assert_allclose(extra(speed, gaussian=[1.0, 1.0]), 0.1 + 0.3 * share, rtol=1e-5)
 
 
 def test_friction_of_the_load_is_a_share_of_it():
