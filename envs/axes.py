@@ -17,9 +17,14 @@ _NOMINAL_RATIOS = {"link_mass": _PRIOR_SHARE, "link_inertia": _PRIOR_SHARE, "gai
 # What else a servo's log gives, and instead: of its motor's constants it gives the torque at the stall (kt volts /
 # resistance_ohm) and the braking (kt^2 / resistance_ohm), each as a data sheet does. It has no damping gain.
 SERVO_RATIOS = {"torque_scale": 0.07, "back_emf": 0.1, "damping_gain": 0.0}
-_NOMINAL_FIELDS = {"armature": "dof_armature", "viscous": "dof_damping", "coulomb": "dof_frictionloss"}
+_NOMINAL_FIELDS = {
+    "armature": "dof_armature",
+    "viscous": "dof_damping",
+    "coulomb": "dof_frictionloss",
+    "joint_spring": "jnt_stiffness",
+}
 _LOOSE, _LEAST_LOOSE_M = 0.01, 1e-3  # by which a centre of mass is off: of the radius of gyration, and in m
-_MOST_TAKEN = 0.99  # of a field of the model: armature and damping must stay positive
+_MOST_TAKEN = 0.99  # of a field of the model: armature, damping and stiffness must stay positive
 
 
 def loose(mass: np.ndarray, inertia: np.ndarray) -> np.ndarray:
@@ -51,8 +56,8 @@ class Axis:
     scale: float
     """What one unit of the coordinate stands for, in the unit of the parameter."""
     least: float
-    """Smallest coordinate. An effect that subtracts from a field of the model (armature, damping, dry friction) may
-    take all but a hundredth of it, so that the field stays positive."""
+    """Smallest coordinate. An effect that subtracts from a field of the model (armature, damping, dry friction, a
+    spring) may take all but a hundredth of it, so that the field stays positive."""
     prior_sd: float
     """Prior standard deviation, in coordinates, of a parameter that every model has (a nuisance that every hypothesis
     fits); zero for an effect that models lack."""
@@ -92,7 +97,9 @@ def describe_axis(
     if row.name in _NOMINAL_RATIOS:
         prior_sd = _NOMINAL_RATIOS[row.name]
     elif row.name in _NOMINAL_FIELDS:
-        nominal = float(getattr(model, _NOMINAL_FIELDS[row.name])[dof[index]] / scale)
+        field, number = _NOMINAL_FIELDS[row.name], dof[index]
+        number = model.dof_jntid[number] if field.startswith("jnt") else number
+        nominal = float(getattr(model, field)[number] / scale)
         # Dry friction acts on a signal, but what the model has of it can be taken as well. What many models have is a
         # placeholder, ten times what it should be.
         least, prior_sd = -_MOST_TAKEN * nominal, _PRIOR_SHARE * nominal

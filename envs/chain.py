@@ -11,10 +11,12 @@ from dataclasses import dataclass
 import chex
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 from mujoco import mjx
 
 from envs import stepping
+from jaxtune import devices
 from jaxtune.types import Effect
 
 MIN_FRICTION_NM = 1e-6
@@ -60,6 +62,36 @@ class Wrench:
 
 
 @dataclass(frozen=True)
+class Lift:
+    """What a controller adds to carry a robot's weight (MJCF's `gravcomp`): that of the nominal model's links."""
+
+    bodies: np.ndarray
+    """[lifted] ids of the bodies."""
+    points: np.ndarray
+    """[lifted, 3] m, their nominal centres of mass, in their frames."""
+    forces: np.ndarray
+    """[lifted, 3] N in the world."""
+
+    @staticmethod
+    def of(model: mujoco.MjModel) -> "Lift":
+        """Reads it off a nominal model."""
+        bodies = np.flatnonzero(model.body_gravcomp)
+        weights = (model.body_mass * model.body_gravcomp)[bodies, None] * model.opt.gravity
+        return Lift(bodies, model.body_ipos[bodies].copy(), -weights)
+
+    @devices.precisely
+    def torques(self, model: mjx.Model, data: mjx.Data) -> jax.Array:
+        """Computes its torques on the joints, [dofs] Nm, where `data` says that the links are."""
+
+        def of(body, point, force):
+            there = data.xpos[body] + data.xmat[body] @ point
+            return mjx.jac(model, data, there, body)[0] @ force
+
+        points, forces = (jnp.asarray(rows, jnp.float32) for rows in (self.points, self.forces))
+        return jax.vmap(of)(jnp.asarray(self.bodies), points, forces).sum(axis=0)
+
+
+@dataclass(frozen=True)
 class Chain:
     """A controller, its motors and its sensors, with effects in the order in which they act.
 
@@ -92,6 +124,7 @@ class Chain:
     order, which is then the leapfrog scheme."""
     trees: np.ndarray | None = None
     """[joints] kinematic trees of the joints; one where None."""
+    lift: Lift | None = None
     units: np.ndarray | None = None
     """[joints] 1 rad of a hinge, or the way in m that a slide has instead (`envs.rig.Rig.units`); hinges where None."""
 
@@ -218,7 +251,7 @@ class Chain:
             dof_damping=model.dof_damping.at[self.dof].set(damping),
         )
         data = data.replace(
-            qfrc_applied=data.qfrc_applied.at[self.dof].set(passed + rubbing),
+            qfrc_applied=self.lifted(model, data).at[self.dof].add(passed + rubbing),
             xfrc_applied=data.xfrc_applied.at[self.bodies, :3].set(wrench.force),
         )
         data = stepping.step(moved, data)
@@ -226,6 +259,13 @@ class Chain:
         memory["passed"] = passed - slows * joint[1] + share * (rubbing - wrench.torque)
         memory["passed"] += stepping.dry_friction(data)[self.dof]
         return data, memory, torque
+
+    def lifted(self, model, data) -> jax.Array:
+        """Torques with which the robot's weight is carried at its positions, [dofs] Nm (`Lift`)."""
+        if self.lift is None or not len(self.lift.bodies):
+            return jnp.zeros_like(data.qvel)
+        # Data of a step hold where links were before it.
+        return self.lift.torques(model, mjx.com_pos(model, mjx.kinematics(model, data)))
 
     def _rotors_and_links(self, model, data, memory) -> dict:
         """What `Now` says of rotors and their links before a step."""

@@ -99,7 +99,8 @@ def bristles(chain: Chain, model: mjx.Model, data: mjx.Data, values, memory: dic
     load = jnp.maximum(jnp.abs(torque), jnp.abs(gravity))
     now = chain.now_of(x, jnp.stack([position, jnp.zeros_like(position)])).replace(load=load)
     calm = Wrench(torque=torque, force=jnp.zeros_like(now.body_velocity))
-    pulled = chain.stage("wrench", values, calm, now, memory)[0].torque + still.qfrc_passive[chain.dof] - gravity
+    pulled = chain.stage("wrench", values, calm, now, memory)[0].torque - gravity
+    pulled += (still.qfrc_passive + chain.lifted(model, still))[chain.dof]
     friction, _ = chain.stage("friction", values, model.dof_frictionloss[chain.dof], now, memory)
     carried = jnp.clip(pulled / jnp.maximum(friction, MIN_FRICTION_NM), -1.0, 1.0)
     return {row.name: row.start(values[row.name], (carried, past), chain.dt) for row in chain.entering("bristle")}
@@ -121,7 +122,7 @@ def needed(chain: Chain, model: mjx.Model, data: mjx.Data, joint: jax.Array, spe
     there = stepping.placed(model, data.replace(qpos=qpos, qvel=qvel))
     inertia = mjx.full_m(model, there)[chain.dof][:, chain.dof]
     moves = inertia @ speeding - model.dof_armature[chain.dof] * speeding
-    return moves + (there.qfrc_bias - there.qfrc_passive)[chain.dof]
+    return moves + (there.qfrc_bias - there.qfrc_passive - chain.lifted(model, there))[chain.dof]
 
 
 def pressed(chain: Chain, values, torque: jax.Array, needed: jax.Array) -> dict:

@@ -30,7 +30,8 @@ def spec(robot: str) -> mujoco.MjSpec:
 
     It needs no other file: included files are part of it, and meshes, height fields and textures are left out
     (`without_files`). Saved as XML, it loads again from any folder. A body without a name that a joint moves is called
-    after the joint, as a place where effects may be.
+    after the joint, as a place where effects may be. Rotors and dampers that the file gives to actuators are joints'
+    (`with_rotors`).
 
     Args:
       robot: the name of a built-in robot, or the path of an MJCF file, as in a log's `meta.yaml`.
@@ -42,7 +43,7 @@ def spec(robot: str) -> mujoco.MjSpec:
     if not path.is_file():
         raise ValueError(f"robot: got '{robot}', expected {', '.join(BUILT_IN)} or the path of an MJCF file")
     try:
-        found = without_files(mujoco.MjSpec.from_file(str(path)))
+        found = with_rotors(without_files(mujoco.MjSpec.from_file(str(path))))
     except ValueError as error:
         raise ValueError(f"robot: {path}: {error}") from error
     taken = {body.name for body in found.bodies}
@@ -131,6 +132,30 @@ def _delete_geoms(spec: mujoco.MjSpec, geoms: Sequence[mujoco.MjsGeom]) -> None:
         spec.delete(element)
 
 
+def with_rotors(spec: mujoco.MjSpec) -> mujoco.MjSpec:
+    """Gives joints the rotors and dampers that their actuators have (MJCF's `actuator/armature` and `damping`).
+
+    MuJoCo has them act through the square of the gear. MJX has none, and a rig brings motors of its own.
+
+    Args:
+      spec: of the robot; it is changed.
+
+    Raises:
+      ValueError: such an actuator acts on something else, as a tendon.
+    """
+    for actuator in spec.actuators:
+        damping = np.asarray(actuator.damping)
+        if actuator.armature == 0 and not damping.any():
+            continue
+        if actuator.trntype not in (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT):
+            raise ValueError(f"actuator '{actuator.name}': got an armature or damping, expected them on a joint alone")
+        joint = spec.joint(actuator.target)
+        joint.armature += actuator.gear[0] ** 2 * actuator.armature
+        joint.damping = np.asarray(joint.damping) + actuator.gear[0] ** 2 * damping
+        actuator.armature, actuator.damping = 0.0, np.zeros_like(damping)
+    return spec
+
+
 def write_inertia(body: mujoco.MjsBody, model: mujoco.MjModel | mjx.Model, number: int) -> None:
     """Gives a body mass and inertia of its own, those of a body of a model, in whatever form they were before.
 
@@ -189,18 +214,22 @@ def suspended(spec: mujoco.MjSpec, joints: Sequence[str] | None = None) -> mujoc
     """Compiles a robot as it is on a test rig: without its free joints, and with contacts switched off.
 
     Its own actuators, sensors and keyframes are left out, and its choice of a solver, an integrator and diagnostics:
-    who simulates a rig brings torques, readings and these. Gravity compensation that went through actuators stays.
+    who simulates a rig brings torques, readings and these. Gravity compensation that went through actuators stays, and
+    so do their rotors (`with_rotors`).
 
     Args:
       spec: of the robot; it is copied, not changed.
       joints: those that are read. Others are held where the model puts them (`envs.held`); None if all are read.
     """
-    spec = without_files(spec.copy())
+    spec = with_rotors(without_files(spec.copy()))
     still = [] if joints is None else held.elements(spec, joints)
     for element in (*spec.keys, *spec.actuators, *spec.sensors, *spec.pairs, *spec.tuples, *still, *free_joints(spec)):
         spec.delete(element)
     for joint in spec.joints:
         joint.actgravcomp = False
+    for body in spec.bodies:
+        # What the compiler would leave out of the inertia matrix may be there once a centre of mass is another.
+        body.simple = False
     default = mujoco.MjOption()
     for name in ("solver", "integrator", "enableflags", "noslip_iterations"):
         setattr(spec.option, name, getattr(default, name))

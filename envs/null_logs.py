@@ -5,7 +5,7 @@ effects one always improves the fit a little, because it imitates differences th
 its integrator, the moment at which a controller reads the joint. A null log therefore has such differences too:
 
 - MuJoCo C simulates the nominal model with half the step, another integrator and a controller whose ticks jitter;
-- its masses, inertias, armatures, dampings and frictions are drawn from the prior, its controller's gains
+- its masses, inertias, armatures, dampings, frictions and springs are drawn from the prior, its controller's gains
   are those of the log;
 - if it is unknown whether targets are held between rows, or move on in straight lines, one of them is drawn;
 - half of all controllers act on readings with the noise and the rounding of the logged ones, as those robots' do whose
@@ -101,11 +101,15 @@ def _drawn(spec: mujoco.MjSpec, joints: Sequence[str], rng: np.random.Generator)
     # A heavier link of the same shape has an inertia that grows in proportion, but its shape is not known better.
     masses = _factors(rng, model.nbody)
     model.body_mass[:] *= masses
+    # A controller that carries the links' weight carries that of the nominal ones.
+    model.body_gravcomp[:] /= masses
     model.body_inertia[:] *= (masses * _factors(rng, model.nbody))[:, None]
     for name in ("dof_armature", "dof_damping", "dof_frictionloss"):
         getattr(model, name)[:] *= _factors(rng, model.nv)
     shifts = rng.standard_normal((model.nbody, 3)).clip(-2.0, 2.0)
     model.body_ipos[:] += loose(model.body_mass, model.body_inertia)[:, None] * shifts
+    if model.jnt_stiffness.any():
+        model.jnt_stiffness[:] *= _factors(rng, model.njnt)
     # Half of all robots have friction that holds, and half the engine's, which creeps under a load.
     if rng.integers(0, 2):
         model.dof_solimp[:, :2] = np.maximum(model.dof_solimp[:, :2], _HOLDS)

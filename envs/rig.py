@@ -19,7 +19,7 @@ from mujoco import mjx
 
 from envs import beginning, sensing
 from envs.axes import Axis, describe_axis, loose
-from envs.chain import MIN_FRICTION_NM, Chain
+from envs.chain import MIN_FRICTION_NM, Chain, Lift
 from envs.effects import EVERY
 from envs.held import unread_joints
 from envs.models import hinges, links, suspended
@@ -69,6 +69,9 @@ class Rig:
         control_hz: float,
     ):
         model = suspended(spec, joints)
+        for name in ("jnt_stiffnesspoly", "dof_dampingpoly", "tendon_stiffnesspoly", "tendon_dampingpoly"):
+            if getattr(model, name).any():
+                raise ValueError(f"robot: got springs or dampers of several terms ({name}), which MJX has not")
         self.control_hz = control_hz
         self.dt = 1.0 / control_hz / np.ceil(1.0 / control_hz / _LONGEST_STEP_S - 1e-9)
         model.opt.timestep = self.dt
@@ -92,6 +95,8 @@ class Rig:
         # MJX refuses shapes whose contacts it does not know, though nothing touches here.
         device.geom_contype[:] = device.geom_conaffinity[:] = 0
         device.opt.iterations = _ITERATIONS
+        # The chain lifts what the nominal model's controller lifts, whatever a link weighs.
+        device.body_gravcomp[:] = 0.0
         device.dof_frictionloss[self.dof] = np.maximum(model.dof_frictionloss[self.dof], MIN_FRICTION_NM)
         try:
             self._model = mjx.put_model(device)
@@ -116,6 +121,7 @@ class Rig:
             lead_s=0.5 * self.dt,
             trees=self.trees,
             units=self.units,
+            lift=Lift.of(model),
         )
         self.axes = self._describe_axes()
 
@@ -130,8 +136,10 @@ class Rig:
         """All that compiled programs depend on beside `system`: robots of equal layout can share them."""
         addresses = (self.qpos.tobytes(), self.dof.tobytes(), self._bodies.tobytes(), self.trees.tobytes())
         frames = np.asarray(self._model.body_quat).tobytes()
+        lift = self.chain.lift
+        lifts = tuple(array.tobytes() for array in (lift.bodies, lift.points, lift.forces))
         paces = self.dt, self.control_hz, self.units.tobytes()
-        return self.joints, self.bodies, *paces, addresses, frames, jax.tree.structure(self.system)
+        return self.joints, self.bodies, *paces, addresses, frames, *lifts, jax.tree.structure(self.system)
 
     def on(self, system: System) -> "Rig":
         """Returns the rig with another robot of the same layout on it, also inside a compiled program."""
@@ -274,7 +282,8 @@ class Rig:
         # From the body up to the world, whose id is 0; the whole robot is no body and finds nothing.
         while body > 0:
             mine = self.mj_model.jnt_bodyid[[self.mj_model.joint(joint).id for joint in self.joints]] == body
-            found += np.flatnonzero(mine).tolist()
+            # Of several joints in one body the last is nearest.
+            found += sorted(np.flatnonzero(mine).tolist(), key=lambda number: -self.dof[number])
             body = self.mj_model.body_parentid[body]
         return tuple(found)
 

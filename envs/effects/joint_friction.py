@@ -27,7 +27,7 @@ def _coulomb(values, bound, now, memory):
 def _stribeck(values, bound, now, memory):
     """bound' = bound + torque exp(-(|speed| / Stribeck speed)^(1 + gaussian)).
 
-    Both powers are in use: one (Tustin, 1947) and two (Armstrong-Helouvry, Dupont and Canudas de Wit, 1994, section 2.1).
+    Both powers are in use: one (Tustin, 1947) and two (Armstrong-Helouvry, Dupont and Canudas de Wit, 1994).
     """
     share = jnp.abs(now.speed) / values["speed_rad_s"]
     return bound + values["torque_nm"] * jnp.exp(-(share ** (1.0 + values["gaussian"]))), memory

@@ -214,6 +214,6 @@ def _ranges(model: mujoco.MjModel, joints: Sequence[str]) -> tuple[np.ndarray, n
     if endless := unlimited_slides(model, joints):
         raise ValueError(f"robot: slide joint '{endless[0]}' has no range, expected one in the MJCF, in m")
     span = np.array([joint.range for joint in found])
-    low, high = np.where(limited[:, None], span, [-np.pi / 2, np.pi / 2]).T
-    middle = np.where(limited, 0.5 * (low + high), np.array([joint.qpos0[0] for joint in found]))
-    return low, high, middle
+    home = np.array([joint.qpos0[0] for joint in found])
+    low, high = np.where(limited[:, None], span, home[:, None] + [-np.pi / 2, np.pi / 2]).T
+    return low, high, np.where(limited, 0.5 * (low + high), home)

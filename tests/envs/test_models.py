@@ -5,9 +5,11 @@ from types import SimpleNamespace
 import mujoco
 import numpy as np
 import pytest
+from mujoco import mjx
 from PIL import Image
 
-from envs import models
+from envs import models, stepping
+from envs.null_logs import Robot
 from envs.rig import Rig
 
 BOX = """v -1 -1 -1
@@ -261,3 +263,51 @@ def test_a_disc_or_a_rod_may_be_rounded(tmp_path, moments):
     (tmp_path / "disc.xml").write_text(spec.to_xml())
     read = mujoco.MjModel.from_xml_path(str(tmp_path / "disc.xml"))
     np.testing.assert_allclose(np.sort(read.body_inertia[1]), moments, rtol=5e-5, atol=3e-6)
+
+
+GEARED = """<mujoco><worldbody><body name="link"><joint name="hinge" axis="0 1 0" armature="0.01" damping="0.1"/>
+  <geom size="0.05" pos="0.2 0 0" mass="1"/></body></worldbody>
+  <actuator><motor joint="hinge" gear="50" armature="1e-4" damping="2e-4"/></actuator></mujoco>"""
+
+
+def test_a_suspended_robot_keeps_the_rotors_of_its_actuators():
+    spec = mujoco.MjSpec.from_string(GEARED)
+    whole, hung = spec.compile(), models.suspended(spec)
+    for model in (whole, hung):
+        data = mujoco.MjData(model)
+        data.qvel[:] = 1.0
+        mujoco.mj_forward(model, data)
+        assert data.M[0] == pytest.approx(0.01 + 2500 * 1e-4 + 0.04 + 0.4 * 0.05**2, rel=1e-6)
+        assert data.qfrc_passive[0] == pytest.approx(-0.1 - 2500 * 2e-4, rel=1e-6)
+    assert spec.actuators[0].armature == 1e-4
+
+
+def test_a_rotor_that_is_no_joints_is_refused():
+    tendon = '<tendon><fixed name="belt"><joint joint="hinge" coef="1"/></fixed></tendon>'
+    xml = GEARED.replace('joint="hinge" gear', 'name="winch" tendon="belt" gear').replace(
+        "</mujoco>", f"{tendon}</mujoco>"
+    )
+    with pytest.raises(
+        ValueError, match="actuator 'winch': got an armature or damping, expected them on a joint alone"
+    ):
+        models.suspended(mujoco.MjSpec.from_string(xml))
+
+
+def test_springs_that_mjx_lacks_are_refused():
+    spec = mujoco.MjSpec.from_string(GEARED.replace('damping="0.1"', 'stiffness="2 0 30"'))
+    with pytest.raises(ValueError, match=r"springs or dampers of several terms \(jnt_stiffnesspoly\)"):
+        Rig(spec, ("hinge",), 200.0)
+
+
+def test_a_turntable_may_have_its_weight_beside_its_axis():
+    # The compiler would leave out what its inertia matrix does not have, and MuJoCo refuse another centre of mass.
+    joints = '<joint name="x" type="slide" axis="1 0 0"/><joint name="turn"/>'
+    disc = f'<body name="disc">{joints}<geom type="cylinder" size="0.2 0.02" mass="2"/></body>'
+    spec = mujoco.MjSpec.from_string(f"<mujoco><worldbody>{disc}</worldbody></mujoco>")
+    drawn = Robot.drawn(spec, ("x", "turn"), np.random.default_rng(0)).model
+    rig = Rig(spec, ("x", "turn"), 200.0)
+    assert np.abs(drawn.body_ipos[1]).max() > 1e-4
+    values = rig.tree(np.array([0.1 * (axis.effect == "com_offset" and axis.parameter == "y_m") for axis in rig.axes]))
+    model = rig.model(rig.values(values))
+    inertia = mjx.full_m(model, stepping.placed(model, mjx.make_data(model)))
+    assert abs(inertia[0, 1]) == pytest.approx(2 * float(model.body_ipos[1, 1]), rel=1e-4)

@@ -16,6 +16,7 @@ from envs.biteno import constants
 from envs.effects import LIBRARY
 from envs.logs import Controller, Run
 from envs.models import suspended
+from envs.null_logs import Robot
 from envs.rig import Rig
 
 START = np.array([0.5, -0.7])
@@ -952,3 +953,48 @@ def test_neighbours_are_those_of_the_model_in_whatever_order_a_log_names_joints(
     assert [before[names.index("shoulder")], after[names.index("elbow")]] == [2, 2]
     assert names[before[names.index("elbow")]] == "shoulder"
     assert names[after[names.index("shoulder")]] == "elbow"
+
+
+LIFTED = """<mujoco><worldbody>
+  <body name="upper" gravcomp="1"><joint name="a" axis="0 1 0" armature="0.01"/>
+    <inertial pos="0.15 0 0" mass="1" diaginertia="0.001 0.01 0.01"/>
+    <body name="lower" pos="0.3 0 0" gravcomp="0.7"><joint name="b" axis="0 1 0" armature="0.01"/>
+      <inertial pos="0.1 0 0" mass="0.7" diaginertia="0.001 0.004 0.004"/>
+    </body></body>
+</worldbody></mujoco>"""
+
+
+def test_a_controller_that_carries_its_robots_weight_does_not_know_of_a_load():
+    spec = mujoco.MjSpec.from_string(LIFTED)
+    player = rigs.Player(Rig(spec, ("a", "b"), rigs.CONTROL_HZ))
+    target = np.linspace(0.0, 0.3, rigs.STEPS)[:, None] * [1.0, -1.0]
+    segment = rigs.segment(player.rig, np.zeros(2), target, kp=np.array([40.0, 10.0]), kd=np.array([3.0, 0.6]))
+    load = spec.body("lower").add_body(name="load", pos=[0.15, 0.02, 0.0])
+    load.explicitinertial, load.mass, load.inertia = True, 0.5, [1e-9] * 3
+    load.ipos, load.iquat = [0.0] * 3, [1.0, 0.0, 0.0, 0.0]
+    loaded = spec.compile()
+    loaded.opt.timestep = player.rig.dt
+    expected = rigs.in_mujoco(player.rig, loaded, segment)[:, 0]
+    payload = {"lower": {"kg": 0.5, "x_m": 0.05, "y_m": 0.02}}
+    np.testing.assert_allclose(player.play(segment, payload=payload)["q"], expected, atol=1e-6)
+    # Its weight pulls: without, nothing does.
+    assert np.abs(player.play(segment)["q"] - expected).max() > 0.01
+
+
+def test_of_several_joints_in_one_body_the_last_is_nearest_to_it():
+    body = '<body name="hip"><joint name="{}"/><joint name="{}" axis="1 0 0"/><joint name="{}" axis="0 1 0"/>'
+    body += '<geom size="0.1"/><body name="leg" pos="0 0 -1"><joint name="knee"/><geom size="0.1"/></body></body>'
+    xml = f"<mujoco><worldbody>{body.format('yaw', 'roll', 'pitch')}</worldbody></mujoco>"
+    rig = Rig(mujoco.MjSpec.from_string(xml), ("knee", "roll", "yaw", "pitch"), rigs.CONTROL_HZ)
+    assert rig.moves("body", "leg") == (0, 3, 1, 2)
+
+
+def test_springs_of_the_model_are_known_no_better_than_its_dampers():
+    joints = '<joint name="{}" stiffness="{}"/><geom size="0.1" pos="0.2 0 0"/>'
+    lower = f'<body name="lower">{joints.format("b", 0)}</body>'
+    xml = f'<mujoco><worldbody><body name="upper">{joints.format("a", 20)}{lower}</body></worldbody></mujoco>'
+    rig = Rig(mujoco.MjSpec.from_string(xml), ("a", "b"), rigs.CONTROL_HZ)
+    found = {axis.place: (axis.prior_sd, axis.least) for axis in rig.axes if axis.effect == "joint_spring"}
+    np.testing.assert_allclose((found["a"], found["b"]), [(2.0, -19.8), (0.0, 0.0)], rtol=1e-6)
+    drawn = Robot.drawn(mujoco.MjSpec.from_string(xml), ("a", "b"), np.random.default_rng(0)).model.jnt_stiffness
+    assert drawn[0] != 20.0 and 16.0 < drawn[0] < 25.0 and drawn[1] == 0.0
