@@ -417,5 +417,6 @@ def test_a_built_in_robot_may_stand_for_the_one_of_a_log(tmp_path):
 def test_a_hinge_without_limits_turns_about_where_the_model_has_it():
     body = '<body><joint name="a" ref="143"/><geom size="0.1"/></body>'
     spec = mujoco.MjSpec.from_string(f"<mujoco><worldbody>{body}</worldbody></mujoco>")
-    runs = excitation(spec, ("a",), 8, 1.0, 100.0)
-    assert all(np.abs(run.target - np.deg2rad(143)).max() < np.pi / 2 for run in runs)
+    runs = excitation(spec, ("a",), 16, 2.0, 100.0)
+    # A quarter of its range away from there at most, and by 0.6 rad each way.
+    assert all(np.abs(run.target - np.deg2rad(143)).max() < 0.25 * np.pi + 0.601 for run in runs)
