@@ -49,8 +49,10 @@ class Now:
     body_velocity: jax.Array  # [bodies, 3] m/s of the centres of mass
     between: jax.Array  # [joints] rad, how far targets are from the held ones if they move on between rows
     unit: jax.Array  # [joints] unit of angle: 1 rad of a hinge, or the way in m that a slide has instead
-    before: jax.Array  # [joints] index of the joint before in the model's order, past the last where there is none
-    after: jax.Array  # [joints] the same of the joint after
+    before: jax.Array  # [joints] index of the joint that carries this one, past the last where there is none
+    after: (
+        jax.Array
+    )  # [joints] of the one that this one carries, past the last where there is none or there are several
 
 
 @chex.dataclass(frozen=True)
@@ -91,6 +93,23 @@ class Lift:
         return jax.vmap(of)(jnp.asarray(self.bodies), points, forces).sum(axis=0)
 
 
+def carriers(model: mujoco.MjModel, dof: np.ndarray) -> np.ndarray:
+    """Finds the joint that carries each joint, [joints] indices; as many as joints where none does.
+
+    Args:
+      model: of the robot.
+      dof: addresses of the joints' velocities.
+    """
+    numbers = {int(address): number for number, address in enumerate(dof)}
+    found = []
+    for address in dof:
+        parent = int(model.dof_parentid[address])
+        while parent >= 0 and parent not in numbers:
+            parent = int(model.dof_parentid[parent])
+        found.append(numbers.get(parent, len(dof)))
+    return np.array(found)
+
+
 @dataclass(frozen=True)
 class Chain:
     """A controller, its motors and its sensors, with effects in the order in which they act.
@@ -122,23 +141,23 @@ class Chain:
     lead_s: float = 0.0
     """How far positions of the simulation are ahead of its velocities; half a step makes semi-implicit Euler of second
     order, which is then the leapfrog scheme."""
-    trees: np.ndarray | None = None
-    """[joints] kinematic trees of the joints; one where None."""
+    before: np.ndarray | None = None
+    """[joints] index of the joint that carries each joint (`carriers`), as many as joints for none."""
     lift: Lift | None = None
+    """What carries the robot's weight; none where None."""
     units: np.ndarray | None = None
     """[joints] 1 rad of a hinge, or the way in m that a slide has instead (`envs.rig.Rig.units`); hinges where None."""
 
     @property
     def beside(self) -> tuple[np.ndarray, np.ndarray]:
-        """Indices of the joints before and after each in the model's order, [joints]; as many as joints for none.
+        """Indices of the joints before and after each, [joints]; as many as joints for none.
 
-        Those of another tree are none. Trees do not feel each other, and may be perturbed together.
+        Where a robot branches, no joint is after the last one before.
         """
-        count, order = len(self.dof), np.argsort(self.dof)
-        trees = np.zeros(count) if self.trees is None else self.trees[order]
-        before, after, along = np.full(count, count), np.full(count, count), trees[1:] == trees[:-1]
-        before[order[1:][along]], after[order[:-1][along]] = order[:-1][along], order[1:][along]
-        return before, after
+        count = len(self.dof)
+        before = np.full(count, count) if self.before is None else self.before
+        children = [np.flatnonzero(before == number) for number in range(count)]
+        return before, np.array([mine[0] if len(mine) == 1 else count for mine in children])
 
     def step(self, model: mjx.Model, data: mjx.Data, memory: dict, values, x) -> tuple[mjx.Data, dict, dict]:
         """Simulates one step of the physics, from the controller's inputs to the robot's motion.

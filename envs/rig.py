@@ -19,7 +19,7 @@ from mujoco import mjx
 
 from envs import beginning, sensing
 from envs.axes import Axis, describe_axis, loose
-from envs.chain import MIN_FRICTION_NM, Chain, Lift
+from envs.chain import MIN_FRICTION_NM, Chain, Lift, carriers
 from envs.effects import EVERY
 from envs.held import unread_joints
 from envs.models import hinges, links, suspended
@@ -120,7 +120,7 @@ class Rig:
             bodies=self._bodies,
             period_s=1.0 / control_hz,
             lead_s=0.5 * self.dt,
-            trees=self.trees,
+            before=carriers(model, self.dof),
             units=self.units,
             lift=Lift.of(model),
         )
@@ -138,7 +138,7 @@ class Rig:
         addresses = (self.qpos.tobytes(), self.dof.tobytes(), self._bodies.tobytes(), self.trees.tobytes())
         frames = np.asarray(self._model.body_quat).tobytes()
         lift = self.chain.lift
-        lifts = tuple(array.tobytes() for array in (lift.bodies, lift.points, lift.forces))
+        lifts = tuple(array.tobytes() for array in (lift.bodies, lift.points, lift.forces, self.chain.before))
         paces = self.dt, self.control_hz, self.units.tobytes()
         return self.joints, self.bodies, *paces, addresses, frames, *lifts, jax.tree.structure(self.system)
 

@@ -39,8 +39,8 @@ def measure_scales(rig: Rig, runs: Sequence[Run]) -> dict[str, np.ndarray]:
         speed      rms(dq)                     rad/s
         slow       0.1 rms(dq)                 rad/s
         motor      largest limit / rms(dq)     Nm s/rad
-        of_before  torque / torque of the joint before, in the model's order
-        of_after   the same of the joint after
+        of_before  torque / torque of the joint that carries this one
+        of_after   the same of the one that it carries
         angle      1 rad of a hinge; of a slide 0.05 m, which a pinion of that radius moves it by
 
     Hand the result to `Rig.scaled`.

@@ -1,6 +1,6 @@
 """A learned torque at every joint, for what no effect of the library explains.
 
-It depends on the joint, and on those before and after it in the model's order: tendons and belts couple neighbours.
+It depends on the joint, on the one that carries it and on the one that it carries: tendons and belts couple neighbours.
 
 It is no hypothesis and names no cause. It bounds what effects of the joints could explain at all, and it is what a user
 gets where something is missing that has no name.

@@ -940,8 +940,17 @@ GRIPPER = """<mujoco><worldbody>
 def test_joints_that_something_couples_are_of_one_tree(coupling, trees):
     rig = Rig(mujoco.MjSpec.from_string(GRIPPER.format(coupling=coupling)), ("l", "r"), rigs.CONTROL_HZ)
     np.testing.assert_array_equal(rig.trees, trees)
-    # Joints of two trees are no neighbours.
-    assert list(rig.chain.beside[0]) == ([2, 0] if trees == [0, 0] else [2, 2])
+
+
+def test_neighbours_of_a_joint_are_along_its_own_arm():
+    link = '<body><joint name="{}"/><geom size="0.1"/>'
+    arms = [link.format(f"{side}_1") + link.format(f"{side}_2") + 2 * "</body>" for side in ("left", "right")]
+    trunk = link.format("yaw") + link.format("lean") + "".join(arms) + 2 * "</body>"
+    spec = mujoco.MjSpec.from_string(f"<mujoco><worldbody>{trunk}</worldbody></mujoco>")
+    joints = ("yaw", "lean", "right_1", "right_2", "left_1", "left_2")
+    before, after = Rig(spec, joints, rigs.CONTROL_HZ).chain.beside
+    assert before.tolist() == [6, 0, 1, 2, 1, 4]
+    assert after.tolist() == [1, 6, 3, 6, 5, 6]
 
 
 @pytest.mark.parametrize("order", [(0, 1), (1, 0)])
