@@ -113,7 +113,7 @@ def build_question(
     plain = plain or Rig(spec, log.joints, rate)
     plain.check_matches(log.joints, rate)
     rig = plain.scaled(measure_scales(plain, unsealed))
-    signals, partly = _compared(log)
+    signals, partly = _compared(log, plain.mj_model)
     follows = ours is not None
     sensed = np.array([follows and axis.effect in OF_SENSORS for axis in rig.axes])
     pushes = {axis.place: number for number, axis in enumerate(rig.axes) if axis.effect == "constant_push"}
@@ -165,8 +165,10 @@ def _free_or_asked(
     }
 
 
-def _compared(log: Log) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Names of the signals that are compared, and a note for each that is not, since only some runs have it."""
+def _compared(log: Log, model: mujoco.MjModel) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Names of the signals that are compared, and a note for each that is not: as only some runs have it, or since an
+    IMU is on a first link that moves, where a rig has a base.
+    """
     counts = {name: sum(name in run.signals for run in log.runs) for name in (*sorted(segments.COMPARED), "target")}
     # Segments of all runs share one layout.
     everywhere = [name for name, count in counts.items() if count == len(log.runs)]
@@ -174,6 +176,8 @@ def _compared(log: Log) -> tuple[tuple[str, ...], tuple[str, ...]]:
     # Without targets the torque is what was sent, not measured.
     left_out = {"target"} if "target" in everywhere else {"target", "tau"}
     notes = tuple(f"{name} is not in all runs, and is not used" for name in partly)
+    if "gravity" in everywhere and model.body_jntnum[1]:
+        left_out, notes = {*left_out, "gravity"}, (*notes, "gravity is of a link that moves, and is not used")
     return tuple(name for name in everywhere if name not in left_out), notes
 
 

@@ -529,3 +529,12 @@ def test_logs_that_cannot_be_simulated_are_refused_with_the_run_named(spec, plai
     # A run of a second has one segment of 0.45 s, beside what comes before it.
     with pytest.raises(ValueError, match=r"'train' has 2 segment\(s\) of 0.45 s, expected 3 or more"):
         build_question(plain, spec, null_logs=0)
+
+
+def test_an_imu_on_a_link_that_moves_is_not_compared(spec):
+    log = record(spec, JOINTS, excitation(spec, JOINTS, 4, 1.2, 200.0), CONTROLLER, Truth(None, (), 0.0), 0.0, seed=3)
+    level = {run.name: np.tile([0.0, 0.0, -1.0], (len(run.time), 1)) for run in log.runs}
+    runs = tuple(replace(run, signals={**run.signals, "gravity": level[run.name]}) for run in log.runs)
+    question = build_question(replace(log, runs=runs), spec, (0.05, 0.1, 0.2), null_logs=0)
+    assert "gravity is of a link that moves, and is not used" in question.notes
+    assert "gravity" not in {signal for signal, _ in question.problem.cells}
