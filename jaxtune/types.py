@@ -229,6 +229,9 @@ class Form:
     like: str = ""
     """Row, of as many parameters, that a small effect in this form is taken for: where that one leads, this is fitted
     too."""
+    far: bool = False
+    """True where with much of it the effect itself is little: a fit from what the effect is alone may not come there,
+    so another one begins with the largest size of the form and little of the effect."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -183,7 +183,8 @@ ROWS = (
             Parameter(name="stall_loss", bounds=(0.0, 0.95), prior=0.3),
         ),
         sizes=(0.1, 0.3, 0.5),
-        forms=(Form("low_stall", "torque_speed", ("stall_loss",)),),
+        # A motor with a fraction of the declared torque loses little of it with speed.
+        forms=(Form("low_stall", "torque_speed", ("stall_loss",), far=True),),
         act=_torque_speed,
         sentence="The faster the motor turns, the less torque it can give.",
         excited_by="saturating steps",

@@ -69,8 +69,8 @@ def forms(axes: Sequence[Axis], rows: Mapping[str, Effect], every: Sequence[Hypo
 
 
 def _as_form(shape: Hypothesis, effect: Hypothesis, form: Form) -> Hypothesis:
-    said = {"form": form.name, "screened": form.screened, "beside": form.beside, "like": form.like}
-    return replace(shape, name=effect.name, family=effect.family, **said)
+    said = {name: getattr(form, name) for name in ("screened", "beside", "like", "far")}
+    return replace(shape, form=form.name, name=effect.name, family=effect.family, **said)
 
 
 _RIGHT = {"left": "right", "l": "r", "fl": "fr", "rl": "rr", "hl": "hr", "bl": "br"}

@@ -66,6 +66,11 @@ def shaped(forms: Sequence[Hypothesis], free: Sequence[Hypothesis], leads: Seque
         for form in (form for form in beside(forms, lead.hypotheses) if form.shapes(effect)):
             point = _start(form)
             found.append(Lead((*lead.hypotheses, form), np.concatenate([lead.point, point]), lead.start, lead.cost))
+            if form.far:
+                little = lead.point.copy()
+                little[: len(effect.directions)] = 0.5 * effect.probes[effect.probes.max(axis=1) > 0][0]
+                much = np.concatenate([little, form.probes[-1]])
+                found.append(Lead((*lead.hypotheses, form), much, lead.start, lead.cost))
             alone = [h for h in free if h.key not in known and np.array_equal(h.directions, form.directions)]
             found += [Lead((h,), point, lead.start, lead.cost) for h in alone]
             known.update(h.key for h in alone)

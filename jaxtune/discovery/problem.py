@@ -57,6 +57,8 @@ class Hypothesis:
     """Of a form: another form of the effect, which the screen tries together with both as well."""
     like: str = ""
     """Of a form: name of the effect that a small one in this form is taken for."""
+    far: bool = False
+    """Of a form: much of it makes the effect itself little, so a fit begins there too."""
     each: bool = False
     """True where every place has a size of its own: `directions` has a row for each, `joints` one joint."""
 

@@ -501,6 +501,11 @@ def test_a_form_that_is_an_effect_of_its_own_is_fitted_alone_too():
     (plain,) = leads.shaped([DIRECTION], (), [both], 1)
     assert [h.key for h in plain.hypotheses] == ["coulomb@slider"]
     assert plain.point == pytest.approx([0.8])
+    # Where much of a form leaves little of the effect, a fit begins there too.
+    far, point = replace(WARPED, far=True), np.concatenate([0.5 * coulomb.probes[0], WARPED.probes[-1]])
+    usual, other = leads.shaped([far], (), [first], 1)
+    assert usual.point[0] == 0.8 and usual.hypotheses == other.hypotheses
+    np.testing.assert_array_equal(other.point, point)
     # What may pass for another effect is fitted where that one leads, unless it leads itself.
     passes = replace(DIRECTION, form="beside", like="damping")
     found = leads.shaped([passes], HYPOTHESES, [second], 1)
