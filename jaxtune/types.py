@@ -231,7 +231,7 @@ class Form:
     too."""
     far: bool = False
     """True where with much of it the effect itself is little: a fit from what the effect is alone may not come there,
-    so another one begins with the largest size of the form and little of the effect."""
+    so others begin with much of the form and little of the effect."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -67,15 +67,27 @@ def shaped(forms: Sequence[Hypothesis], free: Sequence[Hypothesis], leads: Seque
             point = _start(form)
             found.append(Lead((*lead.hypotheses, form), np.concatenate([lead.point, point]), lead.start, lead.cost))
             if form.far:
-                little = lead.point.copy()
-                little[: len(effect.directions)] = 0.5 * effect.probes[effect.probes.max(axis=1) > 0][0]
-                much = np.concatenate([little, form.probes[-1]])
-                found.append(Lead((*lead.hypotheses, form), much, lead.start, lead.cost))
+                found += _from_far(lead, form)
             alone = [h for h in free if h.key not in known and np.array_equal(h.directions, form.directions)]
             found += [Lead((h,), point, lead.start, lead.cost) for h in alone]
             known.update(h.key for h in alone)
         if not others:
             found += taken_for(lead, forms, [h for h in free if h.key not in known])
+    return found
+
+
+def _from_far(lead: Lead, form: Hypothesis) -> list[Lead]:
+    """Lists further starts with a form of a lead's effect: much of the form, and little of the effect.
+
+    Where limits are not reached costs have no slope, so there are several.
+    """
+    effect, found = lead.hypotheses[0], []
+    smallest = effect.probes[effect.probes.max(axis=1) > 0][0]
+    for share in (0.25, 1.0):
+        for much in form.probes[-2:]:
+            point = lead.point.copy()
+            point[: len(smallest)] = share * smallest
+            found.append(Lead((*lead.hypotheses, form), np.concatenate([point, much]), lead.start, lead.cost))
     return found
 
 

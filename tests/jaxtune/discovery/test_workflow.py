@@ -501,11 +501,12 @@ def test_a_form_that_is_an_effect_of_its_own_is_fitted_alone_too():
     (plain,) = leads.shaped([DIRECTION], (), [both], 1)
     assert [h.key for h in plain.hypotheses] == ["coulomb@slider"]
     assert plain.point == pytest.approx([0.8])
-    # Where much of a form leaves little of the effect, a fit begins there too.
-    far, point = replace(WARPED, far=True), np.concatenate([0.5 * coulomb.probes[0], WARPED.probes[-1]])
-    usual, other = leads.shaped([far], (), [first], 1)
-    assert usual.point[0] == 0.8 and usual.hypotheses == other.hypotheses
-    np.testing.assert_array_equal(other.point, point)
+    # Where much of a form leaves little of the effect, fits begin there too.
+    usual, *others = leads.shaped([replace(WARPED, far=True)], (), [first], 1)
+    assert usual.point[0] == 0.8 and all(one.hypotheses == usual.hypotheses for one in others)
+    little, much = coulomb.probes[0, 0], WARPED.probes[-2:, 0]
+    expected = [(share * little, size) for share in (0.25, 1.0) for size in much]
+    np.testing.assert_allclose([one.point for one in others], expected)
     # What may pass for another effect is fitted where that one leads, unless it leads itself.
     passes = replace(DIRECTION, form="beside", like="damping")
     found = leads.shaped([passes], HYPOTHESES, [second], 1)
