@@ -50,9 +50,7 @@ class Now:
     between: jax.Array  # [joints] rad, how far targets are from the held ones if they move on between rows
     unit: jax.Array  # [joints] unit of angle: 1 rad of a hinge, or the way in m that a slide has instead
     before: jax.Array  # [joints] index of the joint that carries this one, past the last where there is none
-    after: (
-        jax.Array
-    )  # [joints] of the one that this one carries, past the last where there is none or there are several
+    after: jax.Array  # [joints] of the one joint that this one carries, past the last where there is no such
 
 
 @chex.dataclass(frozen=True)

@@ -13,7 +13,7 @@ import numpy as np
 
 from envs.corrected.record import EFFECTS, MODEL, Effects
 from envs.effects import EVERY
-from envs.models import free_joints, without_files, write_inertia
+from envs.models import free_joints, with_rotors, without_files, write_inertia
 from envs.rig import Rig
 
 
@@ -40,9 +40,12 @@ def _corrected_spec(spec: mujoco.MjSpec, rig: Rig, vector: np.ndarray) -> mujoco
     """Makes the nominal MJCF with the corrected inertias, armatures, dampings, springs and dry frictions, compiled."""
     values = rig.values(rig.tree(jnp.asarray(vector, jnp.float32)))
     model, device = rig.mj_model, jax.jit(rig.model)(values)
-    spec = without_files(spec.copy())
+    spec = with_rotors(without_files(spec.copy()))
     for name in rig.bodies:
-        write_inertia(spec.body(name), device, model.body(name).id)
+        body, number = spec.body(name), model.body(name).id
+        write_inertia(body, device, number)
+        # A controller carries what the nominal link weighs.
+        body.gravcomp = float(model.body_gravcomp[number] * model.body_mass[number] / device.body_mass[number])
     for number, name in enumerate(rig.joints):
         dof, joint = rig.dof[number], spec.joint(name)
         joint.armature = float(device.dof_armature[dof])

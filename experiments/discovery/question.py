@@ -166,8 +166,9 @@ def _free_or_asked(
 
 
 def _compared(log: Log, model: mujoco.MjModel) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Names of the signals that are compared, and a note for each that is not: as only some runs have it, or since an
-    IMU is on a first link that moves, where a rig has a base.
+    """Names of the signals that are compared, and a note for each that is not.
+
+    Some runs may lack it, or an IMU be on a first link that moves: that of a rig is on a base at rest.
     """
     counts = {name: sum(name in run.signals for run in log.runs) for name in (*sorted(segments.COMPARED), "target")}
     # Segments of all runs share one layout.

@@ -157,6 +157,17 @@ def test_a_shape_that_is_its_scale_is_kept(arm, tmp_path):
     np.testing.assert_allclose(values["speed_rad_s"][0], 0.31, rtol=1e-5)
 
 
+def test_a_controller_carries_no_more_of_a_robot_that_is_heavier(tmp_path):
+    xml = rigs.ARM.replace('<body name="lower"', '<body name="lower" gravcomp="0.8"')
+    spec = mujoco.MjSpec.from_string(xml)
+    carried = rigs.Player(Rig(spec, rigs.ARM_JOINTS, rigs.CONTROL_HZ))
+    corrected.save(tmp_path, spec, carried.rig, carried.vector(link_mass={"lower": {"ratio": 1.5}}))
+    rig, _ = corrected.load(tmp_path)
+    np.testing.assert_allclose(rig.mj_model.body_mass[-1], 1.5 * carried.rig.mj_model.body_mass[-1], rtol=1e-5)
+    np.testing.assert_allclose(rig.chain.lift.forces, carried.rig.chain.lift.forces, rtol=1e-5)
+    assert len(rig.chain.lift.forces) == 1
+
+
 def test_a_model_without_effects_is_the_nominal_one(arm, tmp_path):
     assert save(tmp_path, arm, arm.vector())["effects"] == {}
     model, nominal = mujoco.MjModel.from_xml_path(str(tmp_path / "model.xml")), arm.rig.mj_model
