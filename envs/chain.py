@@ -11,12 +11,11 @@ from dataclasses import dataclass
 import chex
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 from mujoco import mjx
 
 from envs import stepping
-from jaxtune import devices
+from envs.carried import Lift
 from jaxtune.types import Effect
 
 MIN_FRICTION_NM = 1e-6
@@ -62,53 +61,6 @@ class Wrench:
 
 
 @dataclass(frozen=True)
-class Lift:
-    """What a controller adds to carry a robot's weight (MJCF's `gravcomp`): that of the nominal model's links."""
-
-    bodies: np.ndarray
-    """[lifted] ids of the bodies."""
-    points: np.ndarray
-    """[lifted, 3] m, their nominal centres of mass, in their frames."""
-    forces: np.ndarray
-    """[lifted, 3] N in the world."""
-
-    @staticmethod
-    def of(model: mujoco.MjModel) -> "Lift":
-        """Reads it off a nominal model."""
-        bodies = np.flatnonzero(model.body_gravcomp)
-        weights = (model.body_mass * model.body_gravcomp)[bodies, None] * model.opt.gravity
-        return Lift(bodies, model.body_ipos[bodies].copy(), -weights)
-
-    @devices.precisely
-    def torques(self, model: mjx.Model, data: mjx.Data) -> jax.Array:
-        """Computes its torques on the joints, [dofs] Nm, where `data` says that the links are."""
-
-        def of(body, point, force):
-            there = data.xpos[body] + data.xmat[body] @ point
-            return mjx.jac(model, data, there, body)[0] @ force
-
-        points, forces = (jnp.asarray(rows, jnp.float32) for rows in (self.points, self.forces))
-        return jax.vmap(of)(jnp.asarray(self.bodies), points, forces).sum(axis=0)
-
-
-def carriers(model: mujoco.MjModel, dof: np.ndarray) -> np.ndarray:
-    """Finds the joint that carries each joint, [joints] indices; as many as joints where none does.
-
-    Args:
-      model: of the robot.
-      dof: addresses of the joints' velocities.
-    """
-    numbers = {int(address): number for number, address in enumerate(dof)}
-    found = []
-    for address in dof:
-        parent = int(model.dof_parentid[address])
-        while parent >= 0 and parent not in numbers:
-            parent = int(model.dof_parentid[parent])
-        found.append(numbers.get(parent, len(dof)))
-    return np.array(found)
-
-
-@dataclass(frozen=True)
 class Chain:
     """A controller, its motors and its sensors, with effects in the order in which they act.
 
@@ -136,11 +88,11 @@ class Chain:
     """[bodies] ids of the bodies that a wrench may act on."""
     period_s: float
     """Of the controller."""
+    before: np.ndarray
+    """[joints] index of the joint that carries each joint (`envs.carried.carriers`)."""
     lead_s: float = 0.0
     """How far positions of the simulation are ahead of its velocities; half a step makes semi-implicit Euler of second
     order, which is then the leapfrog scheme."""
-    before: np.ndarray | None = None
-    """[joints] index of the joint that carries each joint (`carriers`), as many as joints for none."""
     lift: Lift | None = None
     """What carries the robot's weight; none where None."""
     units: np.ndarray | None = None
@@ -153,9 +105,8 @@ class Chain:
         Where a robot branches, no joint is after the last one before.
         """
         count = len(self.dof)
-        before = np.full(count, count) if self.before is None else self.before
-        children = [np.flatnonzero(before == number) for number in range(count)]
-        return before, np.array([mine[0] if len(mine) == 1 else count for mine in children])
+        children = [np.flatnonzero(self.before == number) for number in range(count)]
+        return self.before, np.array([mine[0] if len(mine) == 1 else count for mine in children])
 
     def step(self, model: mjx.Model, data: mjx.Data, memory: dict, values, x) -> tuple[mjx.Data, dict, dict]:
         """Simulates one step of the physics, from the controller's inputs to the robot's motion.
@@ -267,8 +218,10 @@ class Chain:
             dof_frictionloss=model.dof_frictionloss.at[self.dof].set(friction),
             dof_damping=model.dof_damping.at[self.dof].set(damping),
         )
+        # Data of a step hold where links were before it.
+        there = mjx.com_pos(model, mjx.kinematics(model, data)) if self.lift else data
         data = data.replace(
-            qfrc_applied=self.lifted(model, data).at[self.dof].add(passed + rubbing),
+            qfrc_applied=self.lifted(model, there).at[self.dof].add(passed + rubbing),
             xfrc_applied=data.xfrc_applied.at[self.bodies, :3].set(wrench.force),
         )
         data = stepping.step(moved, data)
@@ -278,11 +231,8 @@ class Chain:
         return data, memory, torque
 
     def lifted(self, model, data) -> jax.Array:
-        """Torques with which the robot's weight is carried at its positions, [dofs] Nm (`Lift`)."""
-        if self.lift is None or not len(self.lift.bodies):
-            return jnp.zeros_like(data.qvel)
-        # Data of a step hold where links were before it.
-        return self.lift.torques(model, mjx.com_pos(model, mjx.kinematics(model, data)))
+        """Torques with which the robot's weight is carried, [dofs] Nm, where `data` says that the links are."""
+        return self.lift.torques(model, data) if self.lift else jnp.zeros_like(data.qvel)
 
     def _rotors_and_links(self, model, data, memory) -> dict:
         """What `Now` says of rotors and their links before a step."""

@@ -19,7 +19,8 @@ from mujoco import mjx
 
 from envs import beginning, sensing
 from envs.axes import Axis, describe_axis, loose
-from envs.chain import MIN_FRICTION_NM, Chain, Lift, carriers
+from envs.carried import Lift, carriers
+from envs.chain import MIN_FRICTION_NM, Chain
 from envs.effects import EVERY
 from envs.held import unread_joints
 from envs.models import hinges, links, suspended
@@ -137,10 +138,9 @@ class Rig:
         """All that compiled programs depend on beside `system`: robots of equal layout can share them."""
         addresses = (self.qpos.tobytes(), self.dof.tobytes(), self._bodies.tobytes(), self.trees.tobytes())
         frames = np.asarray(self._model.body_quat).tobytes()
-        lift = self.chain.lift
-        lifts = tuple(array.tobytes() for array in (lift.bodies, lift.points, lift.forces, self.chain.before))
+        carried = self.chain.before.tobytes(), self.chain.lift and self.chain.lift.layout
         paces = self.dt, self.control_hz, self.units.tobytes()
-        return self.joints, self.bodies, *paces, addresses, frames, *lifts, jax.tree.structure(self.system)
+        return self.joints, self.bodies, *paces, addresses, frames, carried, jax.tree.structure(self.system)
 
     def on(self, system: System) -> "Rig":
         """Returns the rig with another robot of the same layout on it, also inside a compiled program."""

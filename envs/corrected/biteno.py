@@ -12,7 +12,8 @@ import numpy as np
 from mujoco import mjx
 
 from envs.biteno import Biteno, Drive, Motion, State, TaskConfig, constants
-from envs.chain import MIN_FRICTION_NM, Chain, carriers
+from envs.carried import carriers
+from envs.chain import MIN_FRICTION_NM, Chain
 from envs.corrected.record import Correction
 from jaxtune.mjx import parameters
 
@@ -51,7 +52,7 @@ class CorrectedBiteno(Biteno):
         # One step of the chain for each step of the physics; the controller reads the joints in every one.
         step = float(model.opt.timestep)
         before = carriers(model, self.joint_dof)
-        self._chain = Chain(step, self._rows, self.joint_qpos, self.joint_dof, np.array(bodies), step, before=before)
+        self._chain = Chain(step, self._rows, self.joint_qpos, self.joint_dof, np.array(bodies), step, before)
 
     def _prepare(self, model: mujoco.MjModel) -> None:
         # The chain computes the torques; MuJoCo's actuators stay in the model for their gains and limits.
