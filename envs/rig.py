@@ -73,7 +73,7 @@ class Rig:
         model = suspended(spec, joints)
         for name in ("jnt_stiffnesspoly", "dof_dampingpoly", "tendon_stiffnesspoly", "tendon_dampingpoly"):
             if getattr(model, name).any():
-                raise ValueError(f"robot: got springs or dampers of several terms ({name}), which MJX has not")
+                raise ValueError(f"robot: got springs or dampers of several terms ({name}), which MJX lacks")
         self.control_hz = control_hz
         self.dt = 1.0 / control_hz / np.ceil(1.0 / control_hz / _LONGEST_STEP_S - 1e-9)
         model.opt.timestep = self.dt

@@ -10,9 +10,10 @@ from jaxtune.discovery.belief import believed, families, posterior, rivals
 from jaxtune.discovery.candidate import Candidate, cost, key_of, measures, squares, total_cost, units_of
 from jaxtune.discovery.evaluate import is_worse, position_gap, rms
 from jaxtune.discovery.evidence import Thresholds, ablate, passes, weigh_evidence
+from jaxtune.discovery.finalists import fit_leads
 from jaxtune.discovery.fit import Fit, begin, polish, refine
 from jaxtune.discovery.instead import instead
-from jaxtune.discovery.leads import at_some_places, beside, fit_leads, known_in_forms, taken_for
+from jaxtune.discovery.leads import at_some_places, beside, known_in_forms, taken_for
 from jaxtune.discovery.naming import at_fewest_places, clear_places, moved_forms, renamed, with_refinements
 from jaxtune.discovery.noise_floor import Floor, NoiseFloor, Say
 from jaxtune.discovery.problem import Hypothesis, Problem

@@ -8,8 +8,9 @@ from dataclasses import replace
 
 from jaxtune.discovery.candidate import Candidate, total_cost
 from jaxtune.discovery.curves import groups_of, simulate_library
+from jaxtune.discovery.finalists import fit_leads
 from jaxtune.discovery.fit import fit_at, refine
-from jaxtune.discovery.leads import beside, fit_leads, shortlist
+from jaxtune.discovery.leads import beside, shortlist
 from jaxtune.discovery.noise_floor import Floor
 from jaxtune.discovery.problem import Problem, are_distinct
 from jaxtune.discovery.result import Settings

@@ -13,8 +13,9 @@ from jaxtune.discovery.candidate import Candidate, key_of, total_cost
 from jaxtune.discovery.curves import groups_of, simulate_library
 from jaxtune.discovery.evaluate import usual
 from jaxtune.discovery.evidence import ablate, or_known
+from jaxtune.discovery.finalists import fit_leads
 from jaxtune.discovery.fit import polish, taken_over
-from jaxtune.discovery.leads import beside, fit_leads, shaped, shaped_after, shortlist, stuck, without_own
+from jaxtune.discovery.leads import beside, shaped, shaped_after, shortlist, stuck, without_own
 from jaxtune.discovery.localise import localise
 from jaxtune.discovery.noise_floor import Floor, NoiseFloor, Say
 from jaxtune.discovery.problem import Hypothesis, Problem, are_distinct

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from slider import AXES, BOTH, DIRECTION, DRAG, EACH, HYPOTHESES, LEARNED, ONE_SIZE, ROWS, WARPED, WILD, problem
 
-from jaxtune.discovery import leads, noise_floor, state, step, workflow
+from jaxtune.discovery import finalists, leads, noise_floor, state, step, workflow
 from jaxtune.discovery.candidate import Candidate, key_of
 from jaxtune.discovery.conclude import _rivals, _with_what_passes
 from jaxtune.discovery.evaluate import is_worse
@@ -399,7 +399,7 @@ def test_an_effect_gives_way_to_another_that_stands_in_its_place_better():
     first, _ = step.step(Settings(), asked, floor, begun)
     at, wrong = floor[asked.main_horizon], (HYPOTHESES[2], HYPOTHESES[4])
     lead = Lead(wrong, np.array([0.8, 0.1]), begun.nominal.coordinates, 0.0)
-    (bad,) = leads.fit_leads(Settings(), at, begun.nominal, (), [lead], 10.0)
+    (bad,) = finalists.fit_leads(Settings(), at, begun.nominal, (), [lead], 10.0)
     alone = [one for one in first.candidates if len(one.hypotheses) < 2]
     stuck = replace(first, best=bad, candidates=(*alone, bad), tried=("null", bad.key))
     found, info = step.step(Settings(), asked, floor, stuck)
@@ -530,7 +530,7 @@ def test_fitted_models_that_cost_least_get_their_forms():
     floor, begun = state.begin(asked, measured_floor(asked))
     at, null = floor[asked.main_horizon], begun.null.fit
     first = [Lead((one,), one.probes[1], null.coordinates, null.cost) for one in (damping, coulomb, push)]
-    fitted = leads.fit_leads(Settings(), at, null, (), first, 0.0)
+    fitted = finalists.fit_leads(Settings(), at, null, (), first, 0.0)
     # The screen may have put the right one last.
     (found,) = leads.shaped_after(null, (), [WARPED], HYPOTHESES, fitted, 1)
     assert key_of(found.hypotheses) == f"{WARPED.key} + {coulomb.key}"
@@ -538,7 +538,7 @@ def test_fitted_models_that_cost_least_get_their_forms():
     alone = next(one for one in fitted if one.key == coulomb.key)
     assert found.point[0] == alone.fit.coordinates[-1]
     np.testing.assert_array_equal(found.start, alone.fit.coordinates[:-1])
-    (both,) = leads.fit_leads(Settings(), at, null, (), [found], 0.0)
+    (both,) = finalists.fit_leads(Settings(), at, null, (), [found], 0.0)
     assert both.fit.cost < alone.fit.cost - 10.0
     # What was fitted is not fitted again, and pairs get no forms.
     assert leads.shaped_after(null, (), [WARPED], HYPOTHESES, [*fitted, both], 1) == []
@@ -554,11 +554,11 @@ def test_what_may_pass_for_a_named_effect_is_fitted_in_its_place():
     at, null = floor[asked.main_horizon], begun.null.fit
     # Somehow the search has ended with another effect, and never looked at this one.
     lead = Lead((damping,), np.array([0.5]), null.coordinates, null.cost)
-    (wrong,) = leads.fit_leads(Settings(), at, null, (), [lead], 0.0)
+    (wrong,) = finalists.fit_leads(Settings(), at, null, (), [lead], 0.0)
     found = _with_what_passes(Settings(), asked, at, replace(begun, best=wrong))
     assert found.best.key == "coulomb(beside)@slider + coulomb@slider"
     # What may pass for nothing is left as it is.
-    (other,) = leads.fit_leads(Settings(), at, null, (), [replace(lead, hypotheses=(mass,))], 0.0)
+    (other,) = finalists.fit_leads(Settings(), at, null, (), [replace(lead, hypotheses=(mass,))], 0.0)
     ended = replace(begun, best=other)
     assert _with_what_passes(Settings(), asked, at, ended).best is other
 
@@ -572,7 +572,7 @@ def test_what_was_better_alone_in_a_form_is_fitted_in_a_model_of_several():
     def fitted(*hypotheses):
         point = np.concatenate([one.probes[1] for one in hypotheses])
         lead = Lead(hypotheses, point, null.coordinates, null.cost)
-        return leads.fit_leads(Settings(), at, null, (), [lead], 0.0)[0]
+        return finalists.fit_leads(Settings(), at, null, (), [lead], 0.0)[0]
 
     wrong, alone = fitted(damping, push), fitted(coulomb, WARPED)
     known = replace(begun, best=wrong, candidates=(fitted(damping), alone, wrong))
@@ -596,7 +596,7 @@ def test_an_effect_at_several_places_is_fitted_at_some_of_them():
     at, null = floor[asked.main_horizon], begun.null.fit
     # Somehow the search has never looked at one place alone.
     lead = Lead((ONE_SIZE,), np.array([0.5]), null.coordinates, null.cost)
-    (wide,) = leads.fit_leads(Settings(), at, null, (), [lead], 0.0)
+    (wide,) = finalists.fit_leads(Settings(), at, null, (), [lead], 0.0)
     found = _with_what_passes(Settings(), asked, at, replace(begun, best=wide, candidates=(wide,)))
     assert found.best.key == at_one.key
     assert {one.key for one in found.candidates} == {wide.key, at_one.key, at_two.key}
