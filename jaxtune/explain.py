@@ -18,7 +18,8 @@ MEANING = {
 ADVICE = {
     Verdict.ACCEPT: "Train the policy in the new distribution and measure again, until steps stay within intervals.",
     Verdict.UNEXPLAINED: "Add parameters that may be wrong, such as a delay or friction, or look for the missing "
-    "effect with jaxtune.discovery. Do not trust the parameters.",
+    "effect with jaxtune.discovery. The robot's noise and policy must be those that are simulated, too. Do not trust "
+    "the parameters.",
     Verdict.RADIUS_EXHAUSTED: "Check the bounds and the measured episodes. If both are right, a parameter is missing.",
     Verdict.NOT_FINITE: "Look for numbers that are not finite, and for simulated observations that never change.",
     Verdict.NOT_COMPARABLE: "Measure episodes in which the robot moves so that parameters show, that differ from each "
@@ -26,6 +27,10 @@ ADVICE = {
     "0.95 needs 19, and 0.99 needs 99. An observation that never changes in simulation must have the same value.",
 }
 """What to do next."""
+_DOUBTFUL = (
+    "Measure again before you train a policy in the new distribution: it may make up for physics that the model lacks. "
+    "Tuner.misfits says where the set does not fit."
+)
 
 
 _WEAK = 0.5  # least error of a coordinate that is hardly identified, as a share of its standard deviation
@@ -161,9 +166,12 @@ def explain(info) -> str:
     elif verdict != Verdict.ACCEPT and np.isfinite([*excess.values()]).any():
         most = max((what for what in excess if np.isfinite(excess[what])), key=excess.__getitem__)
         lines.append(f"  most unlike the simulated sets: {most} ({excess[most]:.1f}; 1 is usual for one set in ten)")
+    if int(info.not_finite):
+        lines.append(f"  {int(info.not_finite)} episode(s), simulated or measured, hold numbers that are not finite")
+    fit = float(info.update.p_value)
+    doubtful = verdict == Verdict.ACCEPT and fit <= _MISFIT
     if verdict == Verdict.ACCEPT:
-        fit = float(info.update.p_value)
-        if fit <= _MISFIT:
+        if doubtful:
             lines.append(f"  fits badly in the distribution that was read last (p {fit:.2f})")
         past = float(info.update.p_past)
         if info.update.pooled:
@@ -186,4 +194,4 @@ def explain(info) -> str:
             else:
                 lines.append(f"{line}, not identifiable from these episodes")
         lines += [f"  together: {one}" for one in combinations(info)]
-    return "\n".join([*lines, ADVICE[verdict]])
+    return "\n".join([*lines, _DOUBTFUL if doubtful else ADVICE[verdict]])

@@ -145,9 +145,8 @@ def refine(config: TunerConfig, carry: dict, moved: ParamDist, update: UpdateInf
     # The gate has just tested the distribution of the first reading.
     again = carry["left"] < 1 + config.refinements
     misfits = again & conformal.rejects(update.p_value, knobs.level)
-    # Tested once a tuning, so that its rate of false alarms is that of one test: at filled bounds by the gate, and from
-    # states, where they are measured, by `sharpen`.
-    first = (carry["left"] == config.refinements) & ~dists.at_bounds(tested) & carry["sharpened"]
+    # Tested once for an accepted set: from states, where they are measured, by `sharpen`.
+    first = (carry["left"] == config.refinements) & carry["sharpened"]
     unexplained = first & (update.p_misfit <= UNEXPLAINED)
     radius, unit = dists.ravel(dist.radius), dists.ravel(tested.radius)
     changed = (dists.ravel(moved.radius) < _CHANGED * radius) | (jnp.abs(update.step) > 1.0 - _CHANGED)
@@ -223,7 +222,8 @@ def sharpen(
     known = (found.estimate, found.interval, errors, found.p_value)
     taken = closer & fits & jnp.stack([jnp.isfinite(values).all() for values in known]).all()
     step = jnp.where(found.identifiable, found.estimate, 0.0)
-    narrower = jnp.where(found.identifiable, found.wide, 1.0)
+    wide = jnp.maximum(found.wide, pooling.half_widths(found.errors, found.sets))
+    narrower = jnp.where(found.identifiable, wide, 1.0)
     moved = dists.narrow(dists.move(dist, step), narrower, config.min_radius)
     update = before.replace(
         step=(dists.ravel(moved.centre) - dists.ravel(tested.centre)) / unit,

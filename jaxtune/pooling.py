@@ -95,6 +95,27 @@ def joined_error(
     return jnp.where(pooled, 1.0 / jnp.sqrt(1.0 / error**2 + more), error)
 
 
+def half_widths(errors: Float[Array, "coords coords"], sets: Array | int) -> Float[Array, " coords"]:
+    """Half widths of a box whose draws vary along every direction at least as much as an estimate errs.
+
+    Where parameters trade against each other, errors go along a direction on which the middles of boxes crowd: the mean
+    of n draws varies by 1 / n of what each does. Sets of robots from such a box would teach that this direction is
+    known, though nothing told it. With r the correlations of the errors E, and u^2 / 3 the variance of draws within u,
+
+        u_i^2 / 3 = f E_ii sum_j |r_ij|,    f = 1 + 2 sqrt(2 / sets),
+
+    with which diag(u^2 / 3) - f E is diagonally dominant, so no direction of it is below zero. Boxes never grow, so
+    errors that are small by chance would narrow them reading after reading; f allows for two standard errors.
+
+    Args:
+      errors: mean products of errors.
+      sets: number of simulated sets that they are of.
+    """
+    size = jnp.sqrt(jnp.maximum(jnp.diag(errors), 0.0))
+    chance = 1.0 + 2.0 * jnp.sqrt(2.0 / jnp.maximum(sets, 1))
+    return jnp.sqrt(3.0 * chance * size * (jnp.abs(errors) / jnp.maximum(size, 1e-9)).sum(axis=1))
+
+
 @devices.precisely
 def joined(
     key: jax.Array,

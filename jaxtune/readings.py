@@ -63,7 +63,8 @@ def cut_alike(collected: Collected, measured: Trajectory) -> Collected:
       collected: whole simulated episodes.
       measured: the measured set, [set_episodes, time].
     """
-    known = measured.alive | (measured.fell | measured.not_finite)[:, None]
+    # A set that is read from a log holds arrays of NumPy, which traced indices do not index.
+    known = jnp.asarray(measured.alive | (measured.fell | measured.not_finite)[:, None])
 
     def cut(episodes, known):
         # What ends an episode in a hidden step is hidden as well.

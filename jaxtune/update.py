@@ -79,7 +79,8 @@ def posterior_update(
     draw like the held-out ones. It no longer is where a narrower box than the truth's was drawn from, and every
     refinement draws from a narrower one. So the box is narrowed to `wide`, which misses a tenth as often, and the
     quantile of `interval` is by as much higher as the refinements (five at most) may miss:
-    `1 - (1 - coverage) (1 - refinements / 10)`.
+    `1 - (1 - coverage) (1 - refinements / 10)`. Nor is it where parameters trade against each other, so the box is at
+    least as wide as `pooling.half_widths`.
 
     Held-out sets without a window are left out of all quantiles. A measured set without one, or with a living step that
     is not finite, leaves the distribution as it is.
@@ -121,10 +122,11 @@ def posterior_update(
     below, above = (jnp.isclose(*pair, atol=1e-4) for pair in zip((low, high), ends, strict=True))
     inside = ((step - interval >= low) | below) & ((step + interval <= high) | above)
     inside |= ~identifiable
+    errors = off.T @ off / jnp.maximum(known.sum(), 1)
+    wide = jnp.maximum(wide, pooling.half_widths(errors, known.sum()))
     narrower = jnp.where(identifiable & inside.all(), wide, 1.0)
     moved = dists.narrow(dists.move(dist, step), narrower, config.min_radius)
     found = {name: excess(name, values) for name, values in misses(reading).items()}
-    errors = off.T @ off / jnp.maximum(known.sum(), 1)
     # Of what may lie beyond the box no more is known than the box is wide.
     reliable = jnp.where(jnp.outer(inside, inside), errors, jnp.diag((high - low) ** 2 / 12.0))
     learnt = pooling.learnt(past, pooled, dist, estimates[-1], reliable, known.sum())

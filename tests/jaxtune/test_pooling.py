@@ -171,3 +171,33 @@ def test_no_combination_is_known_exactly_by_chance():
     dist = toys.uniform({str(number): 0.0 for number in range(9)})
     past = pooling.learnt(pooling.nothing(dist), False, dist, jnp.zeros(9), off.T @ off / 9, 9)
     assert jnp.linalg.eigvalsh(past.errors / 0.16).min() > 0.2
+
+
+def test_a_box_is_as_wide_as_errors_along_every_direction():
+    rng = np.random.default_rng(0)
+    mixed = rng.normal(size=(4, 4))
+    errors = mixed @ mixed.T * np.outer([1.0, 0.1, 3.0, 0.5], [1.0, 0.1, 3.0, 0.5])
+    half = np.asarray(pooling.half_widths(jnp.asarray(errors), 10**6))
+    assert np.linalg.eigvalsh(np.diag(half**2) / 3.0 - errors).min() > -1e-5
+    # Of independent errors, no more than that.
+    alone = np.diag([4.0, 0.01, 0.0])
+    np.testing.assert_allclose(pooling.half_widths(jnp.asarray(alone), 10**6), np.sqrt(3.0 * np.diag(alone)), rtol=2e-3)
+
+
+@pytest.mark.parametrize("coords", [2, 5])
+def test_what_nothing_tells_stays_in_the_box_however_often_it_is_read(coords):
+    rng = np.random.default_rng(0)
+    # Readings tell all differences exactly, and the mean not at all: the middle of the box is the best answer.
+    share, held = np.full((coords, coords), 1.0 / coords), []
+    for _ in range(200):
+        truth, centre, half = rng.uniform(-1.0, 1.0, coords), np.zeros(coords), np.ones(coords)
+        for _ in range(4):
+            sets = rng.uniform(-half, half, (99, coords))
+            off = -sets @ share
+            errors = off.T @ off / len(off)
+            step = truth - centre - share @ (truth - centre)
+            wide = np.quantile(np.abs(off).max(axis=1), 0.99)
+            half = np.minimum(half, np.maximum(wide, pooling.half_widths(jnp.asarray(errors), len(sets))))
+            centre = centre + step
+        held.append((np.abs(truth - centre) <= half).all())
+    assert np.mean(held) > 0.97

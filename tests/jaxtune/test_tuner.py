@@ -671,6 +671,9 @@ def test_simulated_episodes_lack_what_measured_ones_lack():
     np.testing.assert_array_equal(cut.held_out.alive[:2, 1].sum(axis=-1), [20, 40])
     np.testing.assert_array_equal(cut.held_out.fell[:2, 1], [True, False])
     np.testing.assert_array_equal(cut.trajectory.alive.sum(axis=-1), [60, 40, 60, 60, 40, 60, 60, 40])
+    # As a set from a log comes, in a tuning that its user did not compile.
+    log = jax.tree.map(np.asarray, short)
+    jax.tree.map(np.testing.assert_array_equal, jax.jit(lambda: readings.cut_alike(collected, log))(), cut)
 
 
 def test_a_set_that_a_hole_cuts_short_is_as_usual_as_a_whole_one():
@@ -743,6 +746,21 @@ def test_a_set_that_was_not_accepted_is_explained_without_movements(play):
     assert text.startswith("unexplained after 2 gate call(s): ")
     assert "->" not in text
     assert "Do not trust the parameters." in text
+
+
+def test_an_accepted_set_that_misfits_where_it_was_read_last_is_doubted(play):
+    info = play(0.5)[2]
+    said = lambda p: tuners.explain(info.replace(update=info.update.replace(p_value=p)))  # noqa: E731
+    assert "Measure again before you train" in said(0.05)
+    assert "Measure again before you train" not in said(0.06)
+
+
+def test_episodes_with_numbers_that_are_not_finite_are_counted(play):
+    info = play(0.5)[2]
+    assert "not finite" not in tuners.explain(info)
+    assert "2 episode(s), simulated or measured, hold numbers that are not finite" in tuners.explain(
+        info.replace(not_finite=jnp.asarray(2))
+    )
 
 
 def test_whether_earlier_sets_count_is_said(play):
@@ -1080,6 +1098,7 @@ def misfitting(p_value, p_misfit, below=0.9):
     return update
 
 
+@pytest.mark.parametrize("bound", [1.2, FIRST_RADIUS], ids=["within bounds", "at filled bounds"])
 @pytest.mark.parametrize(
     ("p_value", "p_misfit", "verdict", "centre", "radius"),
     [
@@ -1089,7 +1108,7 @@ def misfitting(p_value, p_misfit, below=0.9):
     ],
     ids=["fits", "taken back", "unexplained"],
 )
-def test_a_narrower_distribution_that_does_not_fit_is_taken_back(p_value, p_misfit, verdict, centre, radius):
+def test_a_narrower_distribution_that_does_not_fit_is_taken_back(p_value, p_misfit, verdict, centre, radius, bound):
     tuner = Tuner(
         config=dataclasses.replace(toys.TINY, refinements=2),
         train_policy=toys.train_policy,
@@ -1098,7 +1117,8 @@ def test_a_narrower_distribution_that_does_not_fit_is_taken_back(p_value, p_misf
         update=misfitting(p_value, p_misfit),
     )
     measured = SLIDER.measure(TWO, 2)(jax.random.key(0), toys.policy())
-    state, info = jax.jit(tuner.tune)(jax.random.key(1), start(tuner), measured)
+    begin = tuner.init(toys.policy(), toys.uniform(TWO, FIRST_RADIUS, bound), knobs())
+    state, info = jax.jit(tuner.tune)(jax.random.key(1), begin, measured)
     assert info.verdicts[0] == verdict
     np.testing.assert_allclose(dists.ravel(state.dist.centre), centre, rtol=1e-5)
     np.testing.assert_allclose(dists.ravel(state.dist.radius), radius, rtol=1e-5)
