@@ -94,7 +94,8 @@ def describe_axis(
       joints: indices of the joints in which the effect shows directly, nearest first.
     """
     least, prior_sd = parameter.bounds[0], 0.0
-    if row.name in _NOMINAL_RATIOS:
+    # What only shapes a ratio, such as up to which errors it holds, is no nuisance.
+    if row.name in _NOMINAL_RATIOS and parameter.form == "ratio":
         prior_sd = _NOMINAL_RATIOS[row.name]
     elif row.name in _NOMINAL_FIELDS:
         field, number = _NOMINAL_FIELDS[row.name], dof[index]

@@ -230,8 +230,8 @@ class Form:
     """Row, of as many parameters, that a small effect in this form is taken for: where that one leads, this is fitted
     too."""
     far: bool = False
-    """True where with much of it the effect itself is little: a fit from what the effect is alone may not come there,
-    so others begin with much of the form and little of the effect."""
+    """True where with much of it the effect itself is little, or, where it is far below zero, more than without it. A
+    fit from what the effect is alone may not come there, so others begin there."""
 
 
 @dataclass(frozen=True, kw_only=True)

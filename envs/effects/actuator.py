@@ -20,6 +20,12 @@ def scaled(values, signal, now, memory):
     return signal * jnp.exp(values["ratio"]), memory
 
 
+def _gain_error(values, error, now, memory):
+    """error' = error (1 + (ratio - 1) / (1 + |error| / within)); `values` hold 1 / within, zero at all errors alike."""
+    del now
+    return error * (1.0 + jnp.expm1(values["ratio"]) / (1.0 + jnp.abs(error) * values["within_rad"])), memory
+
+
 def _torque_limit(values, torque, now, memory):
     """torque' = clip(torque, -limit, limit); `values` hold 1 / limit, which is zero where there is none.
 
@@ -39,8 +45,9 @@ def _torque_limit(values, torque, now, memory):
 def _torque_speed(values, torque, now, memory):
     """torque' = clip(torque, min(-limit - c speed, 0), max(limit - c speed, 0)), a DC motor's torque-speed line.
 
-    The limit is the controller's, less the share of it that the motor lacks at the stall; c is what the back
-    electromotive force takes from it. Beyond the speed at which nothing is left the motor gives no torque; it does not
+    The limit is the controller's, less the share of it that the motor lacks at the stall. That share is negative where
+    the motor could give more than its controller allows, so that the line begins to bind at some speed. c is what the
+    back electromotive force takes. Beyond the speed at which nothing is left the motor gives no torque; it does not
     brake on its own.
     """
     drop = values["nm_s_per_rad"] * now.speed
@@ -157,10 +164,14 @@ ROWS = (
     Effect(
         name="gain_error",
         enters="error",
-        parameters=(Parameter(name="ratio", form="ratio", bounds=(-1.0, 1.0), prior=0.3),),
+        parameters=(
+            Parameter(name="ratio", form="ratio", bounds=(-1.0, 1.0), prior=0.3),
+            Parameter(name="within_rad", form="reciprocal", scale="angle", bounds=(0.0, 20.0), prior=3.0),
+        ),
         sizes=(0.05,),
-        # Of the error, which scales the proportional gain alone.
-        act=scaled,
+        forms=(Form("small_errors", "gain_error", ("within_rad",)),),
+        # Of the error, so that damping gains stay.
+        act=_gain_error,
         sentence="The controller's proportional gain is not the one that was set.",
         excited_by="postures of low and of high gravity torque at two controller gains",
         **_ACTUATOR,
@@ -180,11 +191,12 @@ ROWS = (
         enters="torque",
         parameters=(
             Parameter(name="nm_s_per_rad", scale="motor", bounds=(0.0, 1.0), prior=0.2),
-            Parameter(name="stall_loss", bounds=(0.0, 0.95), prior=0.3),
+            Parameter(name="stall_loss", bounds=(-2.0, 0.95), prior=0.3),
         ),
         sizes=(0.1, 0.3, 0.5),
-        # A motor with a fraction of the declared torque loses little of it with speed.
-        forms=(Form("low_stall", "torque_speed", ("stall_loss",), far=True),),
+        # A motor with a fraction of the declared torque loses little of it with speed; one that could give more than
+        # its controller allows loses it faster, from a higher stall.
+        forms=(Form("other_stall", "torque_speed", ("stall_loss",), far=True),),
         act=_torque_speed,
         sentence="The faster the motor turns, the less torque it can give.",
         excited_by="saturating steps",

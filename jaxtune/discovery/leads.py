@@ -74,17 +74,21 @@ def shaped(forms: Sequence[Hypothesis], free: Sequence[Hypothesis], leads: Seque
 
 
 def _from_far(lead: Lead, form: Hypothesis) -> list[Lead]:
-    """Lists further starts with a form of a lead's effect: much of the form, and little of the effect.
+    """Lists further starts with much of a form of a lead's effect: with little of the effect, or with more of it.
 
-    Where limits are not reached costs have no slope, so there are several.
+    The first are of a form that takes the effect's place. Where limits are not reached costs have no slope, so there
+    are several. The others are of one that is below zero, which the effect has to make up for.
     """
     effect, found = lead.hypotheses[0], []
+    own = slice(0, len(effect.directions))
     smallest = effect.probes[effect.probes.max(axis=1) > 0][0]
-    for share in (0.25, 1.0):
-        for much in form.probes[-2:]:
-            point = lead.point.copy()
-            point[: len(smallest)] = share * smallest
-            found.append(Lead((*lead.hypotheses, form), np.concatenate([point, much]), lead.start, lead.cost))
+    above, below = form.probes[-2:], form.probes[form.probes.max(axis=1) < 0][-2:]
+    starts = [(share * smallest, much) for share in (0.25, 1.0) for much in above]
+    starts += [((1.0 - much.min()) * lead.point[own], much) for much in below]
+    for size, much in starts:
+        point = lead.point.copy()
+        point[own] = size
+        found.append(Lead((*lead.hypotheses, form), np.concatenate([point, much]), lead.start, lead.cost))
     return found
 
 

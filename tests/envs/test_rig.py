@@ -823,8 +823,11 @@ def test_levers_are_how_fast_joints_move_centres_of_mass(arm):
 
 
 def prior_sd(rig):
-    """Prior standard deviations of nominal parameters, by effect and place."""
-    return {(axis.effect, axis.place): axis.prior_sd for axis in rig.axes if axis.prior_sd > 0}
+    """Prior standard deviations of nominal parameters, by effect and place; each of them has one parameter."""
+    nominal = [axis for axis in rig.axes if axis.prior_sd > 0]
+    found = {(axis.effect, axis.place): axis.prior_sd for axis in nominal}
+    assert len(found) == len(nominal)
+    return found
 
 
 def test_nominal_parameters_are_those_that_the_model_has(pendulum):

@@ -323,6 +323,17 @@ def test_a_ratio_multiplies(name):
     np.testing.assert_allclose(act(name, [2.0, -3.0], ratio=[0.8, 1.5]), [1.6, -4.5], rtol=1e-6)
 
 
+def test_a_gain_may_be_off_at_small_errors_alone():
+    def after(error):
+        return act("gain_error", [error, error], ratio=0.4, within_rad=[0.1, np.inf])
+
+    # At 0.1 rad half of the 0.6 is missing, at 10 rad a hundredth of it; elsewhere all of it.
+    np.testing.assert_allclose(after(0.1), [0.07, 0.04], rtol=1e-6)
+    np.testing.assert_allclose(after(-0.1), [-0.07, -0.04], rtol=1e-6)
+    np.testing.assert_allclose(after(10.0), [10.0 - 6.0 / 101.0, 4.0], rtol=1e-6)
+    np.testing.assert_allclose(after(1e-6), [0.4e-6, 0.4e-6], rtol=1e-4)
+
+
 def test_a_torque_is_limited_both_ways():
     np.testing.assert_allclose(act("torque_limit", [2.0, -3.0], torque_nm=[1.5, 2.5]), [1.5, -2.5], rtol=1e-6)
     np.testing.assert_allclose(act("torque_limit", [2.0, -3.0], torque_nm=4.0), [2.0, -3.0], rtol=1e-6)
@@ -385,6 +396,17 @@ def test_a_motor_at_a_low_voltage_stalls_below_its_controllers_limit():
     np.testing.assert_allclose(most(4.9, 5.0), [2.0, 4.0], rtol=1e-6)
     np.testing.assert_allclose(most(-4.9, 0.0), [-3.0, -4.9], rtol=1e-6)
     np.testing.assert_allclose(most(2.9, 0.0), 2.9, rtol=1e-6)
+
+
+def test_a_motor_that_could_give_more_than_its_controller_allows_falls_off_from_a_speed_on():
+    def most(torque, speed):
+        return act("torque_speed", torque, at=now(speed), nm_s_per_rad=0.5, stall_loss=-0.6)
+
+    # The line is 1.6 x 5 less 0.5 per rad/s, and meets the limit of 5 Nm at 6 rad/s.
+    np.testing.assert_allclose(most(5.0, 6.0), 5.0, rtol=1e-6)
+    np.testing.assert_allclose(most(5.0, 10.0), 3.0, rtol=1e-6)
+    np.testing.assert_allclose(most(-5.0, -10.0), -3.0, rtol=1e-6)
+    np.testing.assert_allclose(most(-5.0, 10.0), -5.0, rtol=1e-6)
 
 
 def test_a_motor_without_a_limit_has_no_speed_line():
