@@ -16,7 +16,7 @@ from envs.clock import SAME_S, Clock, clock_of
 from envs.effects.memory import LONGEST_S, PAST_STEP_S, PAST_TARGET_S
 from envs.logs import Run
 from envs.readings import aligned, hermite, noise, quantum_of
-from envs.smoothing import lateness, smoothed
+from envs.smoothing import accelerations, lateness, smoothed
 
 __all__ = [
     "HISTORY_S",
@@ -61,8 +61,8 @@ class Segment:
     limit: jax.Array  # [before + after, joints] Nm, of stiffness and damping together
     emf: jax.Array  # [before + after, joints] Nm s/rad, back electromotive force, not limited
     sample: jax.Array  # [before + after] true where the controller reads the joint anew
-    # [before + 1 + ahead, 2, joints] rad and rad/s, smoothed. Index `before` is the start; the `LONGEST_S / dt` steps
-    # `ahead` of it are what undoing a sensor's delay needs.
+    # [before + 1 + ahead, 3, joints] rad, rad/s and rad/s^2, smoothed. Index `before` is the start; the `LONGEST_S` of
+    # steps `ahead` of it is what undoing a sensor's delay needs.
     measured: jax.Array
     # [past, joints] rad, smoothed positions every 10 ms in the 2 s that lead to the first of `measured`. They wind up
     # the bristles of dry friction; in slow motion the history alone is too short for that. At the first of them
@@ -98,13 +98,16 @@ class Estimate:
 
     states: np.ndarray
     """[rows, 2, joints] rad and rad/s (`envs.smoothing.smoothed`)."""
+    accelerations: np.ndarray
+    """[rows, joints] rad/s^2 (`envs.smoothing.accelerations`)."""
     signals: dict[str, np.ndarray]
     """[rows, components] by name (`envs.readings.aligned`)."""
 
 
 def estimate(run: Run) -> Estimate:
     """Estimates states and signals at the rows of a run."""
-    return Estimate(smoothed(run), {name: aligned(run, name) for name in COMPARED if name in run.signals})
+    signals = {name: aligned(run, name) for name in COMPARED if name in run.signals}
+    return Estimate(smoothed(run), accelerations(run), signals)
 
 
 def cut(
@@ -208,7 +211,7 @@ def _segments(
     """
     after = 1 + int(np.ceil((longest_s - SAME_S) / dt))
     every = zip(runs, estimates, starts, rows, strict=True)
-    parts = [_of_run(run, one.states, start, row, after, dt) for run, one, start, row in every]
+    parts = [_of_run(run, one, start, row, after, dt) for run, one, start, row in every]
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
 
 
@@ -222,7 +225,7 @@ def rows_together(period_s: float, bin_s: float) -> int:
     return max(1, round(bin_s / period_s))
 
 
-def _of_run(run: Run, states: np.ndarray, start: np.ndarray, rows: np.ndarray, after: int, dt: float) -> Segment:
+def _of_run(run: Run, found: Estimate, start: np.ndarray, rows: np.ndarray, after: int, dt: float) -> Segment:
     """Makes the segments of one run, of `after` steps each (`_segments`)."""
     before, ahead = round(HISTORY_S / dt), round(LONGEST_S / dt)
     begin = run.time[start][:, None]
@@ -242,12 +245,13 @@ def _of_run(run: Run, states: np.ndarray, start: np.ndarray, rows: np.ndarray, a
     ticks = np.floor((told + clock.same_s - clock.rows[0]) * clock.rate_hz)
     at = (run.time[rows] - begin) / dt
     step = np.minimum(np.floor(at + SAME_S / dt).astype(np.int32), after - 1)
-    position, velocity = np.moveaxis(states, 1, 0)
+    position, velocity = np.moveaxis(found.states, 1, 0)
     fine = begin + dt * np.arange(-before, ahead + 1)
     # The slope of interpolated positions would have several times the noise of the velocities, but not at the rows: a
     # delay of whole rows would then seem likelier than any other.
-    acceleration = np.gradient(velocity, run.time, axis=0)
-    between_rows = [hermite(run.time, *pair, fine)[0] for pair in ((position, velocity), (velocity, acceleration))]
+    slopes = [velocity, np.gradient(velocity, run.time, axis=0), np.gradient(found.accelerations, run.time, axis=0)]
+    motion = [position, velocity, found.accelerations]
+    between_rows = [hermite(run.time, *pair, fine)[0] for pair in zip(motion, slopes, strict=True)]
     past = begin - HISTORY_S + PAST_STEP_S * np.arange(-round(_PAST_S / PAST_STEP_S), 1)
     told_before = clock.rows[start] - HISTORY_S - _PAST_S
     told_past = told_before[:, None] + _PAST_S + PAST_TARGET_S

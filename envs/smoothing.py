@@ -1,6 +1,6 @@
 """Estimates the states behind the positions and velocities that a run recorded."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from math import factorial
 
@@ -11,6 +11,7 @@ from envs.logs import Run
 from envs.readings import aligned, fresh, noise_of
 
 _PARABOLA_S, _CUBIC_S = 0.012, 0.03  # half widths of the local fits
+_BENT_S = (0.02, 0.03, 0.045)  # half widths of those that give accelerations
 _WIDEST_S = 0.018  # half width from which on a parabola no longer follows the motion
 _MIN_HALF_ROWS = 2  # a parabola needs three rows
 _CLEARER = 0.9  # share of a misfit that is left by a lag that is there
@@ -37,34 +38,60 @@ def smoothed(run: Run) -> np.ndarray:
     Returns:
       [rows, 2, joints] rad, rad/s.
     """
-    parts = [(fresh(run, name), noise_of(run, name)) for name in ("q", "dq") if name in run.signals]
-    return np.stack(
-        [
-            _fit(run.time, [(*readings[joint], sd[joint]) for readings, sd in parts])
-            for joint in range(run.signals["q"].shape[1])
-        ],
-        axis=-1,
-    )
+
+    def windows(time):
+        widest, order, period = _window(time)
+        least = min(1 if "dq" in run.signals else _MIN_HALF_ROWS, widest)
+        return {least, max(least, widest // 2), widest}, order, period
+
+    return _fit(run, windows)[:, :2]
 
 
-def _fit(time: np.ndarray, parts: Sequence[tuple[np.ndarray, np.ndarray, float]]) -> np.ndarray:
-    """Fits polynomials around every row to positions, and to velocities in the second part: [rows, 2].
+def accelerations(run: Run) -> np.ndarray:
+    """Estimates accelerations at every row, by cubics over 20 to 45 ms on both sides.
+
+    Those of the parabolas that give states would be mostly noise. What a filter hides of a velocity is the acceleration
+    times the filter's time.
+
+    Args:
+      run: with `q` and perhaps `dq`.
+
+    Returns:
+      [rows, joints] rad/s^2.
+    """
+
+    def windows(time):
+        period = _window(time)[2]
+        return {max(_MIN_HALF_ROWS, round(half / period)) for half in _BENT_S}, 3, period
+
+    return _fit(run, windows)[:, 2]
+
+
+def _fit(run: Run, windows: Callable[[np.ndarray], tuple[Collection[int], int, float]]) -> np.ndarray:
+    """Fits polynomials around every row to positions, and to velocities: [rows, 3, joints], with accelerations.
 
     Every row has the widest window in which the polynomial agrees with the readings, or the narrowest one.
+
+    Args:
+      run: with `q` and perhaps `dq`.
+      windows: of a joint's times of readings: how many a window has on each side, of all windows that are tried; the
+        order of the polynomials; and the time between readings.
     """
-    widest, order, period = _window(parts[0][0])
-    least = min(1 if len(parts) > 1 else _MIN_HALF_ROWS, widest)
-    found = None
-    for half in sorted({least, max(least, widest // 2), widest}):
-        fit, agrees = _fit_window(time, parts, half, order, half * period)
-        found = fit if found is None else np.where(agrees[:, None], fit, found)
-    return found
+    parts, every = [(fresh(run, name), noise_of(run, name)) for name in ("q", "dq") if name in run.signals], []
+    for joint in range(run.signals["q"].shape[1]):
+        mine, found = [(*readings[joint], sd[joint]) for readings, sd in parts], None
+        halves, order, period = windows(mine[0][0])
+        for half in sorted(halves):
+            fit, agrees = _fit_window(run.time, mine, half, order, half * period)
+            found = fit if found is None else np.where(agrees[:, None], fit, found)
+        every.append(found)
+    return np.stack(every, axis=-1)
 
 
 def _fit_window(
     time: np.ndarray, parts: Sequence[tuple[np.ndarray, np.ndarray, float]], half: int, order: int, width: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Fits polynomials in windows of one width: states [rows, 2], and whether they agree with the readings [rows]."""
+    """Fits polynomials in windows of one width: motion [rows, 3], and whether it agrees with the readings [rows]."""
     designs, values = [], []
     for derivative, (at, read, sd) in enumerate(parts):
         near = _nearest(at, time, half)
@@ -83,7 +110,7 @@ def _fit_window(
     fit = np.linalg.solve(across @ design + 1e-9 * np.eye(order + 1), across @ value[..., None])
     left = value - (design @ fit)[..., 0]
     agrees = (left**2).sum(axis=1) < chi2.isf(_CHANCE, max(value.shape[1] - order - 1, 1))
-    return np.concatenate([fit[:, 0], fit[:, 1] / width], axis=1), agrees
+    return fit[:, :3, 0] * [1.0, 1.0 / width, 2.0 / width**2], agrees
 
 
 def _window(time: np.ndarray) -> tuple[int, int, float]:

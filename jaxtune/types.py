@@ -290,8 +290,8 @@ class Effect:
     """`start(values, signal, dt) -> memory`: the memory after what the robot did before, which the stage's signal tells
     (`envs.chain.Chain.start`). None where the effect has no memory."""
     undo: Callable[..., Any] | None = None
-    """For a sensor effect, `undo(values, readings, dt) -> truth`: recovers true positions and velocities from recorded
-    ones, [time, 2, joints]."""
+    """For a sensor effect, `undo(values, readings, dt) -> truth`: recovers true positions, velocities and accelerations
+    from recorded ones, [time, 3, joints]."""
     forms: tuple[Form, ...] = ()
     """Other forms that it may have."""
     differs: bool = False

@@ -101,7 +101,7 @@ def segment(rig, start, target, kp=0.0, kd=0.0, limit=np.inf, feed=0.0, emf=0.0,
     target = np.concatenate([np.broadcast_to(target[0], (before, joints)), target])
     speed = np.broadcast_to(speed, joints)
     time = rig.dt * np.arange(-before, ahead + 1)[:, None]
-    measured = np.stack([start + time * speed, speed + 0 * time], axis=1)
+    measured = np.stack([start + time * speed, speed + 0 * time, 0 * speed + 0 * time], axis=1)
     held = {"feed": feed, "stiffness": kp, "damping": kd, "limit": limit, "emf": emf}
     every = round(1.0 / rig.control_hz / rig.dt)
     return Segment(
@@ -139,7 +139,7 @@ def in_mujoco(rig, model, segment, command=None, sense=None, motor=None, outside
     data = mujoco.MjData(model)
     # Positions of a semi-implicit step are half a step ahead of its velocities; that makes it of second order.
     lead = 0.5 * model.opt.timestep
-    position, velocity = np.asarray(segment.measured[before] if start is None else start)
+    position, velocity = np.asarray(segment.measured[before, :2] if start is None else start)
     data.qpos[rig.qpos], data.qvel[rig.dof] = position + lead * velocity, velocity
     read, held = [], None
     for step in range(before, len(segment.target)):

@@ -171,7 +171,7 @@ def test_what_is_not_there_changes_nothing(row):
 
 @pytest.mark.parametrize("row", [row for row in ACTING if row.undo], ids=lambda row: row.name)
 def test_undoing_what_is_not_there_changes_nothing(row):
-    readings = draw(np.random.default_rng(1), (20, 2, JOINTS))
+    readings = draw(np.random.default_rng(1), (20, 3, JOINTS))
     values = {parameter.name: jnp.zeros(JOINTS) for parameter in row.parameters}
     np.testing.assert_allclose(row.undo(values, readings, DT), readings, rtol=1e-6, atol=1e-6)
 
@@ -676,10 +676,11 @@ def test_what_a_sensor_did_is_undone(name, physical):
         readings = np.stack([act(name, reading, **physical) for reading in truth])
     else:
         readings = series(name, truth, **physical)
-    got = np.asarray(row.undo(values, jnp.asarray(readings), DT))
+    slopes = np.gradient(readings[:, 1:], DT, axis=0)
+    got = np.asarray(row.undo(values, jnp.concatenate([readings, slopes], axis=1), DT))
     # Until a lag of 20 ms has forgotten its start, and as long as a delay of 31 ms knows what comes.
     inner = slice(200, 560)
-    # Slopes over 20 ms of motion at 3 Hz are 0.6 % too small, of up to 0.02 s x 7.5 rad/s and 142 rad/s^2.
+    # A jerk over 40 ms of motion at 3 Hz is 2.4 % too small.
     np.testing.assert_allclose(got[inner, 0], truth[inner, 0], atol=0.006 * 0.02 * 7.6 + 1e-4)
     np.testing.assert_allclose(got[inner, 1], truth[inner, 1], atol=0.006 * 0.02 * 143 + 1e-3)
     # Left alone they are further off.
@@ -691,7 +692,8 @@ def test_a_lead_of_positions_and_of_what_was_taken_from_them_is_undone():
     values = values_of(NOMINAL["position_lead"], seconds=lead, velocity_seconds=lead)
     time, pace = DT * np.arange(400)[:, None], 20.0
     truth, ahead = (
-        np.stack([0.3 * np.sin(pace * at), 0.3 * pace * np.cos(pace * at)], axis=1) for at in (time, time + lead)
+        np.stack([0.3 * np.sin(pace * at), 0.3 * pace * np.cos(pace * at), -0.3 * pace**2 * np.sin(pace * at)], axis=1)
+        for at in (time, time + lead)
     )
     got = np.asarray(NOMINAL["position_lead"].undo(values, jnp.asarray(ahead, jnp.float32), DT))
     # To first order: half the square of a lead's share of the motion is left.
