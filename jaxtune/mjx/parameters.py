@@ -58,12 +58,12 @@ def check(model: mjx.Model, entries: Mapping[str, Entry]) -> None:
             raise ValueError(f"parameter '{name}', {error}") from None
 
 
-def distribution(entries: Mapping[str, Entry], radius: float, centre: Params) -> ParamDist:
+def distribution(entries: Mapping[str, Entry], radius: float | Coords, centre: Params) -> ParamDist:
     """Makes the distribution over a table that a search begins with, bounded by the table's bounds.
 
     Args:
       entries: the table.
-      radius: half width in coordinates, the same for every parameter.
+      radius: half width in coordinates, the same for every parameter or by name.
       centre: physical values by name; those that are left out are nominal.
 
     Raises:

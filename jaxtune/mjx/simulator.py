@@ -112,12 +112,12 @@ class Simulator:
         """The table, by the name that other robots have it under."""
         return self.parameters
 
-    def dist(self, radius: float = 0.2, centre: Params | None = None) -> ParamDist:
+    def dist(self, radius: float | Coords = 0.2, centre: Params | None = None) -> ParamDist:
         """Makes the distribution that a search begins with.
 
         Args:
-          radius: half width in coordinates: 0.2 spans multipliers of 0.82 to 1.22, and a fifth of half the bounds of
-            what is added.
+          radius: half width in coordinates, the same for all or by name, of every one: 0.2 spans multipliers of 0.82
+            to 1.22, and a fifth of half the bounds of what is added.
           centre: physical values by name; those that are left out are nominal.
         """
         return parameters.distribution(self.parameters, radius, centre or {})
