@@ -11,7 +11,7 @@ from envs.logs import Run
 from envs.readings import aligned, fresh, noise_of
 
 _PARABOLA_S, _CUBIC_S = 0.012, 0.03  # half widths of the local fits
-_BENT_S = (0.02, 0.03, 0.045)  # half widths of those that give accelerations
+_BENT_S, _BENT_EVERY_S = (0.02, 0.03, 0.045), 0.005  # half widths of those that give accelerations, and their spacing
 _WIDEST_S = 0.018  # half width from which on a parabola no longer follows the motion
 _MIN_HALF_ROWS = 2  # a parabola needs three rows
 _CLEARER = 0.9  # share of a misfit that is left by a lag that is there
@@ -44,7 +44,7 @@ def smoothed(run: Run) -> np.ndarray:
         least = min(1 if "dq" in run.signals else _MIN_HALF_ROWS, widest)
         return {least, max(least, widest // 2), widest}, order, period
 
-    return _fit(run, windows)[:, :2]
+    return _fit(run, run.time, windows)[:, :2]
 
 
 def accelerations(run: Run) -> np.ndarray:
@@ -64,16 +64,20 @@ def accelerations(run: Run) -> np.ndarray:
         period = _window(time)[2]
         return {max(_MIN_HALF_ROWS, round(half / period)) for half in _BENT_S}, 3, period
 
-    return _fit(run, windows)[:, 2]
+    # They change little over 5 ms, and windows of a fast log hold many rows.
+    some = run.time[:: max(1, int(_BENT_EVERY_S / _spacing(run)))]
+    found = _fit(run, some, windows)[:, 2]
+    return np.stack([np.interp(run.time, some, one) for one in found.T], axis=1)
 
 
-def _fit(run: Run, windows: Callable[[np.ndarray], tuple[Collection[int], int, float]]) -> np.ndarray:
-    """Fits polynomials around every row to positions, and to velocities: [rows, 3, joints], with accelerations.
+def _fit(run: Run, time: np.ndarray, windows: Callable[[np.ndarray], tuple[Collection[int], int, float]]) -> np.ndarray:
+    """Fits polynomials around every time to positions, and to velocities: [times, 3, joints], with accelerations.
 
-    Every row has the widest window in which the polynomial agrees with the readings, or the narrowest one.
+    Every time has the widest window in which the polynomial agrees with the readings, or the narrowest one.
 
     Args:
       run: with `q` and perhaps `dq`.
+      time: s, some or all of the run's.
       windows: of a joint's times of readings: how many a window has on each side, of all windows that are tried; the
         order of the polynomials; and the time between readings.
     """
@@ -82,7 +86,7 @@ def _fit(run: Run, windows: Callable[[np.ndarray], tuple[Collection[int], int, f
         mine, found = [(*readings[joint], sd[joint]) for readings, sd in parts], None
         halves, order, period = windows(mine[0][0])
         for half in sorted(halves):
-            fit, agrees = _fit_window(run.time, mine, half, order, half * period)
+            fit, agrees = _fit_window(time, mine, half, order, half * period)
             found = fit if found is None else np.where(agrees[:, None], fit, found)
         every.append(found)
     return np.stack(every, axis=-1)
