@@ -58,7 +58,7 @@ class Hypothesis:
     like: str = ""
     """Of a form: name of the effect that a small one in this form is taken for."""
     far: bool = False
-    """Of a form: much of it makes the effect itself little, so fits begin there too."""
+    """Of a form: much of it makes the effect itself little, or more where it is below zero, so fits begin there too."""
     each: bool = False
     """True where every place has a size of its own: `directions` has a row for each, `joints` one joint."""
 

@@ -507,6 +507,10 @@ def test_a_form_that_is_an_effect_of_its_own_is_fitted_alone_too():
     little, much = coulomb.probes[0, 0], WARPED.probes[-2:, 0]
     expected = [(share * little, size) for share in (0.25, 1.0) for size in much]
     np.testing.assert_allclose([one.point for one in others], expected)
+    # A form below zero leaves more of it.
+    both_ways = replace(WARPED, far=True, probes=np.array([[-0.1], [-0.5], [0.1], [0.5]]))
+    _, *others = leads.shaped([both_ways], (), [first], 1)
+    np.testing.assert_allclose([one.point for one in others[-2:]], [(0.8 * 1.1, -0.1), (0.8 * 1.5, -0.5)])
     # What may pass for another effect is fitted where that one leads, unless it leads itself.
     passes = replace(DIRECTION, form="beside", like="damping")
     found = leads.shaped([passes], HYPOTHESES, [second], 1)
