@@ -60,7 +60,7 @@ def begin(
 
 
 def _undone(chain, values, readings):
-    """The motion [steps, 3, joints] that was read, without this hypothesis' errors of sensors."""
+    """The motion [steps, 4, joints] that was read, without this hypothesis' errors of sensors."""
     for row in chain.entering("sensor"):
         if row.undo is not None:
             readings = row.undo(values[row.name], readings, chain.dt)
@@ -78,7 +78,7 @@ def _bristles(chain, model, data, values, segment, inputs) -> dict:
     still = jnp.zeros_like(position)
     inputs = inputs | {"target": segment.past_told, "between": still, "feed": segment.past_feed}
     # Undoing a lag takes a slope, so it needs more rows than one.
-    rest = _undone(chain, values, jnp.tile(jnp.stack([position, still, still]), (3, 1, 1)))[0, :2]
+    rest = _undone(chain, values, jnp.tile(jnp.stack([position, still, still, still]), (3, 1, 1)))[0, :2]
     memory, torque = history.remember(chain, values, chain.start(values, rest, inputs), rest, inputs)
     there = data.replace(qpos=data.qpos.at[chain.qpos].set(rest[0]))
     return history.bristles(chain, model, there, values, memory, torque, inputs, segment.past)

@@ -16,7 +16,7 @@ from envs.clock import SAME_S, Clock, clock_of
 from envs.effects.memory import LONGEST_S, PAST_STEP_S, PAST_TARGET_S
 from envs.logs import Run
 from envs.readings import aligned, hermite, noise, quantum_of
-from envs.smoothing import accelerations, lateness, smoothed
+from envs.smoothing import lateness, slopes, smoothed
 
 __all__ = [
     "HISTORY_S",
@@ -61,8 +61,8 @@ class Segment:
     limit: jax.Array  # [before + after, joints] Nm, of stiffness and damping together
     emf: jax.Array  # [before + after, joints] Nm s/rad, back electromotive force, not limited
     sample: jax.Array  # [before + after] true where the controller reads the joint anew
-    # [before + 1 + ahead, 3, joints] rad, rad/s and rad/s^2, smoothed. Index `before` is the start; the `LONGEST_S` of
-    # steps `ahead` of it is what undoing a sensor's delay needs.
+    # [before + 1 + ahead, 4, joints] rad and rad/s, smoothed, and slopes over longer times, rad/s and rad/s^2. Index
+    # `before` is the start; the `LONGEST_S` of steps `ahead` of it is what undoing a sensor's delay needs.
     measured: jax.Array
     # [past, joints] rad, smoothed positions every 10 ms in the 2 s that lead to the first of `measured`. They wind up
     # the bristles of dry friction; in slow motion the history alone is too short for that. At the first of them
@@ -98,8 +98,8 @@ class Estimate:
 
     states: np.ndarray
     """[rows, 2, joints] rad and rad/s (`envs.smoothing.smoothed`)."""
-    accelerations: np.ndarray
-    """[rows, joints] rad/s^2 (`envs.smoothing.accelerations`)."""
+    slopes: np.ndarray
+    """[rows, 2, joints] rad/s and rad/s^2 (`envs.smoothing.slopes`)."""
     signals: dict[str, np.ndarray]
     """[rows, components] by name (`envs.readings.aligned`)."""
 
@@ -107,7 +107,7 @@ class Estimate:
 def estimate(run: Run) -> Estimate:
     """Estimates states and signals at the rows of a run."""
     signals = {name: aligned(run, name) for name in COMPARED if name in run.signals}
-    return Estimate(smoothed(run), accelerations(run), signals)
+    return Estimate(smoothed(run), slopes(run), signals)
 
 
 def cut(
@@ -249,9 +249,10 @@ def _of_run(run: Run, found: Estimate, start: np.ndarray, rows: np.ndarray, afte
     fine = begin + dt * np.arange(-before, ahead + 1)
     # The slope of interpolated positions would have several times the noise of the velocities, but not at the rows: a
     # delay of whole rows would then seem likelier than any other.
-    slopes = [velocity, np.gradient(velocity, run.time, axis=0), np.gradient(found.accelerations, run.time, axis=0)]
-    motion = [position, velocity, found.accelerations]
-    between_rows = [hermite(run.time, *pair, fine)[0] for pair in zip(motion, slopes, strict=True)]
+    speed, acceleration = np.moveaxis(found.slopes, 1, 0)
+    rising = [np.gradient(one, run.time, axis=0) for one in (velocity, acceleration)]
+    motion = ((position, velocity), (velocity, rising[0]), (speed, acceleration), (acceleration, rising[1]))
+    between_rows = [hermite(run.time, *pair, fine)[0] for pair in motion]
     past = begin - HISTORY_S + PAST_STEP_S * np.arange(-round(_PAST_S / PAST_STEP_S), 1)
     told_before = clock.rows[start] - HISTORY_S - _PAST_S
     told_past = told_before[:, None] + _PAST_S + PAST_TARGET_S

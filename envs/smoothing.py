@@ -11,7 +11,7 @@ from envs.logs import Run
 from envs.readings import aligned, fresh, noise_of
 
 _PARABOLA_S, _CUBIC_S = 0.012, 0.03  # half widths of the local fits
-_BENT_S, _BENT_EVERY_S = (0.02, 0.03, 0.045), 0.005  # half widths of those that give accelerations, and their spacing
+_BENT_S, _BENT_EVERY_S = (0.012, 0.02, 0.03, 0.045), 0.005  # half widths of those that give slopes, and their spacing
 _WIDEST_S = 0.018  # half width from which on a parabola no longer follows the motion
 _MIN_HALF_ROWS = 2  # a parabola needs three rows
 _CLEARER = 0.9  # share of a misfit that is left by a lag that is there
@@ -47,17 +47,17 @@ def smoothed(run: Run) -> np.ndarray:
     return _fit(run, run.time, windows)[:, :2]
 
 
-def accelerations(run: Run) -> np.ndarray:
-    """Estimates accelerations at every row, by cubics over 20 to 45 ms on both sides.
+def slopes(run: Run) -> np.ndarray:
+    """Estimates velocities and accelerations at every row, by cubics over 12 to 45 ms on both sides.
 
-    Those of the parabolas that give states would be mostly noise. What a filter hides of a velocity is the acceleration
+    Those of the parabolas that give states have several times the noise. What a filter hides of a motion are its slopes
     times the filter's time.
 
     Args:
       run: with `q` and perhaps `dq`.
 
     Returns:
-      [rows, joints] rad/s^2.
+      [rows, 2, joints] rad/s, rad/s^2.
     """
 
     def windows(time):
@@ -66,8 +66,8 @@ def accelerations(run: Run) -> np.ndarray:
 
     # They change little over 5 ms, and windows of a fast log hold many rows.
     some = run.time[:: max(1, int(_BENT_EVERY_S / _spacing(run)))]
-    found = _fit(run, some, windows)[:, 2]
-    return np.stack([np.interp(run.time, some, one) for one in found.T], axis=1)
+    found = _fit(run, some, windows)[:, 1:]
+    return np.apply_along_axis(lambda one: np.interp(run.time, some, one), 0, found)
 
 
 def _fit(run: Run, time: np.ndarray, windows: Callable[[np.ndarray], tuple[Collection[int], int, float]]) -> np.ndarray:

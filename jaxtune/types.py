@@ -290,8 +290,8 @@ class Effect:
     """`start(values, signal, dt) -> memory`: the memory after what the robot did before, which the stage's signal tells
     (`envs.chain.Chain.start`). None where the effect has no memory."""
     undo: Callable[..., Any] | None = None
-    """For a sensor effect, `undo(values, readings, dt) -> truth`: recovers true positions, velocities and accelerations
-    from recorded ones, [time, 3, joints]."""
+    """For a sensor effect, `undo(values, readings, dt) -> truth`: recovers the true motion from what was recorded,
+    [time, 4, joints]: positions, velocities, and slopes with less noise (`envs.segments.Segment.measured`)."""
     forms: tuple[Form, ...] = ()
     """Other forms that it may have."""
     differs: bool = False

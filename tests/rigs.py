@@ -101,7 +101,7 @@ def segment(rig, start, target, kp=0.0, kd=0.0, limit=np.inf, feed=0.0, emf=0.0,
     target = np.concatenate([np.broadcast_to(target[0], (before, joints)), target])
     speed = np.broadcast_to(speed, joints)
     time = rig.dt * np.arange(-before, ahead + 1)[:, None]
-    measured = np.stack([start + time * speed, speed + 0 * time, 0 * speed + 0 * time], axis=1)
+    measured = np.stack([start + time * speed, speed + 0 * time, speed + 0 * time, 0 * (speed + time)], axis=1)
     held = {"feed": feed, "stiffness": kp, "damping": kd, "limit": limit, "emf": emf}
     every = round(1.0 / rig.control_hz / rig.dt)
     return Segment(

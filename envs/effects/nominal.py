@@ -44,9 +44,9 @@ def _position_lead(values, readings, now, memory):
 
 def _undo_lead(values, readings, dt):
     """q(t) = q'(t - seconds) and v(t) = v'(t - velocity_seconds), to first order."""
-    position, velocity, acceleration = jnp.moveaxis(readings, 1, 0)
+    position, velocity = readings[:, 0], readings[:, 1]
     later = values["velocity_seconds"] * jnp.gradient(velocity, dt, axis=0)
-    return jnp.stack([position - values["seconds"] * velocity, velocity - later, acceleration], axis=1)
+    return readings.at[:, :2].set(jnp.stack([position - values["seconds"] * velocity, velocity - later], axis=1))
 
 
 ROWS = (

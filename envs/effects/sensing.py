@@ -1,8 +1,8 @@
 """Effects between the joint and its reading: errors that both the controller and the log see.
 
 The signal is [2, joints], positions in rad and velocities in rad/s; for `imu_tilt` it is the gravity vector [3] in the
-body frame. `undo` recovers the true motion from recorded readings [time, 3, joints], accelerations in rad/s^2 the
-third, so that a simulation can start where the robot really was.
+body frame. `undo` recovers the true motion from recorded readings, so that a simulation can start where the robot
+really was. These are [time, 4, joints]: position and velocity, and slopes with less noise, rad/s and rad/s^2.
 """
 
 import jax
@@ -13,7 +13,7 @@ from envs.effects.memory import LONGEST_S, SECOND_STAGE, delay_line, delayed, fi
 from jaxtune.types import Effect, Form, Parameter
 
 _SENSING = {"family": "sensing"}
-_HALF_SLOPE_S = 0.02  # half of the window over which slopes of readings are taken
+_HALF_SLOPE_S = 0.01  # half of the window over which slopes of readings are taken
 
 
 def _encoder_bias(values, readings, now, memory):
@@ -72,19 +72,19 @@ def _undo_lag(values, readings, dt):
     """readings = readings' + (t1 + t2) d readings' / dt + t1 t2 d2 readings' / dt2, with both stages' time constants.
 
     Of all alike: recorded velocities that do not agree with positions are not used, and those of a state follow from
-    its positions. Their slopes are those over 40 ms, or the start of a segment would have more noise under this
-    hypothesis than under a delay; the mean of a speed over a half width h is above it by h^2 / 6 jerk.
+    its positions. With the state's own slopes the start of a segment would have more noise under this hypothesis than
+    under a delay.
     """
     first, second = two_stages(values["seconds"], values["second_stage"])
-    jerk = _slope(readings[:, 2], dt)
-    speed = _slope(readings[:, 0], dt) - _HALF_SLOPE_S**2 / 6.0 * jerk
-    slope = jnp.stack([speed, readings[:, 2], jerk], axis=1)
-    bend = jnp.stack([readings[:, 2], jerk, jnp.zeros_like(jerk)], axis=1)
+    speed, acceleration = readings[:, 2], readings[:, 3]
+    jerk = _slope(acceleration, dt)
+    slope = jnp.stack([speed, acceleration, acceleration, jerk], axis=1)
+    bend = jnp.stack([acceleration, jerk, jerk, jnp.zeros_like(jerk)], axis=1)
     return readings + values["seconds"] * slope + first * second * bend
 
 
 def _slope(readings, dt):
-    """Slopes of readings [steps, joints] over 40 ms, or what there is of that at the ends."""
+    """Slopes of readings [steps, joints] over 20 ms, or what there is of that at the ends."""
     count, half = len(readings), round(_HALF_SLOPE_S / dt)
     at = np.arange(count)
     after, before = np.minimum(at + half, count - 1), np.maximum(at - half, 0)

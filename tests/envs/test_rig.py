@@ -280,7 +280,7 @@ CARRIED = np.array([0.3, -0.3])  # Nm, what gravity and motors leave to a fricti
 def test_a_robot_that_rests_on_its_friction_stays_there(arm, plain, driven, effects):
     segment = rigs.segment(arm.rig, START, **driven(weight(arm, plain)))
     if "encoder_bias" in effects:
-        read = segment.measured + np.float32([[0.05], [0.0], [0.0]])
+        read = segment.measured + np.float32([[0.05], [0.0], [0.0], [0.0]])
         segment = segment.replace(measured=read, past=segment.past + np.float32(0.05))
     read = arm.play(segment, **RUBBING, **effects)["q"]
     np.testing.assert_allclose(read, np.tile(read[0], (rigs.STEPS, 1)), atol=2e-6)

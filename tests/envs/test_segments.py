@@ -68,19 +68,21 @@ def test_smoothing_takes_noise_out():
     np.testing.assert_allclose((got[:, 1] - velocity[10:-10]).std(), 0.01 / (0.005 * 10**0.5), rtol=0.06)
 
 
-def test_accelerations_have_less_noise_than_slopes_of_velocities_and_follow_the_motion():
+def test_slopes_have_less_noise_than_states_and_follow_the_motion():
     rng = np.random.default_rng(1)
     time = times(4.0)
     angle = 2.0 * np.pi * 2.0 * time[:, None] * [1.0, -0.5]
     position, acceleration = 0.3 * np.sin(angle), -0.3 * (2.0 * np.pi * np.array([2.0, 1.0])) ** 2 * np.sin(angle)
     inner = slice(10, -10)
-    exact = segments.accelerations(run(time, q=position))
+    exact = segments.slopes(run(time, q=position))[:, 1]
     # A cubic over 20 ms on both sides bends 0.5 % less at 2 Hz.
     np.testing.assert_allclose(exact[inner], acceleration[inner], atol=0.006 * np.abs(acceleration).max())
     noisy = run(time, q=position + 3e-4 * rng.standard_normal(position.shape))
-    got = segments.accelerations(noisy)[inner] - acceleration[inner]
-    slopes = np.gradient(segments.smoothed(noisy)[:, 1], time, axis=0)[inner] - acceleration[inner]
-    assert got.std() < 0.3 * slopes.std()
+    got = segments.slopes(noisy)[inner]
+    velocity, own = np.gradient(position, time, axis=0)[inner], segments.smoothed(noisy)[:, 1]
+    assert (got[:, 0] - velocity).std() < 0.6 * (own[inner] - velocity).std()
+    slopes = np.gradient(own, time, axis=0)[inner] - acceleration[inner]
+    assert (got[:, 1] - acceleration[inner]).std() < 0.3 * slopes.std()
 
 
 def test_a_good_velocity_counts_for_more_than_positions():
@@ -341,7 +343,7 @@ def test_pieces_follow_on_each_other_and_have_a_history(moving):
     # 0.15 s and one step for the end, or two where times are no multiples to the last bit.
     _, steps = one.sample.shape
     assert BEFORE + 151 <= steps <= BEFORE + 152
-    assert one.measured.shape == (5, BEFORE + 1 + AHEAD, 3, 2)
+    assert one.measured.shape == (5, BEFORE + 1 + AHEAD, 4, 2)
     for name in ("target", "between", "feed", "stiffness", "damping", "limit", "emf"):
         assert getattr(one, name).shape == (5, steps, 2), name
     assert one.row_step.shape == one.row_share.shape == (5, 30)
