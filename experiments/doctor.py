@@ -6,7 +6,9 @@ much better with itself and with the robot's model. `envs.diagnosis` holds the t
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Annotated
 
+import tyro
 from rich.markup import escape
 from rich.table import Table
 
@@ -21,7 +23,7 @@ class Args:
     """Looks in a log for swapped joints, flipped signs, degrees in the place of radians, offsets, delays and clock
     errors."""
 
-    log: Path
+    log: Annotated[Path, tyro.conf.arg(aliases=["--logs"])]
     """Folder of the log, with its meta.yaml; or of the JSON files of the XL330 pendulum."""
     robot: Path | None = None
     """MJCF of the robot, in the place of the log's own model. It may be anywhere; a log's own must be in its folder."""
