@@ -33,9 +33,10 @@ _DOUBTFUL = (
 )
 
 
+DOUBTFUL = 0.05
+"""Largest p-value (`UpdateInfo.p_value`) with which an accepted set fits so badly that its estimates are in doubt."""
 _WEAK = 0.5  # least error of a coordinate that is hardly identified, as a share of its standard deviation
 _SMALL = 0.3  # weight in a combination that is left out, as a share of the largest
-_MISFIT = 0.05  # largest p-value that is worth a word
 _EXCESS = {
     "cover": "shapes that the verification model does not know",
     "lost": "how long the robot stays up",
@@ -76,6 +77,16 @@ def intervals(info) -> np.ndarray:
     return np.where(
         inside & np.asarray(info.update.identifiable), np.asarray(dists.ravel(info.dist.radius)) * interval, np.nan
     )
+
+
+def doubtful(info) -> bool:
+    """Tells whether an accepted set fits so badly in the distribution that was read last that estimates are in doubt.
+
+    Args:
+      info: of one tuning in which the gate was called.
+    """
+    accepted = int(info.verdicts[int(info.calls) - 1]) == Verdict.ACCEPT
+    return accepted and float(info.update.p_value) <= DOUBTFUL
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -168,11 +179,10 @@ def explain(info) -> str:
         lines.append(f"  most unlike the simulated sets: {most} ({excess[most]:.1f}; 1 is usual for one set in ten)")
     if int(info.not_finite):
         lines.append(f"  {int(info.not_finite)} episode(s), simulated or measured, hold numbers that are not finite")
-    fit = float(info.update.p_value)
-    doubtful = verdict == Verdict.ACCEPT and fit <= _MISFIT
+    doubt = doubtful(info)
     if verdict == Verdict.ACCEPT:
-        if doubtful:
-            lines.append(f"  fits badly in the distribution that was read last (p {fit:.2f})")
+        if doubt:
+            lines.append(f"  fits badly in the distribution that was read last (p {float(info.update.p_value):.2f})")
         past = float(info.update.p_past)
         if info.update.pooled:
             lines.append(f"  joined with the sets of earlier tunings, which it does not contradict (p {past:.2f})")
@@ -185,13 +195,16 @@ def explain(info) -> str:
         moved = dists.move(info.dist, info.update.step).centre
         interval = intervals(info)
         vague = weak(info)
+        ends = (dists.ravel(end) for end in (info.dist.lower, info.dist.upper))
+        at_bound = np.isclose([*ends], dists.ravel(moved), atol=1e-4).any(axis=0)
         for column, name in enumerate(dists.names(info.dist)):
             line = f"  {name}: {float(info.dist.centre[name]):.3f}"
             if info.update.identifiable[column]:
                 around = "" if np.isnan(interval[column]) else f" +- {interval[column]:.3f}"
                 note = ", weakly identified" if vague[column] else ""
+                note += ", at a bound" if at_bound[column] else ""
                 lines.append(f"{line} -> {float(moved[name]):.3f}{around}{note}")
             else:
                 lines.append(f"{line}, not identifiable from these episodes")
         lines += [f"  together: {one}" for one in combinations(info)]
-    return "\n".join([*lines, _DOUBTFUL if doubtful else ADVICE[verdict]])
+    return "\n".join([*lines, _DOUBTFUL if doubt else ADVICE[verdict]])

@@ -9,18 +9,19 @@ import jax.numpy as jnp
 
 from jaxtune.types import Effect, Parameter
 
-# Of the unit of angle: bristles that are stiffer would need shorter steps, and the engine's own friction is as sharp.
+# Of the unit of angle: bristles that are stiffer would need shorter steps. Those have a share of the friction, and the
+# engine's own, which is as sharp, the rest: a travel that shrinks to nothing changes nothing at once.
 _LEAST_TRAVEL = 1e-4
 
 
 def _presliding(values, friction, now, memory):
     """torque' = torque - bound z with d z / dt = speed / travel, |z| <= 1 (Dahl friction with a sharp knee)."""
     bound, torque = friction
-    travel = values["travel_rad"]
+    travel, least = values["travel_rad"], _LEAST_TRAVEL * now.unit
     # The memory is z, the deflection of the bristles in shares of that at which they slide.
-    wound = jnp.clip(memory + now.dt * now.speed / jnp.maximum(travel, 1e-9), -1.0, 1.0)
-    there = travel > _LEAST_TRAVEL * now.unit
-    return jnp.stack([jnp.where(there, 0.0, bound), torque - jnp.where(there, bound * wound, 0.0)]), wound
+    wound = jnp.clip(memory + now.dt * now.speed / jnp.maximum(travel, least), -1.0, 1.0)
+    theirs = jnp.clip(travel / least, 0.0, 1.0) * bound
+    return jnp.stack([bound - theirs, torque - theirs * wound]), wound
 
 
 def _wound(values, past, dt):

@@ -7,7 +7,7 @@ else.
 
 from dataclasses import dataclass, field
 
-from jaxtune.explain import Combination
+from jaxtune.explain import DOUBTFUL, Combination
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,7 +143,7 @@ class Tuning:
     compared_s: float
     """How many seconds of every walk were compared, from its start."""
     misfits: dict[str, Misfit]
-    """Signals that no parameters explain, the worst first; none unless the log was rejected."""
+    """Signals that no parameters explain, the worst first; none unless the log was rejected or is doubtful."""
     explained: Prediction
     """Prediction for the policy that walked, in the tuned simulator; it should agree with the measurement."""
 
@@ -151,6 +151,11 @@ class Tuning:
     def verdict(self) -> str | None:
         """How the tuning ended; None for a method without a gate."""
         return self.verdicts[-1] if self.verdicts and self.p_value[-1] is not None else None
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether an accepted log fits so badly in the distribution that was read last that estimates are in doubt."""
+        return self.verdict == "accept" and self.fit_p_value is not None and self.fit_p_value <= DOUBTFUL
 
     @property
     def unidentified(self) -> tuple[str, ...]:

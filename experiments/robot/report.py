@@ -27,6 +27,9 @@ VERDICTS = {
 
 ADVICE = {
     "accept": "Continue with the next round, if the expected falls allow it.",
+    "doubtful": "The log fits badly all the same, in the distribution that was read last: estimates may make up for "
+    "physics that the model lacks. Look where it does not fit before the robot walks again, and measure again with the "
+    "same policy if you can.",
     "unexplained": "Suspend the robot, play the targets that experiments.excite writes, and run experiments.discover "
     "on the log: it names what is missing.",
     "radius_exhausted": "Check the bounds of the parameters and the log. If both are right, suspend the robot and run "
@@ -37,7 +40,7 @@ ADVICE = {
     "with the robot held by a rope.",
     None: "Use --method ours if you want to know.",
 }
-"""What to do next, by verdict."""
+"""What to do next, by verdict; `doubtful` stands for an accepted log that fits badly."""
 
 _TEMPLATE = Path(__file__).with_suffix(".html")
 _QUANTITIES = {"return": "return", "fall_rate": "share of walks that end in a fall", "power_w": "mechanical power, W"}
@@ -58,7 +61,7 @@ def write(path: Path, history: Sequence[Round], terms: Terms, robot: str = "bite
         line=as_json(last),
         verdict=last.tuning.verdict,
         meaning=VERDICTS[last.tuning.verdict],
-        advice=ADVICE[last.tuning.verdict],
+        advice=_advice(last),
         quantities=_QUANTITIES,
         unidentified=last.tuning.unidentified,
         earlier=_earlier(last),
@@ -73,6 +76,12 @@ def write(path: Path, history: Sequence[Round], terms: Terms, robot: str = "bite
         picture=plots.embedded(plots.rounds(as_json(list(history)))),
     )
     path.write_text(page)
+
+
+def _advice(last: Round) -> str:
+    if not last.tuning.doubtful:
+        return ADVICE[last.tuning.verdict]
+    return f"{ADVICE['doubtful']} (p {last.tuning.fit_p_value:.2f})"
 
 
 def _earlier(last: Round) -> str:
@@ -96,7 +105,7 @@ def show(console: Console, last: Round) -> None:
     """
     verdict = last.tuning.verdict
     console.print(f"[bold]round {last.index}: {verdict or 'no gate'}[/bold]: {VERDICTS[verdict]}")
-    console.print(ADVICE[verdict])
+    console.print(_advice(last))
     table = Table("", "predicted", "measured", "same policy, tuned simulator", "predicted for the next round")
     columns = [as_json(one) for one in (last.predicted, last.measured, last.tuning.explained, last.next_predicted)]
     for name, label in _QUANTITIES.items():

@@ -36,6 +36,7 @@ from experiments.robot.records import Measured, Misfit, Moved, Prediction, Round
 from experiments.walking.learner import Learner, Policy
 from experiments.walking.policies import policy_config
 from jaxtune import baselines, devices, tuner
+from jaxtune.explain import doubtful
 from jaxtune.tuner import Tuner, TunerState
 from jaxtune.types import Trajectory, Verdict
 
@@ -262,9 +263,9 @@ class Rounds:
         write_json(place / "tuning.json", tuning)
 
     def _misfits(self, index: int, state: TunerState, measured: Trajectory, info: tuner.Info) -> dict[str, Misfit]:
-        """The signals that no parameters explain, the worst first; none unless the set was rejected."""
+        """The signals that no parameters explain, the worst first; none unless the set was rejected or fits badly."""
         rejected = (Verdict.UNEXPLAINED, Verdict.RADIUS_EXHAUSTED)
-        if info.calls == 0 or info.verdicts[int(info.calls) - 1] not in rejected:
+        if info.calls == 0 or not (info.verdicts[int(info.calls) - 1] in rejected or doubtful(info)):
             return {}
         found = self._programs.misfits(self._key(index, 4), state, measured)
         names = self._learner.channels()

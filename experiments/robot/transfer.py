@@ -3,11 +3,11 @@
 `experiments.sim2real` is this module as a command. `experiments.sim2real_bench` plays many runs with it.
 """
 
-import sys
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import tyro
 
 from envs import corrected
@@ -87,9 +87,10 @@ def check(transfer: Transfer) -> tuple[Preset, Kind, dict[str, Entry], dict[str,
     # A walk is compared with simulated episodes, so it lasts at least as long as one.
     least["walk_s"] = min(sizes.episode_steps, robot.episode_steps) * robot.control_s
     for option, value in {**asdict(transfer), **asdict(transfer.terms), "epochs": epochs}.items():
-        most = 1 if option == "max_fall_rate" else sys.float_info.max
-        if option in least and not least[option] <= value <= most:
-            raise ValueError(f"{option}: got {value}, expected {least[option]:g} to {most:g}")
+        most = 1 if option == "max_fall_rate" else np.inf
+        if option in least and not (np.isfinite(value) and least[option] <= value <= most):
+            allowed = f"{least[option]:g} " + (f"to {most:g}" if np.isfinite(most) else "or more")
+            raise ValueError(f"{option}: got {value}, expected {allowed}")
     start = nominal(entries) | named_values("start", transfer.start, entries)
     task = replace(sizes.task, noise=transfer.noise)
     return replace(sizes, task=task, epochs=epochs), robot, entries, start

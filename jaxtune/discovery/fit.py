@@ -20,6 +20,7 @@ _SCALES = (1.0, 0.35)  # shares of the Gauss-Newton step that are tried side by 
 _DAMPING = 1e-3
 _IDLE = 0.5  # fall of the cost that chance gives: about a half for a squared unit residual
 _PATIENCE = 2  # rounds without more than that
+_SHORTEST_SECANT = 0.01  # of a deviation
 _SHORTEST = 0.03  # length of a step, in coordinates, below which rounding hides what it could teach
 
 
@@ -266,6 +267,9 @@ def _secant_step(fit: Fit) -> np.ndarray:
     """How far to go for a secant along each coordinate, [coordinates], inwards from an upper bound."""
     # Nominal parameters stay within a deviation or so; an effect's prior is wide, and its own size says more.
     size = np.maximum(0.3 * fit.free.sd * np.where(fit.free.nominal, 1.0, 0.1), 0.1 * np.abs(fit.coordinates))
+    # What cannot be negative may matter by its ratio, as a short travel of bristles does.
+    grows = fit.free.nominal & (fit.free.bounds[:, 0] == 0) & (fit.coordinates > 0)
+    size = np.where(grows, np.clip(0.3 * fit.coordinates, _SHORTEST_SECANT * fit.free.sd, size), size)
     return np.where(fit.coordinates + size > fit.free.bounds[:, 1], -size, size)
 
 

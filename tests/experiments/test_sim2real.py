@@ -254,6 +254,13 @@ def test_the_page_says_what_matters_and_runs_nothing_of_the_log(tmp_path):
     report.write(page, [line(["unexplained"], 0.4, 0.1)], TERMS, robot="go2")
     assert "experiments.excite --robot ROBOT.xml" in page.read_text()
     assert "--model" not in page.read_text()
+    badly = replace(one, tuning=replace(one.tuning, fit_p_value=0.05, misfits=line(["widen"], 0.4, 0.1).tuning.misfits))
+    assert badly.tuning.doubtful
+    assert not one.tuning.doubtful
+    report.write(page, [badly], TERMS)
+    assert "fits badly all the same" in page.read_text()
+    assert "(p 0.05)" in page.read_text()
+    assert "gyro[1] 4.2" in page.read_text()
     report.write(page, [line(["not_comparable"], 1.0, 0.1, cut_short=3)], TERMS)
     text = page.read_text()
     assert "a policy that stands longer" in text

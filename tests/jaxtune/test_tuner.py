@@ -755,6 +755,14 @@ def test_an_accepted_set_that_misfits_where_it_was_read_last_is_doubted(play):
     assert "Measure again before you train" not in said(0.06)
 
 
+def test_an_estimate_at_a_bound_is_called_that(play):
+    info = play(0.5)[2]
+    assert "at a bound" not in tuners.explain(info)
+    above = jax.tree.map(lambda end: jnp.full_like(end, 0.1), info.dist.upper)
+    text = tuners.explain(info.replace(dist=info.dist.replace(upper=above)))
+    assert "mass: 0.000 -> 0.100, at a bound" in text
+
+
 def test_episodes_with_numbers_that_are_not_finite_are_counted(play):
     info = play(0.5)[2]
     assert "not finite" not in tuners.explain(info)

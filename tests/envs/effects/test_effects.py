@@ -347,12 +347,25 @@ def test_a_soft_limit_is_the_usual_one_of_some_power(softness):
 
 
 def test_bristles_of_a_slide_may_be_shorter_than_those_of_a_hinge():
-    # 20 um are much for a slide, and for a hinge in rad too little to be told from the engine's own friction.
+    # 20 um are much for a slide. Of a hinge in rad they are a fifth of the least travel, so bristles of that travel have
+    # a fifth of the friction, and the engine the rest.
     friction = np.tile([[0.4], [0.1]], JOINTS)
-    for speed, torque in ((0.0, 0.1), (0.01, 0.1 - 0.4 * 0.5)):
+    for speed, wound in ((0.0, (0.0, 0.0)), (0.01, (0.1, 0.5))):
         at = now(speed=speed, unit=np.array([1.0, 0.05], np.float32))
         got = act("presliding", friction, memory=np.zeros(JOINTS), at=at, travel_rad=20e-6)
-        np.testing.assert_allclose(got, [[0.4, 0.0], [0.1, torque]], atol=1e-6)
+        torque = 0.1 - 0.4 * np.array([0.2, 1.0]) * wound
+        np.testing.assert_allclose(got, [[0.32, 0.0], torque], atol=1e-6)
+
+
+def test_a_travel_that_shrinks_to_nothing_changes_nothing_at_once():
+    friction = np.tile([[0.4], [0.1]], JOINTS)
+    after = lambda travel: act(  # noqa: E731
+        "presliding", friction, memory=np.full(JOINTS, 0.5), at=now(speed=0.01), travel_rad=travel
+    )
+    travels = np.linspace(0.0, 3e-4, 301)
+    jumps = np.abs(np.diff([after(travel) for travel in travels], axis=0)).max()
+    assert jumps < 0.01 * 0.4 + 1e-6
+    np.testing.assert_allclose(after(0.0), friction, atol=1e-7)
 
 
 def test_bristles_give_way_and_then_slide():

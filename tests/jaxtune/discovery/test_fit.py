@@ -1,0 +1,37 @@
+"""Fits of numbers whose residuals are known in closed form."""
+
+import numpy as np
+
+from jaxtune.discovery.fit import Free, fit_at, polish
+from jaxtune.discovery.least_squares import Counts
+
+ALONG, ACROSS, OTHER, NOISE = np.random.default_rng(3).standard_normal((4, 400))
+LENGTH = 0.05
+
+
+class Evaluate:
+    """Residuals that turn with the logarithm of a length, coordinate 0, and are linear in coordinate 1.
+
+    They are least at `LENGTH` and at 1; something across the first direction is never explained.
+    """
+
+    def __call__(self, vectors):
+        turn = np.log((vectors[:, :1] + 1e-4) / (LENGTH + 1e-4))
+        bent = 20.0 * (np.sin(turn) * ALONG + (1.0 - np.cos(turn)) * ACROSS)
+        return NOISE - 20.0 * ACROSS + bent + 5.0 * (vectors[:, 1:] - 1.0) * OTHER
+
+    def changes(self, bases, residuals, moves):
+        return [self(base + mine) - own for base, own, mine in zip(bases, residuals, moves, strict=True)]
+
+
+def test_slopes_along_a_short_length_are_taken_by_its_own_size():
+    free = Free(np.eye(2), np.ones(2), np.array([[0.0, 5.0], [-3.0, 3.0]]), np.ones(2, bool))
+    counts, evaluate = Counts(components=1, bins=10, independent=1.0), Evaluate()
+    begun = fit_at(free, np.array([LENGTH, 0.0]), counts, evaluate)
+    # By a third of a deviation, as of parameters that may have any sign, the length would be seven times as long.
+    tangent = 20.0 * ALONG / (LENGTH + 1e-4)
+    assert np.linalg.norm(begun.jacobian[:, 0] - tangent) < 0.3 * np.linalg.norm(tangent)
+    # With that slope no step lowers the cost, and the other coordinate stays where it is, too.
+    (found,) = polish([begun], evaluate, 4)
+    assert abs(found.coordinates[0] - LENGTH) < 0.01
+    assert found.coordinates[1] > 0.5
