@@ -347,7 +347,7 @@ def test_a_soft_limit_is_the_usual_one_of_some_power(softness):
 
 
 def test_bristles_of_a_slide_may_be_shorter_than_those_of_a_hinge():
-    # 20 um are much for a slide. Of a hinge in rad they are a fifth of the least travel, so bristles of that travel have
+    # 20 um are much for a slide. Of a hinge in rad they are a fifth of the least travel: bristles of that travel have
     # a fifth of the friction, and the engine the rest.
     friction = np.tile([[0.4], [0.1]], JOINTS)
     for speed, wound in ((0.0, (0.0, 0.0)), (0.01, (0.1, 0.5))):
