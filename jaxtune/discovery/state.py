@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxtune.discovery.candidate import Candidate, cheapest_of_each
 from jaxtune.discovery.curves import Library
-from jaxtune.discovery.fit import Fit, Free, refine
+from jaxtune.discovery.fit import Fit, Free, fit_at, refine
 from jaxtune.discovery.noise_floor import NoiseFloor, with_systematic_share
 from jaxtune.discovery.problem import Problem
 from jaxtune.discovery.result import Settings
@@ -26,7 +26,7 @@ class State:
     """What a discovery knows after a step; the next step needs nothing else."""
 
     nominal: Fit
-    """The nominal model, with the slopes of the prior directions."""
+    """The nominal model, with the slopes of the prior directions, and other unknowns where the null first had them."""
     null: Candidate
     """The nominal model with its nominal parameters and other unknowns fitted, and no effect."""
     best: Candidate
@@ -103,6 +103,11 @@ def begin(problem: Problem, floor: NoiseFloor) -> tuple[NoiseFloor, State]:
     at = floor[problem.main_horizon]
     nominal = replace(nominal, counts=at.counts)
     (fit,) = refine([nominal], at.residuals["train"], _NULL_ROUNDS)
+    # Nobody believes that the other unknowns are zero, and some of them, such as the travel of bristles, change how all
+    # the rest acts. So effects are looked for where they are about right.
+    settled = np.where(np.arange(len(zero)) < len(zero) - len(problem.unknowns), 0.0, fit.coordinates)
+    nominal = fit_at(at.prior, settled, at.counts, at.residuals["train"])
+    (fit,) = refine([replace(fit, jacobian=nominal.jacobian)], at.residuals["train"], _NULL_ROUNDS)
     null = Candidate((), fit, at.residuals["select"](fit.vector[None])[0])
     return floor, State(nominal=nominal, null=null, best=null, candidates=(null,))
 

@@ -3,8 +3,9 @@
     slopes -> localise -> screen -> fit -> polish -> compare
 
 The first step starts from the nominal model, not from the null: nominal parameters that were fitted alone have moved to
-imitate what is missing, and a search from there would have to lead them back. It tries pairs as well, since the gap of
-one effect may hide another. Where nothing joins the best model any more, each of its effects is replaced in turn.
+imitate what is missing, and a search from there would have to lead them back. Only the other unknowns are where the
+null first had them, since nobody believes that these are zero. It tries pairs as well, since the gap of one effect may
+hide another. Where nothing joins the best model any more, each of its effects is replaced in turn.
 """
 
 from dataclasses import dataclass, replace

@@ -1,7 +1,12 @@
-"""Fits of numbers whose residuals are known in closed form."""
+"""Where fits begin, and how they move."""
+
+from dataclasses import replace
 
 import numpy as np
+import pytest
+from slider import HYPOTHESES, problem
 
+from jaxtune.discovery import noise_floor, state
 from jaxtune.discovery.fit import Free, fit_at, polish
 from jaxtune.discovery.least_squares import Counts
 
@@ -35,3 +40,15 @@ def test_slopes_along_a_short_length_are_taken_by_its_own_size():
     (found,) = polish([begun], evaluate, 4)
     assert abs(found.coordinates[0] - LENGTH) < 0.01
     assert found.coordinates[1] > 0.5
+
+
+def test_effects_are_looked_for_where_the_null_has_the_other_unknowns():
+    free = {"unknowns": 0.25 * HYPOTHESES[2].directions, "unknown_bounds": np.array([[0.0, 4.0]])}
+    asked = replace(problem({"coulomb": 0.4, "mass": 0.08}), **free)
+    floor, begun = state.begin(asked, noise_floor.measure(asked, lambda text: None))
+    # Nominal parameters are those of the model, where they cannot make up for what is missing.
+    np.testing.assert_array_equal(begun.nominal.coordinates[:2], 0.0)
+    assert 0.25 * begun.nominal.coordinates[2] == pytest.approx(0.4, rel=0.1)
+    evaluate = floor[asked.main_horizon].residuals["train"]
+    np.testing.assert_allclose(begun.nominal.residual, evaluate(begun.nominal.vector[None])[0], atol=1e-5)
+    assert begun.null.fit.cost < begun.nominal.cost
