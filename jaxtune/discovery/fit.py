@@ -3,7 +3,7 @@
 A fit minimises the cost of `least_squares`: what the residuals say, and the prior of every coordinate that is free. A
 simulation is the expensive part, so slopes are secants that are taken once and, for the finalists, where they stand
 (`polish`). In between, Broyden's update learns them from the steps themselves, and one iteration costs two simulations.
-Source: Nocedal and Wright, Numerical Optimization, chapters 10 and 11.
+Sources: Nocedal and Wright, Numerical Optimization, chapters 10 and 11; Marquardt (1963) for the damping.
 """
 
 from collections.abc import Sequence
@@ -16,11 +16,11 @@ from jaxtune.discovery.least_squares import Counts, Linear, of_size
 from jaxtune.discovery.problem import Hypothesis
 from jaxtune.discovery.simulation import Evaluate
 
-_SCALES = (1.0, 0.35)  # shares of the Gauss-Newton step that are tried side by side
-_DAMPING = 1e-3
+_SHORT = 0.35  # share of the step that is tried beside the whole one
+_DAMPING, _LEAST, _MOST, _FACTOR = 1e-3, 1e-6, 1.0, 30.0  # first damping, its range, and how fast it changes
 _IDLE = 0.5  # fall of the cost that chance gives: about a half for a squared unit residual
 _PATIENCE = 2  # rounds without more than that
-_SHORTEST_SECANT = 0.01  # of a deviation
+_SECANT, _SHORTEST_SECANT, _FIRST_SECANT = 0.03, 0.001, 0.3  # of a deviation; the last one from zero
 _SHORTEST = 0.03  # length of a step, in coordinates, below which rounding hides what it could teach
 
 
@@ -116,9 +116,9 @@ class Fit:
         sd = self.free.deviations(self.coordinates)
         return Linear(self.residual, self.jacobian, self.coordinates, sd, weight)
 
-    def moved(self, scale: float) -> np.ndarray:
+    def moved(self, scale: float, damping: float) -> np.ndarray:
         """Coordinates after a share `scale` of the damped Gauss-Newton step; they never leave the bounds."""
-        step = self.linear.step(_DAMPING, self.free.bounds)
+        step = self.linear.step(damping, self.free.bounds)
         return np.clip(self.coordinates + scale * step, self.free.bounds[:, 0], self.free.bounds[:, 1])
 
 
@@ -126,21 +126,30 @@ def refine(fits: Sequence[Fit], evaluate: Evaluate, rounds: int) -> list[Fit]:
     """Moves every fit towards its least cost, all of them in the same batches of simulations.
 
     A round tries a whole and a short Gauss-Newton step of every fit and keeps the better one, if it lowers the cost.
-    A fit that gained less than chance in two rounds in a row is done. One whose trials are all not finite is returned
-    with `finite=False`.
+    The whole one is damped less: with thousands of residuals, parameters that make up for one another would creep along
+    their valley at any fixed damping. A fit that gained less than chance in two rounds in a row is done. One whose
+    trials are all not finite is returned with `finite=False`.
     """
-    fits, idle = list(fits), [0] * len(fits)
+    fits, idle, damping = list(fits), [0] * len(fits), [_DAMPING] * len(fits)
     for _ in range(rounds):
         active = [index for index, count in enumerate(idle) if count < _PATIENCE and fits[index].finite]
         if not active:
             break
         # All trials of all fits go into one batch, since a device simulates many as fast as one.
-        trials = [[fits[index].moved(scale) for scale in _SCALES] for index in active]
+        less = [max(damping[index] / _FACTOR, _LEAST) for index in active]
+        trials = [
+            (fits[index].moved(1.0, light), fits[index].moved(_SHORT, damping[index]))
+            for index, light in zip(active, less, strict=True)
+        ]
         vectors = [p @ fits[index].free.directions for index, pair in zip(active, trials, strict=True) for p in pair]
-        found = evaluate(np.stack(vectors)).reshape(len(active), len(_SCALES), -1)
-        for index, points, residuals in zip(active, trials, found, strict=True):
-            before, fits[index] = fits[index].cost, _best_trial(fits[index], points, residuals)
-            idle[index] = idle[index] + 1 if before - fits[index].cost < _IDLE else 0
+        found = evaluate(np.stack(vectors)).reshape(len(active), 2, -1)
+        for index, light, points, residuals in zip(active, less, trials, found, strict=True):
+            before, fits[index] = fits[index], _best_trial(fits[index], points, residuals)
+            if (fits[index].coordinates == points[0]).all():
+                damping[index] = light
+            elif fits[index].cost == before.cost:
+                damping[index] = min(damping[index] * _FACTOR, _MOST)
+            idle[index] = idle[index] + 1 if before.cost - fits[index].cost < _IDLE else 0
     return fits
 
 
@@ -265,11 +274,14 @@ def taken_over(free: Free, hypothesis: Hypothesis) -> np.ndarray:
 
 def _secant_step(fit: Fit) -> np.ndarray:
     """How far to go for a secant along each coordinate, [coordinates], inwards from an upper bound."""
-    # Nominal parameters stay within a deviation or so; an effect's prior is wide, and its own size says more.
-    size = np.maximum(0.3 * fit.free.sd * np.where(fit.free.nominal, 1.0, 0.1), 0.1 * np.abs(fit.coordinates))
-    # What cannot be negative may matter by its ratio, as a short travel of bristles does.
-    grows = fit.free.nominal & (fit.free.bounds[:, 0] == 0) & (fit.coordinates > 0)
-    size = np.where(grows, np.clip(0.3 * fit.coordinates, _SHORTEST_SECANT * fit.free.sd, size), size)
+    sd, at, nominal = fit.free.sd, np.abs(fit.coordinates), fit.free.nominal
+    # Logs may say a hundred times more than the prior does, so slopes must not bend over a secant. Nominal parameters
+    # stay within a deviation or so; an effect's prior is wide, and its own size says more.
+    size = np.maximum(_SECANT * sd * np.where(nominal, 1.0, 0.1), _SECANT / 3.0 * at)
+    # What cannot be negative may matter by its ratio, as a short travel of bristles does, and not at once.
+    grows = nominal & (fit.free.bounds[:, 0] == 0)
+    size = np.where(grows, np.clip(_SECANT * at, _SHORTEST_SECANT * sd, size), size)
+    size = np.where(grows & (at == 0), _FIRST_SECANT * sd, size)
     return np.where(fit.coordinates + size > fit.free.bounds[:, 1], -size, size)
 
 

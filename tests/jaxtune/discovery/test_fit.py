@@ -7,7 +7,7 @@ import pytest
 from slider import HYPOTHESES, problem
 
 from jaxtune.discovery import noise_floor, state
-from jaxtune.discovery.fit import Free, fit_at, polish
+from jaxtune.discovery.fit import Free, fit_at, polish, refine
 from jaxtune.discovery.least_squares import Counts
 
 ALONG, ACROSS, OTHER, NOISE = np.random.default_rng(3).standard_normal((4, 400))
@@ -52,3 +52,32 @@ def test_effects_are_looked_for_where_the_null_has_the_other_unknowns():
     evaluate = floor[asked.main_horizon].residuals["train"]
     np.testing.assert_allclose(begun.nominal.residual, evaluate(begun.nominal.vector[None])[0], atol=1e-5)
     assert begun.null.fit.cost < begun.nominal.cost
+
+
+class Valley:
+    """Residuals with a valley: 300 times steeper across it than along it. They are least at (1, -1)."""
+
+    def __call__(self, vectors):
+        across, along = vectors.sum(axis=1, keepdims=True), vectors[:, :1] - vectors[:, 1:] - 2.0
+        return NOISE + 300.0 * across * ALONG + along * ACROSS
+
+    changes = Evaluate.changes
+
+
+def test_fits_do_not_creep_along_a_valley():
+    free = Free(np.eye(2), np.ones(2), np.array([[-3.0, 3.0]] * 2), np.ones(2, bool))
+    begun = fit_at(free, np.zeros(2), Counts(components=1, bins=10, independent=1.0), Valley())
+    (found,) = refine([begun], Valley(), 4)
+    np.testing.assert_allclose(found.coordinates, [1.0, -1.0], atol=0.15)
+
+
+def test_slopes_do_not_bend_over_a_secant():
+    class Bent:
+        def __call__(self, vectors):
+            return vectors @ np.ones((1, 400)) + vectors**2 @ np.ones((1, 400))
+
+        changes = Evaluate.changes
+
+    free = Free(np.eye(1), np.ones(1), np.array([[-3.0, 3.0]]), np.ones(1, bool))
+    begun = fit_at(free, np.array([0.2]), Counts(components=1, bins=10, independent=1.0), Bent())
+    np.testing.assert_allclose(begun.jacobian, 1.4, rtol=0.05)
