@@ -34,7 +34,8 @@ ROWS = (
             Parameter(name="n_s2_per_m2", scale="air", bounds=(-5.0, 5.0), prior=0.3),
         ),
         sizes=(0.03,),
-        forms=(Form("quadratic", "drag", ("n_s2_per_m2",)),),
+        # As of viscous friction: free dampings of the joints take most of what grows with speed itself.
+        forms=(Form("quadratic", "drag", ("n_s2_per_m2",), screened=True),),
         enters="wrench",
         act=_drag,
         sentence="A cable or the air drags on the link in proportion to its speed.",
