@@ -2,7 +2,8 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from experiments.common.files import read_json, write_json
 from experiments.discovery.measured import read_logs
 from experiments.discovery.question import Question, build_question
 from experiments.discovery.summary import details, free_runs, summarise
+from experiments.discovery.whole_runs import mean_errors
 from jaxtune.discovery import workflow
 from jaxtune.discovery.noise_floor import Say
 from jaxtune.discovery.result import Result
@@ -70,7 +72,7 @@ def investigate(
     question = build_question(log, spec, horizons, null_logs, seed)
     out.mkdir(parents=True, exist_ok=True)
     result = workflow.discover(
-        question.problem,
+        replace(question.problem, whole_runs=partial(mean_errors, question)),
         saved=read_json(saved) if saved.exists() else None,
         save=lambda state: write_json(saved, state),
         say=say,

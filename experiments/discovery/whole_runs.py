@@ -54,6 +54,19 @@ def simulate_runs(
     ]
 
 
+def mean_errors(question: Question, vectors: np.ndarray) -> np.ndarray:
+    """Computes by how much vectors [vectors, axes] miss whole runs of train and select, [vectors] in the signal's unit.
+
+    It is the mean of the runs' mean absolute errors.
+    """
+    used = {name for split in ("train", "select") for name in question.splits[split]}
+    runs = [run for run in question.log.runs if run.name in used]
+    rows, simulated = simulate_runs(question, runs, vectors)
+    measured = [run.signals[question.of_whole_runs][own] for run, own in zip(runs, rows, strict=True)]
+    errors = [np.abs(one - real).mean(axis=(1, 2)) for one, real in zip(simulated, measured, strict=True)]
+    return np.mean(errors, axis=0)
+
+
 @devices.on_all
 @partial(jax.jit, static_argnums=(0, 1))
 def _play(simulate, signal, system, values, inputs, steps):

@@ -64,6 +64,7 @@ def conclude(settings: Settings, problem: Problem, floor: NoiseFloor, state: Sta
     at = floor[problem.main_horizon]
     say("evidence")
     state = _where_it_shows(problem, at, _with_one_name(problem, at, state))
+    state = _by_whole_runs(settings, problem, at, state)
     best, terms, ablated, dropped = _proved(settings, problem, floor, state)
     state = _with_what_passes(settings, problem, at, replace(state, best=best))
     if state.best is not best:
@@ -166,6 +167,26 @@ def _where_it_shows(problem: Problem, at: Floor, state: State) -> State:
     if all(len(effect.places) == 1 for effect in state.best.effects):
         return state
     return replace(state, best=at_fewest_places(state.best, *_compared(problem, at, state)))
+
+
+def _by_whole_runs(settings: Settings, problem: Problem, at: Floor, state: State) -> State:
+    """Takes, of models that are believed about as much as the best one, one that predicts whole runs much better.
+
+    Of a servo two models of its losses were as good on segments, which start at measured states, and one of them
+    predicted whole runs that were fitted with more than twice the error of the other.
+    """
+    if problem.whole_runs is None or not state.best.hypotheses:
+        return state
+    candidates, probabilities = _compared(problem, at, state)
+    mine = next(n for n, one in enumerate(candidates) if one.key == state.best.key)
+    near = np.flatnonzero(probabilities >= settings.as_likely * probabilities[mine])
+    near = np.append(near[near != mine][: settings.rivals], mine)
+    if len(near) < 2:
+        return state
+    errors = problem.whole_runs(np.stack([candidates[n].fit.vector for n in near]))
+    errors = np.where(np.isfinite(errors), errors, np.inf)
+    least = int(np.argmin(errors))
+    return replace(state, best=candidates[near[least]]) if errors[least] < settings.whole_runs * errors[-1] else state
 
 
 def _with_what_passes(settings: Settings, problem: Problem, at: Floor, state: State) -> State:

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from slider import problem
 
@@ -49,3 +50,26 @@ def test_the_answer_names_the_joints_that_show_an_effect(stepped):
     begun = replace(found, best=wide, candidates=(wide, *found.candidates))
     (term,) = conclude.conclude(Settings(), asked, floor, begun, lambda text: None).terms
     assert term.hypothesis.places == ("slider",)
+
+
+def test_of_models_that_are_believed_alike_one_that_predicts_whole_runs_is_taken(stepped):
+    asked, floor, found = stepped
+    at = floor[asked.main_horizon]
+    (coulomb,) = found.best.effects
+    # Under another name it costs the same, and a vector that is a little off tells which of them was asked for.
+    other = replace(found.best, hypotheses=(replace(coulomb, name="other"),))
+    moved = replace(other, fit=replace(other.fit, coordinates=1.0001 * other.fit.coordinates))
+    begun = replace(found, candidates=(*found.candidates, moved))
+
+    def taken(errors):
+        least = found.best.fit.vector.tobytes()
+        asked_for = replace(asked, whole_runs=lambda vectors: np.array([errors[v.tobytes() == least] for v in vectors]))
+        return conclude._by_whole_runs(Settings(), asked_for, at, begun).best
+
+    assert taken({True: 0.1, False: 0.05}) is moved
+    # A little better may be chance.
+    assert taken({True: 0.1, False: 0.09}) is found.best
+    assert taken({True: 0.1, False: np.nan}) is found.best
+    # The null is not believed at all.
+    begun = found
+    assert taken({True: 0.1, False: 0.01}) is found.best
