@@ -64,9 +64,9 @@ def conclude(settings: Settings, problem: Problem, floor: NoiseFloor, state: Sta
     at = floor[problem.main_horizon]
     say("evidence")
     state = _where_it_shows(problem, at, _with_one_name(problem, at, state))
-    state = _by_whole_runs(settings, problem, at, state)
     best, terms, ablated, dropped = _proved(settings, problem, floor, state)
     state = _with_what_passes(settings, problem, at, replace(state, best=best))
+    state = _by_whole_runs(settings, problem, at, state)
     if state.best is not best:
         best, terms, ablated, later = _proved(settings, problem, floor, state)
         dropped += later
