@@ -232,7 +232,7 @@ def _hypothesis(
         family=row.family,
         places=places,
         directions=directions,
-        probes=_probes(row.sizes, parameters, bounds[0, 0]),
+        probes=_probes(row.sizes, parameters, bounds[0, 0], 1.0 / directions[0].max()),
         bounds=bounds,
         spent=axes[first[0]].takes,
         prior=np.array([one.prior for one in parameters]),
@@ -256,7 +256,7 @@ def _each(axes: Sequence[Axis], index: Mapping, row: Effect, places: tuple[str, 
     )
 
 
-def _probes(sizes: Sequence[float], parameters: Sequence[Parameter], least: float) -> np.ndarray:
+def _probes(sizes: Sequence[float], parameters: Sequence[Parameter], least: float, finest: float) -> np.ndarray:
     """Returns the coordinates [probes, parameters] at which the screen simulates an effect.
 
     Shape parameters, such as the speed scale of Stribeck friction, stay zero, since they mean nothing without a size.
@@ -268,13 +268,17 @@ def _probes(sizes: Sequence[float], parameters: Sequence[Parameter], least: floa
       sizes: of the effect, the smallest of interest first; several where it has no slope at zero.
       parameters: that are free.
       least: smallest coordinate.
+      finest: what is of the same interest at the place where the effect acts most, as a share of that at the first
+        place: what moves a finger is little for an arm.
     """
+    sizes = [finest * sizes[0], *sizes[1:]]
     free = [number for number, parameter in enumerate(parameters) if not parameter.shape]
     if len(free) > 1:
         return np.concatenate([size * np.eye(len(parameters))[free] for size in sizes])
     most, bends = parameters[free[0]].bounds[1], len(sizes) > 1
     largest = max(_LARGE * most, sizes[-1])
-    sizes = np.unique(np.geomspace(sizes[0], largest, _BENT if bends else _STRAIGHT))
+    count = (_BENT if bends else _STRAIGHT) + int(np.ceil(np.log10(1.0 / finest)))
+    sizes = np.unique(np.geomspace(sizes[0], largest, count))
     below = [-size for size in sizes if -size >= _LARGE * least - 1e-9]
     # Armature and damping can be lowered by less than their smallest size of interest.
     below = below or ([0.5 * least] if least < 0 else [])
