@@ -266,6 +266,22 @@ def test_no_place_loses_more_than_it_has(spec):
     assert (both.probes >= both.bounds[0, 0]).all()
 
 
+def test_sets_are_tried_at_what_is_of_interest_where_it_acts_most(spec):
+    from envs.rig import Rig
+
+    # The elbow's torques are a hundredth of the shoulder's.
+    rig = Rig(spec, JOINTS, 1000.0).scaled({"torque": np.array([20.0, 0.2])})
+    rows = {name: rig.effects[name] for name in ("coulomb", "torque_limit", "torque_scale")}
+    for one in hypotheses(rig.axes, rig.places, rows):
+        if one.name in rows and not one.each:
+            most = np.abs(one.directions[0]).max()
+            assert most == pytest.approx(100.0 if (one.name, one.places) == ("coulomb", JOINTS) else 1.0)
+            assert np.abs(one.probes[:, 0]).min() * most == pytest.approx(rows[one.name].sizes[0])
+            # Sizes do not lie farther apart than those of one place.
+            positive = one.probes[one.probes[:, 0] > 0, 0]
+            assert (np.diff(np.log(positive)) < np.log(20.0)).all()
+
+
 def test_a_centre_of_mass_is_tried_near_and_far_in_each_direction(spec):
     # About an upright axis only a far one is felt, since inertia grows with its square.
     from envs.rig import Rig
