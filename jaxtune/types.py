@@ -224,6 +224,8 @@ class Form:
     """Empty for all parameters of that row."""
     screened: bool = False
     """True where the effect may show in this form alone: it is screened with the form's smallest size too."""
+    alone: bool = False
+    """True where the effect may be all in this form, with nothing of what it is without it."""
     beside: str = ""
     """Another form of the effect, without which this one may not show: both are screened together too."""
     like: str = ""

@@ -35,7 +35,7 @@ ROWS = (
         ),
         sizes=(0.03,),
         # As of viscous friction: free dampings of the joints take most of what grows with speed itself.
-        forms=(Form("quadratic", "drag", ("n_s2_per_m2",), screened=True),),
+        forms=(Form("quadratic", "drag", ("n_s2_per_m2",), screened=True, alone=True),),
         enters="wrench",
         act=_drag,
         sentence="A cable or the air drags on the link in proportion to its speed.",

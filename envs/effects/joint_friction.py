@@ -59,7 +59,7 @@ ROWS = (
         ),
         sizes=(0.03,),
         # Where the model has damping, what is free under every hypothesis takes all that grows with speed itself.
-        forms=(Form("quadratic", "learned_torque", ("square_nm_s2_per_rad2",), screened=True),),
+        forms=(Form("quadratic", "learned_torque", ("square_nm_s2_per_rad2",), screened=True, alone=True),),
         differs=True,
         sentence="The joint loses a torque in proportion to its speed.",
         excited_by="a motor-off swing, or chirps at two amplitudes",

@@ -69,7 +69,7 @@ def forms(axes: Sequence[Axis], rows: Mapping[str, Effect], every: Sequence[Hypo
 
 
 def _as_form(shape: Hypothesis, effect: Hypothesis, form: Form) -> Hypothesis:
-    said = {name: getattr(form, name) for name in ("screened", "beside", "like", "far")}
+    said = {name: getattr(form, name) for name in ("screened", "alone", "beside", "like", "far")}
     return replace(shape, form=form.name, name=effect.name, family=effect.family, **said)
 
 

@@ -104,6 +104,9 @@ def weigh_evidence(
     inside = ((low < values) | hypothesis.spent) & (values < high)
     # What only shapes an effect says nothing where it ends: a filter may have one stage.
     inside |= ~(hypothesis.probes != 0).any(axis=0)
+    # Drag of the square of speed alone has none in proportion to speed.
+    whole = [part for part in parts if part is hypothesis or part.alone]
+    inside |= (len(whole) > 1) & (low == 0) & (values < high)
     relief = ablated.fit.penalty - fit.penalty
     mean_squares = [finite(one) / at.counts.bins for one in (before, now)]
     falls = [_largest_fall(*(measure(one) for one in mean_squares)) for measure in measures(at)]
@@ -119,7 +122,7 @@ def weigh_evidence(
         # Of several places one may have nothing of it, or less than nothing.
         inside=bool(inside[clearest] if hypothesis.each else inside.all()),
         horizons=_horizons_better(floor, candidate.fit, ablated.fit),
-        size=_in_smallest(values, hypothesis.probes),
+        size=max(_in_smallest(fit.coordinates[fit.along(part)], part.probes) for part in whole),
     )
     return evidence, ablated
 

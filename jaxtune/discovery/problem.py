@@ -53,6 +53,8 @@ class Hypothesis:
     frees further parameters, is tried only beside the effect, and is no name of its own."""
     screened: bool = False
     """True for a form without which its effect may not be seen: the screen tries both together as well."""
+    alone: bool = False
+    """Of a form: whether an effect may be all in it."""
     beside: str = ""
     """Of a form: another form of the effect, which the screen tries together with both as well."""
     like: str = ""

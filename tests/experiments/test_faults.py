@@ -1,6 +1,7 @@
 """Commands that are killed before or after any of their steps on the disk; what they compute is a stub."""
 
 import sys
+from dataclasses import dataclass
 from types import SimpleNamespace
 
 import numpy as np
@@ -85,6 +86,13 @@ def test_a_benchmark_of_robots(monkeypatch, tmp_path):
     assert check_every_kill(monkeypatch, tmp_path, command) == 2 * 3 * 8
 
 
+@dataclass(frozen=True)
+class Asked:
+    """What a discovery is asked to do."""
+
+    whole_runs: object = None
+
+
 @pytest.fixture
 def found(monkeypatch):
     """A discovery in three steps, each of which is kept, and what it writes of the result."""
@@ -102,7 +110,9 @@ def found(monkeypatch):
 
     summary = {"verdict": "named", "effects": [{"name": "coulomb"}], "parameter_changes": []}
     monkeypatch.setattr(investigate, "read_logs", lambda *_: (None, None))
-    monkeypatch.setattr(investigate, "build_question", lambda *_: SimpleNamespace(problem=None, rig=None, sensed=False))
+    monkeypatch.setattr(
+        investigate, "build_question", lambda *_: SimpleNamespace(problem=Asked(), rig=None, sensed=False)
+    )
     monkeypatch.setattr(investigate.workflow, "discover", discover)
     monkeypatch.setattr(investigate, "free_runs", lambda *_: {})
     monkeypatch.setattr(
