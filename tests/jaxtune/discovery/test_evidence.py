@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from slider import HYPOTHESES, WARPED, problem
+from slider import DRAG, HYPOTHESES, WARPED, problem
 
 from jaxtune.discovery import noise_floor, state, step
 from jaxtune.discovery.belief import believed, posterior, rivals
@@ -77,6 +77,20 @@ def test_an_effect_that_is_free_anyway_may_be_clear_of_zero_in_its_form():
     assert evidence.gain > 100.0
     assert evidence.interval[0] > 0.0
     assert evidence.interval[0] < 8.0 < evidence.interval[1]
+
+
+@pytest.mark.parametrize("alone", [True, False])
+def test_an_effect_may_be_all_in_its_form(alone):
+    form = replace(WARPED, name="drag", alone=alone)
+    asked = problem({"cubic": 8.0}, hypotheses=(*HYPOTHESES, DRAG), forms=(form,))
+    floor, begun = state.begin(asked, noise_floor.measure(asked, lambda text: None))
+    evaluate = floor[asked.main_horizon].residuals["train"]
+    points, base = [np.array([0.0, 8.0])], begun.null.fit
+    (fit,) = polish(begin(base, [(DRAG, form)], points, [base.coordinates], evaluate), evaluate, 0)
+    candidate = Candidate((DRAG, form), fit, floor[asked.main_horizon].residuals["select"](fit.vector[None])[0])
+    evidence, _ = weigh_evidence(asked, floor, candidate, DRAG, {})
+    assert evidence.inside == alone
+    assert (evidence.size > 1.0) == alone
 
 
 def test_a_fit_that_was_not_finished_is_no_evidence(stepped):
