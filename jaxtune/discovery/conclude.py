@@ -186,7 +186,7 @@ def _by_whole_runs(settings: Settings, problem: Problem, at: Floor, state: State
     errors = problem.whole_runs(np.stack([candidates[n].fit.vector for n in near]))
     errors = np.where(np.isfinite(errors), errors, np.inf)
     least = int(np.argmin(errors))
-    return replace(state, best=candidates[near[least]]) if errors[least] < settings.whole_runs * errors[-1] else state
+    return replace(state, best=candidates[near[least]]) if errors[least] < settings.share_whole * errors[-1] else state
 
 
 def _with_what_passes(settings: Settings, problem: Problem, at: Floor, state: State) -> State:

@@ -142,7 +142,7 @@ def refine(fits: Sequence[Fit], evaluate: Evaluate, rounds: int) -> list[Fit]:
             for index, light in zip(active, less, strict=True)
         ]
         vectors = [p @ fits[index].free.directions for index, pair in zip(active, trials, strict=True) for p in pair]
-        found = evaluate(np.stack(vectors)).reshape(len(active), 2, -1)
+        found = evaluate(np.stack(vectors)).reshape(len(active), len(trials[0]), -1)
         for index, light, points, residuals in zip(active, less, trials, found, strict=True):
             before, fits[index] = fits[index], _best_trial(fits[index], points, residuals)
             if (fits[index].coordinates == points[0]).all():

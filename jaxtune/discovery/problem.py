@@ -170,11 +170,11 @@ class Problem:
     """Forms that effects may have, at all places of `hypotheses`."""
     residual: Hypothesis | None = None
     """A learned torque at all joints that names nothing; it bounds what is explainable, and is the fallback."""
+    residual_parts: Sequence[Hashable] = ()
+    """[parameters of `residual`]: the part of it to which each belongs, such as what depends on one joint's speed."""
     whole_runs: Callable[[np.ndarray], np.ndarray] | None = None
     """Mean absolute errors [vectors] with which coordinates [vectors, axes] predict whole runs of `train` and `select`,
     without correction by measured states in between; None where models are compared by segments alone."""
-    residual_parts: Sequence[Hashable] = ()
-    """[parameters of `residual`]: the part of it to which each belongs, such as what depends on one joint's speed."""
 
     @property
     def horizons(self) -> tuple[float, ...]:

@@ -58,7 +58,7 @@ class Settings:
     """Probability from which on another name may as well be right."""
     as_likely: float = 0.1
     """Share of the best model's probability from which on another one is believed about as much."""
-    whole_runs: float = 0.7
+    share_whole: float = 0.7
     """Share of the best model's error on whole runs of `train` and `select` below which it gives way to another."""
     inexact: float = 0.08
     """Standard deviation, as a share, by which the form of the library may shift the parameters of an effect. Intervals
