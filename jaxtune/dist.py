@@ -142,17 +142,23 @@ def at_bounds(dist: ParamDist) -> jax.Array:
     return ravel(full).all()
 
 
-def widen(dist: ParamDist, factor: jax.Array) -> ParamDist:
+def widen(dist: ParamDist, factor: jax.Array, towards: Float[Array, " coords"] | float = 0.0) -> ParamDist:
     """Multiplies every radius by a factor (Algorithm 1, `r <- r c`), up to the width of the bounds.
 
-    The tuner widens only after a failed check, while Algorithm 1 as printed widens before every check. The centre
-    stays.
+    The tuner widens only after a failed check, while Algorithm 1 as printed widens before every check.
+
+    Args:
+      dist: what is widened.
+      factor: above 1.
+      towards: where the robot seems to be, in radii. The centre moves there as far as the wider distribution still
+        holds the narrower one. At 0 it stays, as in the paper.
     """
+    wider = move(dist, jnp.clip(jnp.broadcast_to(towards, len(dist.centre)), 1.0 - factor, factor - 1.0))
     # A radius as wide as the bounds fills them from any centre.
     radius = jax.tree.map(
         lambda r, lower, upper: jnp.minimum(r * factor, upper - lower), dist.radius, dist.lower, dist.upper
     )
-    return dist.replace(radius=radius)
+    return wider.replace(radius=radius)
 
 
 def move(dist: ParamDist, step: Float[Array, " coords"]) -> ParamDist:

@@ -53,6 +53,9 @@ class GateInfo:
     beyond: jax.Array = math.nan  # excess of the estimate's distance from inside the box
     uncovered: jax.Array = math.nan  # share of the measured windows that have no simulated neighbour within reach
     elbo: jax.Array = math.nan  # evidence lower bound that the verification model reached, nats per window
+    # Where the measured robot seems to be, [coords] in radii; a distribution that widens moves that way. It widens
+    # about its centre where a gate does not tell. Logs of calls leave it out.
+    towards: jax.Array | None = None
 
 
 Verify = Callable[[jax.Array, TunerConfig, Collected, Trajectory, Knobs], GateInfo]
@@ -130,6 +133,7 @@ def calibrated_gate(
         & ~_copied(measured, collected),
         uncovered=jnp.sum(valid[-1] & ~covered[-1]) / jnp.maximum(valid[-1].sum(), 1),
         elbo=elbo,
+        towards=reading.answers[-1],
         **{name: values[-1] for name, values in found.items()},
     )
 

@@ -172,7 +172,8 @@ class HostTuner:
         if carry["verdict"] == Verdict.ACCEPT and not carry["sharpened"]:
             _, key_update, collected, carry = collect(carry)
             carry = self._sharpen(key_update, carry, collected, measured, state.knobs)
-        return state.replace(dist=carry["dist"], past=loop.known_after(carry)), loop.make_info(carry, measured)
+        dist = loop.dist_after(carry, state.dist)
+        return state.replace(dist=dist, past=loop.known_after(carry)), loop.make_info(carry, measured)
 
     def misfits(self, key: jax.Array, state: TunerState, measured: Trajectory) -> Misfits:
         """Says which observations and actions no parameters explain, and in which phase, as `Tuner.misfits` does."""

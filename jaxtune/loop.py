@@ -22,7 +22,8 @@ from jaxtune.shooting import Replay
 from jaxtune.types import ParamDist, Trajectory, Verdict
 from jaxtune.update import UpdateInfo, no_update
 
-_CHANGED = 0.9  # of a radius: what is narrowed less than that, or moved by less than the rest, is as it was
+_NARROWED = 0.9  # of a radius; less than that does not count
+_MOVED = 0.5  # radii; less than that does not count
 
 
 @chex.dataclass(frozen=True)
@@ -106,8 +107,7 @@ def decide(config: TunerConfig, carry: dict, gate: GateInfo, knobs: Knobs) -> di
     calls, dist = carry["calls"], carry["dist"]
     verdict = jnp.asarray(_verdict(config, gate, dist, calls), int)
     goes_on = (verdict == Verdict.WIDEN) | (verdict == Verdict.ACCEPT)
-    wider = dists.widen(dist, knobs.widen_factor)
-    following = optax.tree.where(verdict == Verdict.WIDEN, wider, dist)
+    following = optax.tree.where(verdict == Verdict.WIDEN, _wider(dist, gate, knobs), dist)
     # A set outside the distribution that earlier ones led to says that they misled.
     outside = (Verdict.WIDEN, Verdict.UNEXPLAINED, Verdict.RADIUS_EXHAUSTED)
     misled = jnp.isin(verdict, jnp.array(outside))
@@ -120,7 +120,9 @@ def decide(config: TunerConfig, carry: dict, gate: GateInfo, knobs: Knobs) -> di
         "verdict": verdict,
         "verdicts": carry["verdicts"].at[calls].set(verdict),
         "radius": carry["radius"].at[calls].set(dists.ravel(dist.radius).max()),
-        "gate": jax.tree.map(lambda log, value: log.at[calls].set(value), carry["gate"], gate),
+        "gate": jax.tree.map(
+            lambda log, value: log.at[calls].set(value), carry["gate"], gate.replace(towards=None)
+        ),
     }
 
 
@@ -149,7 +151,7 @@ def refine(config: TunerConfig, carry: dict, moved: ParamDist, update: UpdateInf
     first = (carry["left"] == config.refinements) & carry["sharpened"]
     unexplained = first & (update.p_misfit <= UNEXPLAINED)
     radius, unit = dists.ravel(dist.radius), dists.ravel(tested.radius)
-    changed = (dists.ravel(moved.radius) < _CHANGED * radius) | (jnp.abs(update.step) > 1.0 - _CHANGED)
+    changed = (dists.ravel(moved.radius) < _NARROWED * radius) | (jnp.abs(update.step) > _MOVED)
     contradicts = _contradicts(update)
     update = update.replace(
         step=(dists.ravel(moved.centre) - dists.ravel(tested.centre)) / unit,
@@ -244,9 +246,33 @@ def sharpen(
     return optax.tree.where(found.p_value <= UNEXPLAINED, _given_up(read), read)
 
 
+def dist_after(carry: dict, first: ParamDist) -> ParamDist:
+    """The distribution after a tuning that began with `first`, from what its loop carried last.
+
+    What was widened towards a set that was then not accepted has its centre back: the set may have misled.
+    """
+    last = carry["dist"]
+    return optax.tree.where(carry["verdict"] == Verdict.ACCEPT, last, last.replace(centre=first.centre))
+
+
 def known_after(carry: dict) -> Past:
     """What all sets so far say after a tuning, from what its loop carried last."""
     return optax.tree.where(carry["verdict"] == Verdict.ACCEPT, carry["update"].learnt, carry["past"])
+
+
+def _wider(dist: ParamDist, gate: GateInfo, knobs: Knobs) -> ParamDist:
+    """Widens a distribution towards where the robot seems to be, and once more if it seems to be farther than that.
+
+    A call of the gate is saved then: what is as far away would be rejected again.
+    """
+    factor = knobs.widen_factor
+    if gate.towards is None:
+        return dists.widen(dist, factor)
+    towards = jnp.nan_to_num(gate.towards)
+    once = dists.widen(dist, factor, towards)
+    seen = dists.ravel(dists.move(dist, towards).centre)
+    left = (seen - dists.ravel(once.centre)) / dists.ravel(once.radius)
+    return optax.tree.where((jnp.abs(left) > 1.0).any(), dists.widen(once, factor, left), once)
 
 
 def _given_up(carry: dict) -> dict:

@@ -39,7 +39,7 @@ class TunerConfig:
     coordinates of its own. With 99 sets, p-values are multiples of 1/100. A level of 0.95 needs 19 sets at least, and
     the verdict `unexplained` needs 99."""
     max_widenings: int = 6
-    """Largest number of widenings within one tuning; the gate is called at most once more than that."""
+    """Largest number of calls of the gate within one tuning that widen the distribution; one more may follow."""
     refinements: int = 3
     """Times that an accepted set is read again, in the distribution that the update narrowed. Use 0 with `vote_update`,
     whose steps are meant for one set each."""

@@ -10,7 +10,7 @@ ones, and trains a policy in it. One tuning is one `Tuner.step`:
       +-> simulate(policy, draws of dist)  ->  D_q, held-out sets  <----------------+
       |   verify(D_q, held-out sets, measured set)  ->  novelty, threshold          |
       |   verdict:                                                                  |
-      |     widen               radius <- min(radius * widen_factor, bounds) -------+
+      |     widen               dist <- wider, towards where the robot seems to be -+
       |     accept              dist <- update(D_q, held-out sets, measured set, dist), and again in the narrower dist
       |     unexplained         the centre stays where it is: the model lacks physics
       |     radius_exhausted    the centre stays: no wider distribution is allowed
@@ -26,7 +26,7 @@ calibrate both. Novelty says how unlike the simulated episodes the measured set 
 novelty that still counts as covered. The verdict is the first of these that holds:
 `not_comparable` if the gate says so; `not_finite` if novelty or threshold is not a finite number; `accept` if novelty
 <= threshold; `unexplained` if the distribution fills its bounds and p <= 0.01; `radius_exhausted` if it fills them or
-was widened `max_widenings` times; else `widen`. A radius that was widened stays so, unless the update narrows it.
+was widened by `max_widenings` calls; else `widen`. A radius that was widened stays so, unless the update narrows it.
 
 Departures from the paper, besides those of `jaxtune.gate` and `jaxtune.update`:
 
@@ -44,7 +44,9 @@ Departures from the paper, besides those of `jaxtune.gate` and `jaxtune.update`:
 - A tuning ends with training the policy, where the paper's begins with it. The last tuning therefore leaves a policy
   that was trained in the last distribution.
 - The radius grows only after a failed check (in print it grows before each), is capped by the bounds, and the loop ends
-  with a verdict.
+  with a verdict. The centre moves towards the regression's estimate then, as far as the wider distribution still holds
+  the narrower one (`dist.widen`). It widens twice at once if the estimate is farther away than that. Widened about its
+  centre, a distribution has the robot near its edge when it is accepted at last, and is twice as wide.
 
 Everything here is pure: a key and a state go in, a state and an info come out. A user hands in three functions; gate
 and update are functions as well and have defaults:
@@ -276,7 +278,8 @@ class Tuner:
 
         first = loop.before(self.config, state.dist, state.past, self.replay is not None)
         carry = jax.lax.while_loop(goes_on, body, first)
-        return state.replace(dist=carry["dist"], past=loop.known_after(carry)), loop.make_info(carry, measured)
+        dist = loop.dist_after(carry, state.dist)
+        return state.replace(dist=dist, past=loop.known_after(carry)), loop.make_info(carry, measured)
 
     def collect(self, key: jax.Array, policy: Policy, dist: ParamDist) -> Collected:
         """Simulates D_q and the held-out sets under one policy, with coordinates drawn from one distribution.

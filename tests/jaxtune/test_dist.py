@@ -68,6 +68,15 @@ def test_widen_multiplies_the_radius_up_to_the_width_of_the_bounds(two):
     assert wider.centre == two.centre
 
 
+def test_widen_moves_as_far_as_the_wider_box_still_holds_the_narrower_one(two):
+    wider = dists.widen(two, jnp.float32(1.5), jnp.array([0.2, -9.0]))
+    np.testing.assert_allclose(dists.ravel(wider.centre) - dists.ravel(two.centre), [0.1, -0.25], rtol=1e-6)
+    assert wider.radius == {"a": 0.75, "b": 0.75}
+    (low, high), (inner, outer) = dists.box(wider), dists.box(two)
+    assert (dists.ravel(low) <= dists.ravel(inner)).all()
+    assert (dists.ravel(high) >= dists.ravel(outer)).all()
+
+
 def test_at_bounds_only_when_every_parameter_is(two):
     assert not dists.at_bounds(two)
     # Radius 1 fills a (-1 to 1), but b from 0.75 - 1 = -0.25 only.

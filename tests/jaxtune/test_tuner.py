@@ -961,6 +961,45 @@ def test_all_sets_of_a_robot_inform_the_estimate():
     assert covered.mean(axis=0).min() > 0.78
 
 
+def decided(first, towards, verdict_novelty=9.0, **carried):
+    """What one call of a gate leaves that says where the robot is; the factor is 2."""
+    carry = loop.before(toys.TINY, first, pooling.nothing(first), replayed=False) | carried
+    found = GateInfo(novelty=jnp.asarray(verdict_novelty), threshold=jnp.ones(()), towards=jnp.asarray(towards))
+    return loop.decide(toys.TINY, carry, jax.tree.map(jnp.asarray, found), knobs(widen_factor=2.0))
+
+
+@pytest.mark.parametrize(
+    "towards, centre, radius",
+    [
+        ([0.0, 0.0], [0.0, 0.0], 0.4),
+        ([0.5, -2.5], [0.1, -0.2], 0.4),
+        # At 0.7, and a box of 0.4 about 0.2 reaches to 0.6: once more.
+        ([3.5, 0.0], [0.6, 0.0], 0.8),
+        ([np.nan, 1.0], [0.0, 0.2], 0.4),
+        ([0.0, -99.0], [0.0, -0.6], 0.8),
+    ],
+)
+def test_a_distribution_widens_towards_where_the_robot_seems_to_be(towards, centre, radius):
+    after = decided(toys.uniform(TWO, 0.2, 1.2), towards)
+    assert after["verdict"] == Verdict.WIDEN
+    np.testing.assert_allclose(dists.ravel(after["dist"].centre), centre, rtol=1e-5)
+    np.testing.assert_allclose(dists.ravel(after["dist"].radius), radius, rtol=1e-6)
+
+
+def test_a_distribution_that_widened_in_vain_has_its_centre_back():
+    first = toys.uniform(TWO, 0.2, 0.3)
+    after = decided(first, [1.0, -1.0])
+    assert abs(after["dist"].centre["mass"]) > 0.05
+    carried = {name: after[name] for name in ("dist", "calls")}
+    last = decided(first, [1.0, -1.0], **{**carried, "calls": jnp.asarray(toys.TINY.max_widenings)})
+    assert last["verdict"] == Verdict.RADIUS_EXHAUSTED
+    ended = loop.dist_after(last, first)
+    assert ended.centre == first.centre
+    assert ended.radius == last["dist"].radius
+    accepted = decided(first, [1.0, -1.0], 0.5, **carried)
+    assert loop.dist_after(accepted, first).centre == after["dist"].centre
+
+
 @pytest.mark.parametrize(
     "novelty, comparable, remembered",
     [(0.5, True, True), (1.5, True, False), (1.5, False, True), (np.inf, True, True)],
