@@ -120,9 +120,7 @@ def decide(config: TunerConfig, carry: dict, gate: GateInfo, knobs: Knobs) -> di
         "verdict": verdict,
         "verdicts": carry["verdicts"].at[calls].set(verdict),
         "radius": carry["radius"].at[calls].set(dists.ravel(dist.radius).max()),
-        "gate": jax.tree.map(
-            lambda log, value: log.at[calls].set(value), carry["gate"], gate.replace(towards=None)
-        ),
+        "gate": jax.tree.map(lambda log, value: log.at[calls].set(value), carry["gate"], gate.replace(towards=None)),
     }
 
 

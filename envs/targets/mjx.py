@@ -26,6 +26,7 @@ def rollout(
     commands: Commands | None = None,
     watch: Callable[..., Any] = lambda before, after, motion: (),
     states: bool = False,
+    until: jax.Array | None = None,
 ) -> tuple[Trajectory, Any]:
     """Simulates one episode for every draw of the parameters (`jaxtune.mjx.rollout`).
 
@@ -38,18 +39,20 @@ def rollout(
       commands: commands and starts of the gait clock, in place of those that the task would draw.
       watch: what is recorded of a step, `(state before, state after, motion) -> pytree`.
       states: True to keep the robot's states (`Trajectory.state`).
+      until: number of steps that are simulated; all if None.
 
     Returns:
       The episodes, and what was recorded of them, [episodes, time, ...].
     """
     if commands is None:
-        return mjx.rollout(robot, key, act, params, steps, watch=watch, states=states)
+        return mjx.rollout(robot, key, act, params, steps, watch=watch, states=states, until=until)
 
     def prepare(state, commands, step):
         phase = state.phase if commands.phase is None else jnp.where(step == 0, commands.phase, state.phase)
         return robot.with_command(state, commands.command[step], phase)
 
-    return mjx.rollout(robot, key, act, params, steps, given=commands, prepare=prepare, watch=watch, states=states)
+    given = {"given": commands, "prepare": prepare}
+    return mjx.rollout(robot, key, act, params, steps, **given, watch=watch, states=states, until=until)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,12 +63,21 @@ class MjxTarget:
     params: Mapping[str, float]
     """True physical values by name; only tests and reports may read them."""
 
-    def episodes(self, key: jax.Array, act: Act, count: int, steps: int, states: bool = False) -> Trajectory:
+    def episodes(
+        self,
+        key: jax.Array,
+        act: Act,
+        count: int,
+        steps: int,
+        states: bool = False,
+        until: jax.Array | None = None,
+    ) -> Trajectory:
         """Measures episodes under a policy; `envs.targets.protocol.Target` describes arguments and result.
 
-        It can be traced, so it may serve as the `measure` of a tuner.
+        It can be traced, so it may serve as the `measure` of a tuner. Only `until` steps are simulated where they are
+        given; the others hold zeros.
         """
-        return rollout(self.robot, key, act, self._params(count), steps, states=states)[0]
+        return rollout(self.robot, key, act, self._params(count), steps, states=states, until=until)[0]
 
     def record(
         self, key: jax.Array, act: Act, count: int, steps: int, commands: Commands | None = None

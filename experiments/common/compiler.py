@@ -67,12 +67,19 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+# JAX 0.11 has no such option, and ends the process at a flag that it does not know.
+_EMITTERS = {} if jax.__version_info__ >= (0, 11) else {"xla_cpu_use_fusion_emitters": False}
+
+SHORT = _EMITTERS
+"""Options of XLA for a simulation that runs for seconds (`jax.jit`): a biped's is compiled in two thirds of the time,
+and is 3 % slower."""
+
+
 def for_simulation() -> str:
     """Returns XLA flags for programs that simulate any robot on CPU; pass them to `set_up`.
 
     The fusion emitters of JAX 0.10 are off. They compute each body's pose again for every body that hangs on it: a step
     of MJX took 84 times as long for a chain of six joints, and 6 times for five (github.com/jax-ml/jax, issue 33761).
-    JAX 0.11 has no such flag, and does not need it.
+    JAX 0.11 does not need it.
     """
-    # XLA ends the process at a flag that it does not know.
-    return "" if jax.__version_info__ >= (0, 11) else "--xla_cpu_use_fusion_emitters=false"
+    return " ".join(f"--{name}={str(value).lower()}" for name, value in _EMITTERS.items())

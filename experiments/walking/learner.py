@@ -18,7 +18,7 @@ from brax.envs.base import State
 from envs.corrected import Correction
 from envs.targets.mjx import MjxTarget, rollout, simulate
 from envs.targets.protocol import Act, Commands, Target
-from experiments.common import hosts
+from experiments.common import compiler, hosts
 from experiments.common.config import Preset
 from experiments.walking.robots import BITENO, Kind
 from jaxtune import devices, mjx
@@ -189,12 +189,24 @@ class Learner:
           `(key, policy, count, steps) -> Trajectory [count, steps]`.
         """
 
-        def play(key, policy, count, steps):
-            return target.episodes(key, self.act(policy), count, steps, self.states)
+        if not isinstance(target, MjxTarget):
+            # The rounding of other engines may differ between hosts, and all must go on with the same episodes.
+            return hosts.on_first(
+                lambda key, policy, *size: jax.device_get(target.episodes(key, self.act(policy), *size, self.states))
+            )
 
-        # The rounding of other engines may differ between hosts, and all must go on with the same episodes.
-        shared = hosts.on_first(lambda *args: jax.device_get(play(*args)))
-        return devices.on_all(jax.jit(play, static_argnums=(2, 3))) if isinstance(target, MjxTarget) else shared
+        def whole(key, policy, until, count, steps):
+            return target.episodes(key, self.act(policy), count, steps, self.states, until)
+
+        compiled = devices.on_all(jax.jit(whole, static_argnums=(3, 4), compiler_options=compiler.SHORT))
+
+        def play(key, policy, count, steps):
+            # One program for measured episodes and evaluations: it takes longer to compile than to simulate the rest.
+            rows, longest = max(count, self.preset.evaluation_episodes), max(steps, self.longest)
+            found = compiled(key, policy, jnp.asarray(steps), rows, longest)
+            return jax.tree.map(lambda leaf: leaf[:count, :steps] if leaf.ndim > 1 else leaf[:count], found)
+
+        return play
 
     def evaluate(self, key: jax.Array, policy: Policy, play: Callable[..., Trajectory]) -> tuple[float, int]:
         """Measures a policy's return and falls in a target, over `evaluation_episodes` episodes of the full time limit.

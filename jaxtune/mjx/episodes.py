@@ -64,6 +64,7 @@ def rollout(
     prepare: Callable[[State, Any, jax.Array], State] = lambda state, given, step: state,
     watch: Callable[[State, State, Any], Any] = lambda before, after, motion: (),
     states: bool = False,
+    until: jax.Array | None = None,
 ) -> tuple[Trajectory, Any]:
     """Simulates one episode for every draw of the parameters.
 
@@ -81,6 +82,8 @@ def rollout(
       prepare: changes a state before a step, `(state, given, number of the step) -> state`.
       watch: what else is recorded of a step, `(state before, state after, motion) -> pytree`.
       states: True to keep the robot's states (`Trajectory.state`), for a `replay`.
+      until: number of steps that are simulated, so that one program serves several lengths; all of them if None. The
+        steps after it hold zeros.
 
     Returns:
       The episodes, and what was watched of them, [episodes, time, ...].
@@ -92,7 +95,7 @@ def rollout(
     # minutes.
     params = jax.lax.optimization_barrier({name: jnp.asarray(value) for name, value in params.items()})
 
-    def episode(act, key, params, given):
+    def episode(act, until, key, params, given):
         key_reset, key_act = jax.random.split(key)
 
         def step(carry, now):
@@ -106,9 +109,15 @@ def rollout(
             kept = robot.kept(state) if states else None
             return (following, alive & (following.done == 0)), (record, kept, watch(state, following, motion))
 
+        def step_or_none(carry, now):
+            if until is None:
+                return step(carry, now)
+            nothing = jax.tree.map(jnp.zeros_like, jax.eval_shape(step, carry, now)[1])
+            return jax.lax.cond(now[1] < until, step, lambda carry, _: (carry, nothing), carry, now)
+
         start = robot.reset(params, key_reset)
         during = jax.random.split(key_act, steps), jnp.arange(steps)
-        (_, alive), (record, kept, watched) = jax.lax.scan(step, (start, jnp.asarray(True)), during)
+        (_, alive), (record, kept, watched) = jax.lax.scan(step_or_none, (start, jnp.asarray(True)), during)
         obs, action, lives, score, broke = record
         ended = {"fell": ~alive, "not_finite": broke.any()}
         return Trajectory(obs=obs, action=action, alive=lives, score=score, state=kept, **ended), watched
@@ -116,7 +125,7 @@ def rollout(
     keys = jax.random.split(key, len(next(iter(params.values()))))
     # A partial's arguments are what a policy depends on.
     act = act if isinstance(act, Partial) else Partial(act)
-    return devices.in_chunks(episode, (keys, params, given), _CHUNK, shared=(act,))
+    return devices.in_chunks(episode, (keys, params, given), _CHUNK, shared=(act, until))
 
 
 def replay(robot: Robot, table: Mapping[str, Entry]) -> Replay:

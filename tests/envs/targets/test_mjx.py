@@ -105,6 +105,18 @@ def test_observation_and_action_of_a_step_belong_together(played):
     assert len(np.unique(played.obs[:, 0, 0])) == 4
 
 
+def test_one_program_plays_episodes_of_any_length(played):
+    params = scripted(4, falls=jnp.array([NEVER, 3, NEVER, 6]), breaks=jnp.array([NEVER, NEVER, 3, NEVER]))
+    play = jax.jit(lambda until: mjx.rollout(Script(), jax.random.key(0), act, params, 9, until=until)[0])
+    for until in (6, 2):
+        found = play(until)
+        shorter = mjx.rollout(Script(), jax.random.key(0), act, params, until)[0]
+        for got, expected in zip(jax.tree.leaves(found), jax.tree.leaves(shorter), strict=True):
+            np.testing.assert_array_equal(got[:, :until] if got.ndim > 1 else got, expected)
+        assert not found.alive[:, until:].any()
+    assert play._cache_size() == 1
+
+
 @pytest.mark.parametrize("count", [257, 516])
 def test_chunks_change_nothing(monkeypatch, count):
     # 257 are two chunks of 129, the last one filled up by a repetition; 516 are three of 172.
@@ -198,9 +210,9 @@ def test_the_same_key_asks_the_same_of_every_robot(play, biteno):
 def test_a_target_keeps_its_truth_and_answers_with_episodes(robot, monkeypatch):
     asked = {}
 
-    def rollout(robot, key, act, params, steps, states):
+    def rollout(robot, key, act, params, steps, *, states, until):
         asked.update(params)
-        return (steps, states), ()
+        return (steps, states), until
 
     monkeypatch.setattr(mjx, "rollout", rollout)
     target = MjxTarget(robot=robot, params={"trunk_mass": 1.5, "foot_friction": 0.7})
