@@ -48,7 +48,7 @@ def tuning(info: Info) -> dict:
     calls = int(info.calls)
     order = dists.names(info.dist)
     # Compiled arrays have room for the largest number of gate calls; only the first `calls` entries were made.
-    gate = {name: np.asarray(value)[:calls] for name, value in info.gate.items()}
+    gate = {name: np.asarray(value)[:calls] for name, value in info.gate.items() if value is not None}
     update = {
         name: dict(zip(order, np.asarray(info.update[name]).tolist(), strict=True))
         for name in ("step", "interval", "identifiable")

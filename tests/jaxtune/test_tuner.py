@@ -458,6 +458,14 @@ def test_gate_rejects_a_truth_one_radius_outside_the_box(gate, shifted):
     assert np.median(score.beyond) > np.median(score.cover)
 
 
+def test_a_set_outside_says_where_the_distribution_should_widen_to(gate):
+    towards = np.median(gate(stacked({"mass": -0.5, "friction": 0.1})).towards, axis=0)
+    friction, mass = (list(TWO).index(name) for name in ("friction", "mass"))
+    # In radii of 0.2; the mass lies at -2.5.
+    assert -4.0 < towards[mass] < -1.0
+    assert abs(towards[friction]) < 1.0
+
+
 def test_what_no_parameters_explain_is_a_misfit(gate):
     within, another = gate(stacked({"mass": 0.1})), gate(stacked({"wind": 0.5}))
     assert np.median(within.misfit) < 1.5
