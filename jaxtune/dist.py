@@ -15,6 +15,8 @@ from jaxtyping import Array, Float, Shaped
 
 from jaxtune.types import Coords, ParamDist
 
+_NARROWED = 0.9  # of a radius; less than that does not count
+
 
 def make(centre: Coords, radius: float | Coords, lower: Coords, upper: Coords) -> ParamDist:
     """Makes the distribution that a search starts with, and checks it.
@@ -180,3 +182,8 @@ def narrow(dist: ParamDist, interval: Float[Array, " coords"], least: float) -> 
     narrowed = jnp.clip(radius * interval, jnp.minimum(least, radius), radius)
     narrowed = jnp.where(jnp.isnan(interval), radius, narrowed)
     return dist.replace(radius=unravel(names(dist), narrowed.astype(jnp.float32)))
+
+
+def narrowed(before: ParamDist, after: ParamDist) -> jax.Array:
+    """Tells whether any radius has become smaller by a tenth or more, which is worth simulating for."""
+    return (ravel(after.radius) < _NARROWED * ravel(before.radius)).any()

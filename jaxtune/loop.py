@@ -22,7 +22,6 @@ from jaxtune.shooting import Replay
 from jaxtune.types import ParamDist, Trajectory, Verdict
 from jaxtune.update import UpdateInfo, no_update
 
-_NARROWED = 0.9  # of a radius; less than that does not count
 _MOVED = 0.5  # radii; less than that does not count
 
 
@@ -128,8 +127,9 @@ def refine(config: TunerConfig, carry: dict, moved: ParamDist, update: UpdateInf
     """Takes an update of an accepted set, and decides whether the set is read again, in the narrower distribution.
 
     That needs no further measured episode. It ends after `TunerConfig.refinements`, where the distribution hardly
-    changed, or where the set does not fit the distribution that the update before had narrowed. That reading is taken
-    back then, and what earlier sets said is forgotten, since it may have misled.
+    narrowed and moved by less than half a radius (unless it was `held`), or where the set does not fit the distribution
+    that the update before had narrowed. That reading is taken back then, and what earlier sets said is forgotten, since
+    it may have misled.
 
     Args:
       config: sizes.
@@ -149,7 +149,7 @@ def refine(config: TunerConfig, carry: dict, moved: ParamDist, update: UpdateInf
     first = (carry["left"] == config.refinements) & carry["sharpened"]
     unexplained = first & (update.p_misfit <= UNEXPLAINED)
     radius, unit = dists.ravel(dist.radius), dists.ravel(tested.radius)
-    changed = (dists.ravel(moved.radius) < _NARROWED * radius) | (jnp.abs(update.step) > _MOVED)
+    changed = dists.narrowed(dist, moved) | update.held | (jnp.abs(update.step) > _MOVED).any()
     contradicts = _contradicts(update)
     update = update.replace(
         step=(dists.ravel(moved.centre) - dists.ravel(tested.centre)) / unit,
@@ -169,7 +169,7 @@ def refine(config: TunerConfig, carry: dict, moved: ParamDist, update: UpdateInf
         learnt=pooling.nothing(wider),
     )
     read = carry | {
-        "left": jnp.where(changed.any() & ~misfits, carry["left"] - 1, 0),
+        "left": jnp.where(changed & ~misfits, carry["left"] - 1, 0),
         "dist": optax.tree.where(misfits, wider, moved),
         "wider": dist.radius,
         "past": optax.tree.where(contradicts & ~misfits, pooling.nothing(tested), carry["past"]),

@@ -52,6 +52,7 @@ class UpdateInfo:
     pooled: jax.Array = False  # scalar: whether the sets of earlier tunings count in the estimate (`jaxtune.pooling`)
     p_past: jax.Array = math.nan  # scalar: of what contradicts them; nan where they said nothing
     learnt: Past | None = None  # what this set and they say, for the next tuning; None where an update does not tell
+    held: jax.Array = False  # scalar: whether radii stayed only since the interval reaches past the distribution
 
 
 Update = Callable[[jax.Array, TunerConfig, Collected, Trajectory, ParamDist, Knobs], tuple[ParamDist, UpdateInfo]]
@@ -124,8 +125,9 @@ def posterior_update(
     inside |= ~identifiable
     errors = off.T @ off / jnp.maximum(known.sum(), 1)
     wide = jnp.maximum(wide, pooling.half_widths(errors, known.sum()))
-    narrower = jnp.where(identifiable & inside.all(), wide, 1.0)
-    moved = dists.narrow(dists.move(dist, step), narrower, config.min_radius)
+    centred = dists.move(dist, step)
+    narrowed = dists.narrow(centred, jnp.where(identifiable, wide, 1.0), config.min_radius)
+    moved = optax.tree.where(inside.all(), narrowed, centred)
     found = {name: excess(name, values) for name, values in misses(reading).items()}
     # Of what may lie beyond the box no more is known than the box is wide.
     reliable = jnp.where(jnp.outer(inside, inside), errors, jnp.diag((high - low) ** 2 / 12.0))
@@ -140,6 +142,7 @@ def posterior_update(
         errors=errors,
         pooled=pooled,
         p_past=p_past,
+        held=~inside.all() & dists.narrowed(dist, narrowed),
         learnt=optax.tree.where(unread | ~known.any(), past, learnt),
     )
 
@@ -190,6 +193,7 @@ def no_update(dist: ParamDist) -> UpdateInfo:
         replayed=jnp.asarray(False),
         pooled=jnp.asarray(False),
         p_past=nan,
+        held=jnp.asarray(False),
         learnt=pooling.nothing(dist),
     )
 

@@ -188,7 +188,6 @@ class Learner:
         Returns:
           `(key, policy, count, steps) -> Trajectory [count, steps]`.
         """
-
         if not isinstance(target, MjxTarget):
             # The rounding of other engines may differ between hosts, and all must go on with the same episodes.
             return hosts.on_first(
@@ -198,7 +197,7 @@ class Learner:
         def whole(key, policy, until, count, steps):
             return target.episodes(key, self.act(policy), count, steps, self.states, until)
 
-        compiled = devices.on_all(jax.jit(whole, static_argnums=(3, 4), compiler_options=compiler.SHORT))
+        compiled = devices.on_all(jax.jit(whole, static_argnums=(3, 4), compiler_options=compiler.for_seconds()))
 
         def play(key, policy, count, steps):
             # One program for measured episodes and evaluations: it takes longer to compile than to simulate the rest.

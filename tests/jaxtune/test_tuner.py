@@ -1102,9 +1102,25 @@ def test_an_interval_that_reaches_past_the_box_does_not_narrow_it():
     # The truth lies two radii out. The held-out sets all lie inside, so their errors say nothing of it, and a narrow
     # box at the edge shuts it out for good where the gate is too weak to reject it.
     dist = toys.uniform(THREE, 0.2)
-    moved, _ = apply(posterior, 2, dist, {"friction": 0.0, "mass": 0.4})
+    moved, info = apply(posterior, 2, dist, {"friction": 0.0, "mass": 0.4})
     assert moved.centre["mass"] > 0.15
     assert moved.radius["mass"] >= 0.2
+    assert info.held
+    assert not apply(posterior, 2, dist, TWO)[1].held
+
+
+@pytest.mark.parametrize(
+    "step, narrower, held, again",
+    [(0.4, 1.0, False, False), (0.6, 1.0, False, True), (0.4, 1.0, True, True), (0.4, 0.8, False, True)],
+)
+def test_a_set_is_read_again_where_that_may_narrow_its_distribution(step, narrower, held, again):
+    first = toys.uniform(TWO, 0.2)
+    carry = loop.before(toys.TINY, first, pooling.nothing(first), replayed=False)
+    step = jnp.array([step, 0.0])
+    update = UpdateInfo(step=step, interval=step, identifiable=step > 0, loss=jnp.zeros(()), held=jnp.asarray(held))
+    moved = dists.narrow(dists.move(first, step), jnp.array([1.0, narrower]), 0.01)
+    after = loop.refine(toys.TINY, carry, moved, update, knobs())
+    assert after["left"] == (toys.TINY.refinements if again else 0)
 
 
 def halving(key, config, collected, measured, dist, knobs):
