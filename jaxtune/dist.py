@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Shaped
 
 from jaxtune.types import Coords, ParamDist
 
-_NARROWED = 0.9  # of a radius; less than that does not count
+_NARROWED = 0.75  # of a radius; less than that does not count
 
 
 def make(centre: Coords, radius: float | Coords, lower: Coords, upper: Coords) -> ParamDist:
@@ -185,5 +185,5 @@ def narrow(dist: ParamDist, interval: Float[Array, " coords"], least: float) -> 
 
 
 def narrowed(before: ParamDist, after: ParamDist) -> jax.Array:
-    """Tells whether any radius has become smaller by a tenth or more, which is worth simulating for."""
+    """Tells whether any radius has become smaller by a quarter or more, which is worth simulating for."""
     return (ravel(after.radius) < _NARROWED * ravel(before.radius)).any()

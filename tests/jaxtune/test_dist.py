@@ -153,3 +153,10 @@ def test_make_needs_the_centre_within_the_bounds():
 def test_operations_batch_over_distributions(two):
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), two, dists.widen(two, jnp.float32(3.5)))
     np.testing.assert_array_equal(jax.vmap(dists.at_bounds)(stacked), [False, True])
+
+
+def test_a_distribution_has_narrowed_if_one_radius_lost_a_quarter(two):
+    for share, narrowed in ((0.8, False), (0.7, True)):
+        after = dists.narrow(two, jnp.array([1.0, share]), 0.01)
+        assert dists.narrowed(two, after) == narrowed
+    assert not dists.narrowed(two, dists.widen(two, jnp.float32(2.0)))
