@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Shaped
 
 from jaxtune.types import Coords, ParamDist
 
-_NARROWED = 0.75  # of a radius; less than that does not count
+_NARROWED, _LEAST = 0.9, 0.5  # of a radius, and of the least radius; less than that does not count
 
 
 def make(centre: Coords, radius: float | Coords, lower: Coords, upper: Coords) -> ParamDist:
@@ -184,6 +184,7 @@ def narrow(dist: ParamDist, interval: Float[Array, " coords"], least: float) -> 
     return dist.replace(radius=unravel(names(dist), narrowed.astype(jnp.float32)))
 
 
-def narrowed(before: ParamDist, after: ParamDist) -> jax.Array:
-    """Tells whether any radius has become smaller by a quarter or more, which is worth simulating for."""
-    return (ravel(after.radius) < _NARROWED * ravel(before.radius)).any()
+def narrowed(before: ParamDist, after: ParamDist, least: float) -> jax.Array:
+    """Tells whether any radius has lost a tenth of it, and half of the least radius: is it worth simulating again?"""
+    was, now = ravel(before.radius), ravel(after.radius)
+    return ((now < _NARROWED * was) & (was - now > _LEAST * least)).any()

@@ -149,7 +149,7 @@ def refine(config: TunerConfig, carry: dict, moved: ParamDist, update: UpdateInf
     first = (carry["left"] == config.refinements) & carry["sharpened"]
     unexplained = first & (update.p_misfit <= UNEXPLAINED)
     radius, unit = dists.ravel(dist.radius), dists.ravel(tested.radius)
-    changed = dists.narrowed(dist, moved) | update.held | (jnp.abs(update.step) > _MOVED).any()
+    changed = dists.narrowed(dist, moved, config.min_radius) | update.held | (jnp.abs(update.step) > _MOVED).any()
     contradicts = _contradicts(update)
     update = update.replace(
         step=(dists.ravel(moved.centre) - dists.ravel(tested.centre)) / unit,

@@ -142,7 +142,7 @@ def posterior_update(
         errors=errors,
         pooled=pooled,
         p_past=p_past,
-        held=~inside.all() & dists.narrowed(dist, narrowed),
+        held=~inside.all() & dists.narrowed(dist, narrowed, config.min_radius),
         learnt=optax.tree.where(unread | ~known.any(), past, learnt),
     )
 

@@ -155,8 +155,10 @@ def test_operations_batch_over_distributions(two):
     np.testing.assert_array_equal(jax.vmap(dists.at_bounds)(stacked), [False, True])
 
 
-def test_a_distribution_has_narrowed_if_one_radius_lost_a_quarter(two):
-    for share, narrowed in ((0.8, False), (0.7, True)):
-        after = dists.narrow(two, jnp.array([1.0, share]), 0.01)
-        assert dists.narrowed(two, after) == narrowed
-    assert not dists.narrowed(two, dists.widen(two, jnp.float32(2.0)))
+def test_a_distribution_has_narrowed_by_a_tenth_and_half_the_least_radius(two):
+    # A radius of 0.5 that becomes 0.4: a fifth of it, and 0.1.
+    after = dists.narrow(two, jnp.array([1.0, 0.8]), 0.01)
+    assert dists.narrowed(two, after, 0.19)
+    assert not dists.narrowed(two, after, 0.21)
+    assert not dists.narrowed(two, dists.narrow(two, jnp.array([0.91, 1.0]), 0.01), 0.01)
+    assert not dists.narrowed(two, dists.widen(two, jnp.float32(2.0)), 0.01)
