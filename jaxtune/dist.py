@@ -126,6 +126,12 @@ def normalised_box(dist: ParamDist) -> tuple[Float[Array, " coords"], Float[Arra
     return normalise(dist, low), normalise(dist, high)
 
 
+def ignorance(dist: ParamDist) -> Float[Array, " coords"]:
+    """Computes the standard deviations of draws, in radii: by how much a guess at the middle of the support errs."""
+    low, high = normalised_box(dist)
+    return (high - low) / jnp.sqrt(12.0)
+
+
 def at_bounds(dist: ParamDist) -> jax.Array:
     """Checks whether every coordinate's support fills its bounds; returns a boolean scalar.
 

@@ -118,7 +118,7 @@ def combinations(info) -> tuple[Combination, ...]:
     names, found = np.array(dists.names(info.dist)), _errors(info)
     vague = np.flatnonzero(weak(info))
     among = found[np.ix_(vague, vague)]
-    sd = (_ignorance(info) * dists.ravel(info.dist.radius))[vague]
+    sd = np.asarray(dists.ignorance(info.dist) * dists.ravel(info.dist.radius))[vague]
     told = []
     for axis in np.linalg.eigh(among)[1].T:
         chosen = np.abs(axis) > _SMALL * np.abs(axis).max()
@@ -137,13 +137,8 @@ def _errors(info) -> np.ndarray:
     """[coords, coords] mean products of estimates' errors, in standard deviations of the distribution."""
     size = len(dists.names(info.dist))
     found = np.broadcast_to(np.nan_to_num(np.asarray(info.update.errors, float)), (size, size))
-    return found / np.outer(_ignorance(info), _ignorance(info))
-
-
-def _ignorance(info) -> np.ndarray:
-    """[coords] standard deviation of a uniform draw from the distribution, in radii."""
-    low, high = map(np.asarray, dists.normalised_box(info.dist))
-    return (high - low) / np.sqrt(12.0)
+    unknown = np.asarray(dists.ignorance(info.dist))
+    return found / np.outer(unknown, unknown)
 
 
 def explain(info) -> str:

@@ -25,7 +25,7 @@ from jaxtune import conformal, dvm, windows
 from jaxtune import dist as dists
 from jaxtune.readings import Collected, excess, misses, of_all_sets, reading_of
 from jaxtune.settings import Knobs, TunerConfig
-from jaxtune.types import ParamDist, Trajectory
+from jaxtune.types import Trajectory
 
 _SAME = 1e-6  # of an observation's size and usual spread: it does not change
 _ROUNDED = 2e-4  # of one, by which a level near one may be off in single precision
@@ -134,7 +134,7 @@ def calibrated_gate(
         uncovered=jnp.sum(valid[-1] & ~covered[-1]) / jnp.maximum(valid[-1].sum(), 1),
         elbo=elbo,
         # What the regression hardly tells stays where it is.
-        towards=reading.answers[-1] * jnp.clip(1.0 - (reading.model.error / _blind_error(collected.dist)) ** 2, 0.0),
+        towards=reading.answers[-1] * jnp.clip(1.0 - (reading.model.error / dists.ignorance(collected.dist)) ** 2, 0.0),
         **{name: values[-1] for name, values in found.items()},
     )
 
@@ -183,14 +183,8 @@ def _shows(config: TunerConfig, collected: Collected, error: jax.Array) -> jax.A
     """
     if config.episodes < _ENOUGH:
         return jnp.asarray(True)
-    shown = (error < (1.0 - max(_SEEN, _SEEN_EPISODES / config.episodes)) * _blind_error(collected.dist)).any()
+    shown = (error < (1.0 - max(_SEEN, _SEEN_EPISODES / config.episodes)) * dists.ignorance(collected.dist)).any()
     return shown if collected.past is None else shown | (collected.past.tunings > 0)
-
-
-def _blind_error(dist: ParamDist) -> jax.Array:
-    """Errors [coords] of a guess at the middle of the box, rms in radii."""
-    low, high = dists.normalised_box(dist)
-    return (high - low) / jnp.sqrt(12.0)
 
 
 def _moves(measured: Trajectory, scaler: windows.Scaler) -> jax.Array:

@@ -268,8 +268,7 @@ def _wider(dist: ParamDist, gate: GateInfo, knobs: Knobs) -> ParamDist:
         return dists.widen(dist, factor)
     towards = jnp.nan_to_num(gate.towards)
     once = dists.widen(dist, factor, towards)
-    seen = dists.ravel(dists.move(dist, towards).centre)
-    left = (seen - dists.ravel(once.centre)) / dists.ravel(once.radius)
+    left = dists.normalise(once, dists.move(dist, towards).centre)
     return optax.tree.where((jnp.abs(left) > 1.0).any(), dists.widen(once, factor, left), once)
 
 

@@ -87,8 +87,7 @@ def joined_error(
     past: Past, pooled: jax.Array, dist: ParamDist, error: Float[Array, " coords"]
 ) -> Float[Array, " coords"]:
     """The size of errors of an estimate that errs by `error` and is joined with `past`, or not; both in radii."""
-    low, high = dists.normalised_box(dist)
-    box = (high - low) ** 2 / 12.0
+    box = dists.ignorance(dist) ** 2
     variance = jnp.maximum(jnp.diag(past.errors) / (_FADES * dists.ravel(dist.radius) ** 2), _LEAST * box)
     # What is known of the box is in the estimate already.
     more = jnp.maximum(1.0 / variance - 1.0 / box, 0.0)
@@ -140,7 +139,7 @@ def joined(
       contradicts it; and the p-value of that contradiction, nan where nothing was known.
     """
     low, high = dists.normalised_box(dist)
-    middle, unit = (low + high) / 2, (high - low) / jnp.sqrt(12.0)
+    middle, unit = (low + high) / 2, dists.ignorance(dist)
     scale = dists.ravel(dist.radius) * unit
     # In standard deviations of the box from its middle, so that its variances are 1.
     read, true = (estimates - middle) / unit, jnp.where(valid[:, None], (truth - middle) / unit, 0.0)

@@ -130,7 +130,7 @@ def posterior_update(
     moved = optax.tree.where(inside.all(), narrowed, centred)
     found = {name: excess(name, values) for name, values in misses(reading).items()}
     # Of what may lie beyond the box no more is known than the box is wide.
-    reliable = jnp.where(jnp.outer(inside, inside), errors, jnp.diag((high - low) ** 2 / 12.0))
+    reliable = jnp.where(jnp.outer(inside, inside), errors, jnp.diag(dists.ignorance(dist) ** 2))
     learnt = pooling.learnt(past, pooled, dist, estimates[-1], reliable, known.sum())
     return moved, UpdateInfo(
         step=step,
