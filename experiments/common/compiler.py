@@ -3,11 +3,14 @@
 import contextlib
 import os
 import re
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import jax
 
 from experiments.common.cli import console
+from jaxtune import devices
 
 _LEAST_THREADS = 8  # of XLA's pool on a CPU
 _LATEST = 4  # programs that may be unfinished
@@ -34,8 +37,8 @@ def set_up(xla_flags: str, most: int = 8) -> None:
     if _DEVICES not in flags:
         flags = f"{flags} {_DEVICES}={min(cores(), most)}"
     os.environ["XLA_FLAGS"] = flags
-    devices = [int(number) for number in re.findall(rf"{_DEVICES}=(\d+)", flags)]
-    os.environ.setdefault("NPROC", str(max(_LEAST_THREADS, cores(), *(1 + number for number in devices))))
+    counts = [int(number) for number in re.findall(rf"{_DEVICES}=(\d+)", flags)]
+    os.environ.setdefault("NPROC", str(max(_LEAST_THREADS, cores(), *(1 + number for number in counts))))
     chosen = os.environ.get("JAX_COMPILATION_CACHE_DIR")
     base = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
     kept = Path(chosen) if chosen else base / "jaxtune" / "xla"
@@ -87,3 +90,24 @@ def for_seconds() -> dict:
     Without fusion emitters a biped's simulation is compiled in two thirds of the time, and is 3 % slower.
     """
     return _WITHOUT_EMITTERS if jax.default_backend() == "cpu" else {}
+
+
+@contextlib.contextmanager
+def beside(program: Callable, *args) -> Iterator[None]:
+    """Compiles a program that is called later, on a core that is free while other programs are compiled or run.
+
+        with beside(second, *arguments):
+            first(...)  # takes as long to compile
+        second(*arguments)
+
+    Several hosts compile when they call, since all must do so in the same order.
+
+    Args:
+      program: that `jax.jit` returned; it is called with `devices.on_all`.
+      args: as of the call, in their shapes and types.
+    """
+    with ThreadPoolExecutor(1) as pool:
+        if jax.process_count() == 1:
+            # What goes wrong is told by the call.
+            pool.submit(devices.on_all(lambda *args: program.lower(*args).compile()), *args)
+        yield

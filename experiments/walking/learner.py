@@ -92,7 +92,8 @@ class Learner:
         # Op by op, a reset would be hundreds of programs, compiled in every process anew.
         self._init = jax.jit(self._fresh)
         # One compiled program serves all methods, because they differ only in its arguments.
-        self._train = devices.on_all(jax.jit(lambda key, policy, dist: self.train(key, policy, dist, preset.epochs)))
+        self._program = jax.jit(lambda key, policy, dist: self.train(key, policy, dist, preset.epochs))
+        self._train = devices.on_all(self._program)
 
     def dist(self, centre: Mapping[str, float], radius: float) -> ParamDist:
         """Makes a uniform distribution around physical values, with the table's bounds.
@@ -291,7 +292,9 @@ class Learner:
 
         def step(key, state):
             key_measure, key_tune, key_train = jax.random.split(key, 3)
-            state, info = tune(key_tune, state, play(key_measure, state.policy, count, steps))
+            measured = play(key_measure, state.policy, count, steps)
+            with compiler.beside(self._program, key_train, state.policy, state.dist):
+                state, info = tune(key_tune, state, measured)
             policy, metrics = self._train(key_train, state.policy, state.dist)
             return state.replace(policy=policy), info.replace(train=metrics)
 

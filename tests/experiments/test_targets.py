@@ -49,7 +49,8 @@ def test_a_step_with_a_foreign_target_is_that_of_the_tuner():
         return machine.measure(key, policy)
 
     sizes = preset("smoke")
-    learner = types.SimpleNamespace(preset=sizes, _train=jax.jit(toys.train_policy))
+    train = jax.jit(toys.train_policy)
+    learner = types.SimpleNamespace(preset=sizes, _program=train, _train=train)
     step = Learner.step(learner, machine, play)
     got, expected = step(jax.random.key(0), state), jax.jit(machine.step)(jax.random.key(0), state)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), got, expected)
