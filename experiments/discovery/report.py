@@ -83,6 +83,7 @@ def write(path: Path, log: Log, question: Question, result: Result, summary: dic
         runs=len(log.runs),
         meaning=VERDICTS[summary["verdict"]] + _doubt(summary),
         clues=_clues(summary),
+        sensors=_sensors(summary),
         advice=ADVICE[summary["verdict"]],
         summary=summary,
         brief=brief,
@@ -170,8 +171,22 @@ def show(console: Console, question: Question, summary: dict, free: dict) -> Non
         say(clues)
     if summary["withdrawn"]:
         say("the corrected model was withdrawn: on held-out runs it was worse than the one that is saved")
+    if sensors := _sensors(summary):
+        say(sensors)
     if summary["not_testable"]:
         say(f"effects that these logs could not show: {', '.join(summary['not_testable'])}")
+
+
+def _sensors(summary: dict) -> str:
+    """How sensors read torques; empty where none are compared."""
+    said = [
+        f"{joint} {', '.join(f'{name} {value:.3g}' for name, value in one.items())}"
+        for joint, one in summary["torque_sensors"].items()
+    ]
+    offsets = any("offset_nm" in one for one in summary["torque_sensors"].values())
+    # It has no other name there.
+    constant = ". A constant torque, such as that of a tilted base, would be in these offsets too" if offsets else ""
+    return f"torque sensors read, of the robot's torques: {'; '.join(said)}{constant}." if said else ""
 
 
 def _whole_runs(free: dict) -> str:

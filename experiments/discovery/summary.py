@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from envs.effects import LIBRARY
+from envs.following import OF_SENSORS
 from envs.logs import Log
 from experiments.discovery.hypotheses import hypotheses
 from experiments.discovery.next_experiment import deciding_experiment
@@ -31,8 +32,8 @@ def summarise(question: Question, log: Log, folder: Path, result: Result) -> dic
 
     Returns:
       The verdict; effects and parameter changes with values, intervals and confusable names; what was accepted beside
-      them and is not named; what was taken out again; what these logs cannot show; the cells with the largest gap;
-      and the gap on sealed runs.
+      them and is not named; what was taken out again; what these logs cannot show; what sensors read of torques; the
+      cells with the largest gap; and the gap on sealed runs.
     """
     effects, changes, not_named = [], [], []
     for term in (*result.terms, *_changed(question, result)):
@@ -61,6 +62,7 @@ def summarise(question: Question, log: Log, folder: Path, result: Result) -> dic
             for one in result.dropped
         ],
         "not_testable": [*result.not_testable, *not_there],
+        "torque_sensors": _torque_sensors(question, result.fit),
         "where": [
             {name: cell[name] for name in ("joint", "signal", "regime", "excess_floor_units")}
             for cell in result.where[:_SHOWN]
@@ -93,6 +95,26 @@ def summarise(question: Question, log: Log, folder: Path, result: Result) -> dic
             if share >= _PART
         ],
     }
+
+
+def _torque_sensors(question: Question, fit: Fit) -> dict[str, dict[str, float]]:
+    """What sensors read of torques, by joint: `ratio` times the robot's, and `offset_nm` where they may have one.
+
+    Empty where no recorded torques are compared.
+    """
+    rig, found = question.rig, {}
+    for axis, coordinate in zip(rig.axes, fit.vector, strict=True):
+        # Of other logs the first two are effects, and not free under every hypothesis.
+        if axis.effect not in (OF_SENSORS if question.sensed.any() else ("torque_reading",)):
+            continue
+        parameter = next(one for one in rig.effects[axis.effect].parameters if one.name == axis.parameter)
+        found.setdefault(axis.place, {})[parameter.name] = float(parameter.value(coordinate, axis.scale))
+    if question.sensed.any():
+        # Then they are of the torques that the model needs: ratio (reading) + push = torque.
+        return {
+            joint: {"ratio": 1.0 / one["ratio"], "offset_nm": 0.0 - one["nm"] / one["ratio"]} for joint, one in found.items()
+        }
+    return found if "tau" in question.problem.components or "abs_tau" in question.problem.components else {}
 
 
 def _far_off(result: Result) -> dict | None:

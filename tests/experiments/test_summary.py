@@ -18,7 +18,7 @@ from experiments.discovery.blind_drive import Truth
 from experiments.discovery.blind_robots import record
 from experiments.discovery.excitation import excitation
 from experiments.discovery.question import build_question
-from experiments.discovery.summary import _effect, _far_off, details, free_runs, summarise
+from experiments.discovery.summary import _effect, _far_off, _torque_sensors, details, free_runs, summarise
 from jaxtune.discovery.evidence import Evidence, Thresholds, passes
 from jaxtune.discovery.fit import Fit, Free
 from jaxtune.discovery.naming import clear_places
@@ -123,6 +123,26 @@ def test_what_a_placeholder_loses_has_an_interval(asked):
     assert [got[name] / axes[number].scale for name in ("low", "value", "high")] == pytest.approx(
         [-2.0, -1.99, -1.99 + 0.0196]
     )
+
+
+def test_what_torque_sensors_read_is_said(asked):
+    log, question = asked
+    assert summarise(question, log, Path("logs"), found(question))["torque_sensors"] == {}
+    axes = question.rig.axes
+    at = {(axis.effect, axis.place): number for number, axis in enumerate(axes)}
+    vector = np.zeros(len(axes))
+    vector[at["torque_scale", "elbow"]], vector[at["constant_push", "elbow"]] = np.log(1.25), 0.5
+    sensed = np.array([axis.effect in ("torque_scale", "constant_push") for axis in axes])
+    read = _torque_sensors(replace(question, sensed=sensed), SimpleNamespace(vector=vector))
+    assert list(read) == ["shoulder", "elbow"] and read["shoulder"]["offset_nm"] == 0.0
+    # A joint that is pushed needs that much less from its motor, and 1 Nm of this one's is read as 0.8.
+    assert read["elbow"]["ratio"] == pytest.approx(0.8)
+    scale = axes[at["constant_push", "elbow"]].scale
+    assert read["elbow"]["offset_nm"] == pytest.approx(-0.8 * 0.5 * scale, rel=1e-5)
+    said = report._sensors({"torque_sensors": read})
+    assert "elbow ratio 0.8, offset_nm -" in said and "tilted base" in said
+    assert report._sensors({"torque_sensors": {"elbow": {"ratio": 0.9}}}).endswith("elbow ratio 0.9.")
+    assert report._sensors({"torque_sensors": {}}) == ""
 
 
 def test_a_delay_that_is_filtered_has_two_times(asked):
