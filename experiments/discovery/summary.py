@@ -112,7 +112,8 @@ def _torque_sensors(question: Question, fit: Fit) -> dict[str, dict[str, float]]
     if question.sensed.any():
         # Then they are of the torques that the model needs: ratio (reading) + push = torque.
         return {
-            joint: {"ratio": 1.0 / one["ratio"], "offset_nm": 0.0 - one["nm"] / one["ratio"]} for joint, one in found.items()
+            joint: {"ratio": 1.0 / one["ratio"], "offset_nm": 0.0 - one["nm"] / one["ratio"]}
+            for joint, one in found.items()
         }
     return found if "tau" in question.problem.components or "abs_tau" in question.problem.components else {}
 
