@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+from jax.scipy.stats import chi2
 
 ROUNDING = 1e-5
 """Less than the distance of two p-values of as many sets as anybody simulates."""
@@ -19,6 +20,21 @@ def p_value(scores: jax.Array) -> jax.Array:
     known = (~jnp.isnan(scores[:-1])).sum()
     p_value = (1 + jnp.sum(scores[:-1] >= scores[-1])) / (1 + known)
     return jnp.where(jnp.isnan(scores[-1]), jnp.nan, p_value)
+
+
+def together(p_values: jax.Array) -> jax.Array:
+    """One p-value of several independent ones [n] (Fisher, *Statistical Methods for Research Workers*, 1932).
+
+        P(chi^2 with 2 n degrees of freedom >= -2 sum log p)
+
+    What is missing in a model makes every set misfit a little. No single one may be rejected then, but all are. Sets
+    of several tunings are independent, since each is compared with held-out sets of its own: `together` of
+    `UpdateInfo.p_misfit`. Values that are nan are left out; it is nan where no other is there.
+    """
+    p_values = jnp.asarray(p_values, float)
+    known = ~jnp.isnan(p_values)
+    statistic = -2.0 * jnp.where(known, jnp.log(p_values), 0.0).sum()
+    return jnp.where(known.any(), chi2.sf(statistic, 2.0 * jnp.maximum(known.sum(), 1)), jnp.nan)
 
 
 def rejects(p_value: jax.Array, level: jax.Array | float) -> jax.Array:

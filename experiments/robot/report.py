@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 from rich.console import Console
 from rich.table import Table
 
@@ -11,6 +12,8 @@ from experiments.common.files import as_json
 from experiments.robot.fall_risk import surprise
 from experiments.robot.records import Round
 from experiments.robot.rounds import Terms
+from jaxtune import conformal
+from jaxtune.settings import UNEXPLAINED
 
 VERDICTS = {
     "accept": "The simulator covers what was measured.",
@@ -30,6 +33,9 @@ ADVICE = {
     "doubtful": "The log fits badly all the same, in the distribution that was read last: estimates may make up for "
     "physics that the model lacks. Look where it does not fit before the robot walks again, and measure again with the "
     "same policy if you can.",
+    "together": "No log is rejected by itself, but the logs of all rounds together are: each misfits a little. Physics "
+    "is missing in the model, and estimates make up for it. Suspend the robot, play the targets that "
+    "experiments.excite writes, and run experiments.discover on the log.",
     "unexplained": "Suspend the robot, play the targets that experiments.excite writes, and run experiments.discover "
     "on the log: it names what is missing.",
     "radius_exhausted": "Check the bounds of the parameters and the log. If both are right, suspend the robot and run "
@@ -40,7 +46,7 @@ ADVICE = {
     "with the robot held by a rope.",
     None: "Use --method ours if you want to know.",
 }
-"""What to do next, by verdict; `doubtful` stands for an accepted log that fits badly."""
+"""What to do next, by verdict; `doubtful` stands for an accepted log that fits badly, `together` for several."""
 
 _TEMPLATE = Path(__file__).with_suffix(".html")
 _QUANTITIES = {"return": "return", "fall_rate": "share of walks that end in a fall", "power_w": "mechanical power, W"}
@@ -61,7 +67,7 @@ def write(path: Path, history: Sequence[Round], terms: Terms, robot: str = "bite
         line=as_json(last),
         verdict=last.tuning.verdict,
         meaning=VERDICTS[last.tuning.verdict],
-        advice=_advice(last),
+        advice=_advice(history),
         quantities=_QUANTITIES,
         unidentified=last.tuning.unidentified,
         earlier=_earlier(last),
@@ -78,10 +84,15 @@ def write(path: Path, history: Sequence[Round], terms: Terms, robot: str = "bite
     path.write_text(page)
 
 
-def _advice(last: Round) -> str:
-    if not last.tuning.doubtful:
-        return ADVICE[last.tuning.verdict]
-    return f"{ADVICE['doubtful']} (p {last.tuning.fit_p_value:.2f})"
+def _advice(history: Sequence[Round]) -> str:
+    last = history[-1].tuning
+    found = [np.nan if one.tuning.misfit_p_value is None else one.tuning.misfit_p_value for one in history]
+    together = float(conformal.together(np.array(found)))
+    if last.verdict == "accept" and together <= UNEXPLAINED:
+        return f"{ADVICE['together']} (p {together:.1g})"
+    if last.doubtful:
+        return f"{ADVICE['doubtful']} (p {last.fit_p_value:.2f})"
+    return ADVICE[last.verdict]
 
 
 def _earlier(last: Round) -> str:
@@ -96,16 +107,17 @@ def _earlier(last: Round) -> str:
     )
 
 
-def show(console: Console, last: Round) -> None:
+def show(console: Console, history: Sequence[Round]) -> None:
     """Prints a round: verdict and advice, prediction and measurement, what moved, and the expected falls.
 
     Args:
       console: where it is printed.
-      last: the round.
+      history: all rounds so far.
     """
+    last = history[-1]
     verdict = last.tuning.verdict
     console.print(f"[bold]round {last.index}: {verdict or 'no gate'}[/bold]: {VERDICTS[verdict]}")
-    console.print(_advice(last))
+    console.print(_advice(history))
     table = Table("", "predicted", "measured", "same policy, tuned simulator", "predicted for the next round")
     columns = [as_json(one) for one in (last.predicted, last.measured, last.tuning.explained, last.next_predicted)]
     for name, label in _QUANTITIES.items():

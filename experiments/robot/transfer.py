@@ -141,7 +141,7 @@ def play(transfer: Transfer, programs: Programs) -> list[Round]:
                 history.append(rounds.play(index, history[-1] if history else None, tell))
                 page = transfer.out / f"round_{index:03d}" / "report.html"
                 report.write(page, history, transfer.terms, programs.learner.kind.name)
-                report.show(console, history[-1])
+                report.show(console, history)
                 console.print(f"report in {page}")
                 progress.advance(task)
         files.write_json(transfer.out / "summary.json", {"rounds": history, "versions": checkpoint.versions()})

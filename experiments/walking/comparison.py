@@ -10,9 +10,10 @@ from rich.table import Table
 
 from envs.targets.protocol import Target
 from experiments.walking.learner import Learner, Policy
-from jaxtune import baselines
+from jaxtune import baselines, conformal
 from jaxtune.baselines import Untuned
 from jaxtune.mjx import parameters
+from jaxtune.settings import UNEXPLAINED
 from jaxtune.tuner import Tuner
 from jaxtune.types import ParamDist
 
@@ -102,6 +103,7 @@ def summarise(settings: Mapping[str, object], results: dict[str, list[dict]], of
                 field: [[value for line in lines for value in line[field]] for lines in calls]
                 for field in ("radius", "novelty", "threshold", "p_value", "verdicts")
             },
+            "misfit_p_value": [_together(lines) for lines in calls],
             "real_episodes": [run["measured_episodes"] for run in runs],
             "falls_in_target": [line["falls"] for line in last],
             "measured_falls": [sum(line["measured_falls"] for line in lines) for lines in calls],
@@ -111,8 +113,16 @@ def summarise(settings: Mapping[str, object], results: dict[str, list[dict]], of
     return {**settings, "off": list(off), "methods": methods, "seconds": seconds}
 
 
+def _together(lines: Sequence[dict]) -> float | None:
+    """How badly the accepted sets of a run fit together: a p-value, None where none was compared."""
+    found = [line["misfit_p_value"] for line in lines if line.get("misfit_p_value") is not None]
+    return float(conformal.together(np.array(found))) if found else None
+
+
 def show(console: Console, summary: dict, results: dict[str, list[dict]]) -> None:
-    """Prints two tables: the methods side by side, and the error of every parameter after the last tuning.
+    """Prints two tables, the methods side by side and the error of every parameter after the last tuning.
+
+    Where the sets of a run fit badly together, it says so.
 
     Args:
       console: where they are printed.
@@ -121,6 +131,14 @@ def show(console: Console, summary: dict, results: dict[str, list[dict]]) -> Non
     """
     console.print(_methods_table(summary))
     console.print(_parameters_table(summary, results))
+    for name, method in summary["methods"].items():
+        for seed, p_value in zip(summary["seeds"], method["misfit_p_value"], strict=True):
+            if p_value is not None and p_value <= UNEXPLAINED:
+                console.print(
+                    f"{name}, seed {seed}: the sets of all tunings together fit worse than simulated ones "
+                    f"(p {p_value:.1g}): something differs that is not tuned, and estimates make up for it",
+                    highlight=False,
+                )
 
 
 def _methods_table(summary: dict) -> Table:

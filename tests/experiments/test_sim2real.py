@@ -261,6 +261,12 @@ def test_the_page_says_what_matters_and_runs_nothing_of_the_log(tmp_path):
     assert "fits badly all the same" in page.read_text()
     assert "(p 0.05)" in page.read_text()
     assert "gyro[1] 4.2" in page.read_text()
+    # None of five logs is rejected, but five together are.
+    weak = replace(one, tuning=replace(one.tuning, misfit_p_value=0.06))
+    report.write(page, [weak] * 5, TERMS)
+    assert "the logs of all rounds together are" in page.read_text()
+    report.write(page, [weak], TERMS)
+    assert "together are" not in page.read_text()
     report.write(page, [line(["not_comparable"], 1.0, 0.1, cut_short=3)], TERMS)
     text = page.read_text()
     assert "a policy that stands longer" in text
@@ -277,7 +283,7 @@ def test_the_page_says_whether_earlier_rounds_count(pooled, said, tmp_path):
     assert "earlier rounds" not in page.read_text()
     one = replace(one, tuning=replace(one.tuning, pooled=pooled, past_p_value=0.01))
     report.write(page, [one], TERMS)
-    report.show(Console(file=output, width=200), one)
+    report.show(Console(file=output, width=200), [one])
     for text in (page.read_text(), output.getvalue()):
         assert said in text
         assert "(p 0.01)" in text

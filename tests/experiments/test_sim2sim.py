@@ -6,6 +6,7 @@ import json
 import jax
 import numpy as np
 import pytest
+from rich.console import Console
 
 from experiments import sim2sim, sweep
 from experiments.common import checkpoint, files, plots
@@ -138,6 +139,20 @@ def test_summary_has_the_promised_keys(tmp_path):
         "param_error_each.png",
         "gate.png",
     }
+
+
+def test_sets_that_fit_badly_together_are_said(capsys):
+    settings = {"case": "mass", "start": 0.5, "preset": "cpu", "seeds": [0, 3], "truth": ()}
+    lines = [_lines("ours", seed) for seed in (0, 3)]
+    lines[0][1:] = [lines[0][1] | {"misfit_p_value": 0.06}] * 5
+    lines[1][1:] = [lines[1][1] | {"misfit_p_value": value} for value in (0.9, None, 0.06)]
+    results = {"ours": [{"lines": one, "measured_episodes": 5} for one in lines]}
+    summary = comparison.summarise(settings, results, ())
+    bad, good = summary["methods"]["ours"]["misfit_p_value"]
+    assert bad < 0.01 and good > 0.1
+    comparison.show(Console(width=200), summary, results)
+    text = capsys.readouterr().out
+    assert "ours, seed 0: the sets of all tunings together fit worse" in text and "seed 3:" not in text
 
 
 def test_finished_pairs_are_not_run_again(tmp_path, monkeypatch):
