@@ -88,7 +88,7 @@ def _advice(history: Sequence[Round]) -> str:
     last = history[-1].tuning
     found = [np.nan if one.tuning.misfit_p_value is None else one.tuning.misfit_p_value for one in history]
     together = float(conformal.together(np.array(found)))
-    if last.verdict == "accept" and together <= UNEXPLAINED:
+    if len(history) > 1 and last.verdict == "accept" and together <= UNEXPLAINED:
         return f"{ADVICE['together']} (p {together:.1g})"
     if last.doubtful:
         return f"{ADVICE['doubtful']} (p {last.fit_p_value:.2f})"
