@@ -27,9 +27,10 @@ def together(p_values: jax.Array) -> jax.Array:
 
         P(chi^2 with 2 n degrees of freedom >= -2 sum log p)
 
-    What is missing in a model makes every set misfit a little. No single one may be rejected then, but all are. Sets
-    of several tunings are independent, since each is compared with held-out sets of its own: `together` of
-    `UpdateInfo.p_misfit`. Values that are nan are left out; it is nan where no other is there.
+    What is missing in a model makes every set misfit a little. No single one may be rejected then, but all are:
+    `together` of the `UpdateInfo.p_misfit` of several tunings. Each is compared with held-out sets of its own, but all
+    are of one robot. So they are independent as far as that misfits like any other of its distribution, whose middle it
+    is near after an update. Values that are nan are left out; it is nan where no other is there.
     """
     p_values = jnp.asarray(p_values, float)
     known = ~jnp.isnan(p_values)

@@ -92,6 +92,11 @@ def for_seconds() -> dict:
     return _WITHOUT_EMITTERS if jax.default_backend() == "cpu" else {}
 
 
+def ahead(program: Callable) -> Callable:
+    """Makes the function that compiles what `jax.jit` returned, for all devices and without running it."""
+    return devices.on_all(lambda *args: program.lower(*args).compile())
+
+
 @contextlib.contextmanager
 def beside(program: Callable, *args) -> Iterator[None]:
     """Compiles a program that is called later, on a core that is free while other programs are compiled or run.
@@ -109,5 +114,5 @@ def beside(program: Callable, *args) -> Iterator[None]:
     with ThreadPoolExecutor(1) as pool:
         if jax.process_count() == 1:
             # What goes wrong is told by the call.
-            pool.submit(devices.on_all(lambda *args: program.lower(*args).compile()), *args)
+            pool.submit(ahead(program), *args)
         yield

@@ -102,20 +102,23 @@ def _torque_sensors(question: Question, fit: Fit) -> dict[str, dict[str, float]]
 
     Empty where no recorded torques are compared.
     """
-    rig, found = question.rig, {}
+    rig, follows, found = question.rig, question.sensed.any(), {}
+    if not follows and not {"tau", "abs_tau"} & set(question.problem.components):
+        return {}
+    # With a known controller those of sensors are effects, and not free under every hypothesis.
+    free = OF_SENSORS if follows else ("torque_reading",)
     for axis, coordinate in zip(rig.axes, fit.vector, strict=True):
-        # Of other logs the first two are effects, and not free under every hypothesis.
-        if axis.effect not in (OF_SENSORS if question.sensed.any() else ("torque_reading",)):
+        if axis.effect not in free:
             continue
         parameter = next(one for one in rig.effects[axis.effect].parameters if one.name == axis.parameter)
         found.setdefault(axis.place, {})[parameter.name] = float(parameter.value(coordinate, axis.scale))
-    if question.sensed.any():
-        # Then they are of the torques that the model needs: ratio (reading) + push = torque.
-        return {
-            joint: {"ratio": 1.0 / one["ratio"], "offset_nm": 0.0 - one["nm"] / one["ratio"]}
-            for joint, one in found.items()
-        }
-    return found if "tau" in question.problem.components or "abs_tau" in question.problem.components else {}
+    if not follows:
+        return found
+    # The model's motors turn readings into torques, torque = ratio reading + push.
+    return {
+        joint: {"ratio": 1.0 / one["ratio"], "offset_nm": 0.0 - one["nm"] / one["ratio"]}
+        for joint, one in found.items()
+    }
 
 
 def _far_off(result: Result) -> dict | None:

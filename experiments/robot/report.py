@@ -86,8 +86,7 @@ def write(path: Path, history: Sequence[Round], terms: Terms, robot: str = "bite
 
 def _advice(history: Sequence[Round]) -> str:
     last = history[-1].tuning
-    found = [np.nan if one.tuning.misfit_p_value is None else one.tuning.misfit_p_value for one in history]
-    together = float(conformal.together(np.array(found)))
+    together = float(conformal.together(np.array([one.tuning.misfit_p_value for one in history], float)))
     if len(history) > 1 and last.verdict == "accept" and together <= UNEXPLAINED:
         return f"{ADVICE['together']} (p {together:.1g})"
     if last.doubtful:

@@ -103,7 +103,11 @@ def summarise(settings: Mapping[str, object], results: dict[str, list[dict]], of
                 field: [[value for line in lines for value in line[field]] for lines in calls]
                 for field in ("radius", "novelty", "threshold", "p_value", "verdicts")
             },
-            "misfit_p_value": [_together(lines) for lines in calls],
+            # Of all sets of a run together. Files have None for nan, which becomes nan again.
+            "misfit_p_value": [
+                float(conformal.together(np.array([line.get("misfit_p_value") for line in lines], float)))
+                for lines in calls
+            ],
             "real_episodes": [run["measured_episodes"] for run in runs],
             "falls_in_target": [line["falls"] for line in last],
             "measured_falls": [sum(line["measured_falls"] for line in lines) for lines in calls],
@@ -111,12 +115,6 @@ def summarise(settings: Mapping[str, object], results: dict[str, list[dict]], of
         }
         seconds[name] = [line["seconds"] for line in last]
     return {**settings, "off": list(off), "methods": methods, "seconds": seconds}
-
-
-def _together(lines: Sequence[dict]) -> float | None:
-    """How badly the accepted sets of a run fit together: a p-value, None where none was compared."""
-    found = [line["misfit_p_value"] for line in lines if line.get("misfit_p_value") is not None]
-    return float(conformal.together(np.array(found))) if found else None
 
 
 def show(console: Console, summary: dict, results: dict[str, list[dict]]) -> None:
@@ -133,7 +131,7 @@ def show(console: Console, summary: dict, results: dict[str, list[dict]]) -> Non
     console.print(_parameters_table(summary, results))
     for name, method in summary["methods"].items():
         for seed, p_value in zip(summary["seeds"], method["misfit_p_value"], strict=True):
-            if p_value is not None and p_value <= UNEXPLAINED:
+            if p_value <= UNEXPLAINED:
                 console.print(
                     f"{name}, seed {seed}: the sets of all tunings together fit worse than simulated ones "
                     f"(p {p_value:.1g}): something differs that is not tuned, and estimates make up for it",

@@ -15,6 +15,7 @@ from envs.biteno import Drive, Motion, State
 from envs.targets import mujoco_c
 from envs.targets.host import Engine, HostTarget
 from envs.targets.mjx import MjxTarget
+from experiments.common import compiler
 from experiments.common.config import Preset
 from experiments.walking.learner import Learner, Policy
 from experiments.walking.policies import starting_policy
@@ -213,9 +214,8 @@ def _seconds(program: Callable, inputs: tuple) -> tuple[float, float]:
     """Seconds to trace and compile a program, and the fewest in which it runs."""
     # A function of its own: JAX keeps what it compiled for another.
     fresh = jax.jit(lambda *args: program(*args))
-    whole = devices.on_all(lambda *args: fresh.lower(*args).compile())
     begin = time.monotonic()
-    built = whole(*inputs)
+    built = compiler.ahead(fresh)(*inputs)
     moments, run = [time.monotonic()], devices.on_all(built)
     for _ in range(_TIMES):
         jax.block_until_ready(run(*inputs))
